@@ -1,0 +1,182 @@
+"""One end of a link: typed messages and file descriptors over a Unix stream socket, never blocking.
+
+A frame is a 4-byte big-endian length and that many bytes of MessagePack. Descriptors travel as SCM_RIGHTS with
+the first byte of their frame; the kernel never merges two sends that carry descriptors, so a queue in order of
+arrival pairs them again.
+
+The channel owns no loop: it has a `fileno()`, `receive()` to call when readable and `flush()` when writable, so
+the same class serves an asyncio process (`attach`) and the relay's epoll loop. A peer that does not read is
+bounded: past `limit` bytes of backlog `send` raises `ChannelFull` (both ends are ours; that is a defect, not load).
+"""
+
+import asyncio
+import os
+import socket
+import struct
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from appliance.channel.messages import Message
+
+_LENGTH = struct.Struct(">I")
+_RECEIVE_SIZE = 262_144
+_MAX_DESCRIPTORS = 64
+
+
+class ChannelClosedError(Exception):
+    """The other end is gone."""
+
+
+class ChannelFullError(Exception):
+    """The other end has not read for so long that the backlog reached its limit."""
+
+
+class Channel:
+    """One end of a link that carries the messages of `union` (a union of `Message` structs)."""
+
+    def __init__(self, sock: socket.socket, union: Any, *, limit: int = 64 << 20) -> None:
+        sock.setblocking(False)
+        self._socket = sock
+        self._encoder = msgspec.msgpack.Encoder()
+        self._decoder = msgspec.msgpack.Decoder(union)
+        self._limit = limit
+        self._incoming = bytearray()
+        self._descriptors: deque[int] = deque()
+        self._outgoing: deque[tuple[bytes, list[int]]] = deque()
+        self._backlog = 0
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._writing = False
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return self._socket.fileno()
+
+    @property
+    def pending(self) -> bool:
+        """Whether `flush` has something left to write."""
+        return bool(self._outgoing)
+
+    def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
+        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps his."""
+        if len(descriptors) != message.descriptors:
+            raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
+        body = self._encoder.encode(message)
+        if self._backlog + len(body) > self._limit:
+            raise ChannelFullError(f"{self._backlog} bytes wait for the other end of the link")
+        self._outgoing.append((_LENGTH.pack(len(body)) + body, [os.dup(one) for one in descriptors]))
+        self._backlog += len(body) + _LENGTH.size
+        self.flush()
+
+    def flush(self) -> None:
+        """Write what the socket takes now. Raises `ChannelClosedError` when the other end is gone."""
+        while self._outgoing:
+            data, descriptors = self._outgoing[0]
+            try:
+                sent = socket.send_fds(self._socket, [data], descriptors) if descriptors else self._socket.send(data)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                raise ChannelClosedError(str(error)) from error
+            for descriptor in descriptors:
+                os.close(descriptor)
+            self._backlog -= sent
+            if sent < len(data):
+                self._outgoing[0] = (data[sent:], [])
+                break
+            self._outgoing.popleft()
+        self._watch_writable()
+
+    def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
+        """Read what has arrived: whole messages with their descriptors, which the caller now owns.
+
+        Raises `ChannelClosedError` when the other end is gone, and `msgspec.DecodeError` for a message that is
+        not of this link.
+        """
+        closed = False
+        while True:
+            try:
+                data, descriptors, _flags, _address = socket.recv_fds(self._socket, _RECEIVE_SIZE, _MAX_DESCRIPTORS)
+            except BlockingIOError:
+                break
+            except OSError:
+                data, descriptors = b"", []
+            self._descriptors.extend(descriptors)
+            self._incoming += data
+            if not data:
+                closed = True
+                break
+        messages = self._take_messages()
+        if closed and not messages:
+            raise ChannelClosedError("the other end closed the link")
+        return messages
+
+    def _take_messages(self) -> list[tuple[Any, tuple[int, ...]]]:
+        messages = []
+        position, available = 0, len(self._incoming)
+        while available - position >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(self._incoming, position)
+            end = position + _LENGTH.size + length
+            if end > available:
+                break
+            message = self._decoder.decode(bytes(self._incoming[position + _LENGTH.size : end]))
+            messages.append((message, tuple(self._descriptors.popleft() for _ in range(message.descriptors))))
+            position = end
+        del self._incoming[:position]
+        return messages
+
+    def attach(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        received: Callable[[Any, tuple[int, ...]], None],
+        closed: Callable[[], None],
+    ) -> None:
+        """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once."""
+        self._loop = loop
+
+        def readable() -> None:
+            try:
+                messages = self.receive()
+            except ChannelClosedError:
+                self.close()
+                closed()
+                return
+            for message, descriptors in messages:
+                received(message, descriptors)
+
+        loop.add_reader(self.fileno(), readable)
+
+    def _watch_writable(self) -> None:
+        if self._loop is None or self._writing == self.pending:
+            return
+        self._writing = self.pending
+        if self._writing:
+            self._loop.add_writer(self.fileno(), self._flush_attached)
+        else:
+            self._loop.remove_writer(self.fileno())
+
+    def _flush_attached(self) -> None:
+        try:
+            self.flush()
+        except ChannelClosedError:
+            # The reader sees the end of the stream as well and reports it, after what is still to be read.
+            self._outgoing.clear()
+            self._watch_writable()
+
+    def close(self) -> None:
+        """Close this end; descriptors that nobody took are closed with it."""
+        if self._socket.fileno() < 0:
+            return
+        if self._loop is not None:
+            self._loop.remove_reader(self.fileno())
+            self._loop.remove_writer(self.fileno())
+        self._socket.close()
+        for _data, descriptors in self._outgoing:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._outgoing.clear()
+        self._descriptors.clear()

@@ -1,0 +1,342 @@
+"""Every message that crosses a process boundary of the appliance, by link.
+
+A message is a frozen struct with a tag of its own name; a link accepts only the messages of its union, so a
+process cannot be told anything that is not written here. A struct that travels with file descriptors says so in
+`descriptors`; they are sent as SCM_RIGHTS with the message and delivered with it.
+
+Strings from strangers (names, header values) are carried as values and never interpreted on the way.
+"""
+
+from typing import Any, ClassVar
+
+import msgspec
+
+
+class Message(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
+    """A message between two processes of the appliance."""
+
+    descriptors: ClassVar[int] = 0
+
+
+# --- lifeline: supervisor <-> any child -------------------------------------------------------------------
+
+
+class Ping(Message):
+    """Supervisor asks a child whether it is alive; unanswered for 5 s, the child is killed and restarted."""
+
+    number: int
+
+
+class Pong(Message):
+    """A child's answer to `Ping`, sent from its main loop."""
+
+    number: int
+
+
+class Stop(Message):
+    """Supervisor asks a child to end cleanly; it has 3 s."""
+
+
+class Ready(Message):
+    """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports)."""
+
+    detail: dict[str, Any] = {}
+
+
+class Failed(Message):
+    """A child cannot serve and says why; the supervisor shows it and stops the appliance."""
+
+    reason: str
+
+
+class LinkOpened(Message):
+    """Supervisor hands a child its end of a new link to another process (replaces an earlier one)."""
+
+    descriptors: ClassVar[int] = 1
+    role: str
+    index: int
+
+
+class SocketKept(Message):
+    """Control gives the supervisor a listening socket to keep over control's death (name is unique)."""
+
+    descriptors: ClassVar[int] = 1
+    name: str
+
+
+class SocketDropped(Message):
+    """Control no longer needs a kept socket."""
+
+    name: str
+
+
+class SocketRestored(Message):
+    """Supervisor gives a restarted control one kept socket back."""
+
+    descriptors: ClassVar[int] = 1
+    name: str
+
+
+class SocketsRestored(Message):
+    """All kept sockets have been given back; sent at every start of control, also when there are none."""
+
+    count: int
+
+
+class ProcessInfo(msgspec.Struct, frozen=True):
+    """One process of the appliance as `rosrv status` shows it; `since` is RFC 3339 UTC."""
+
+    role: str
+    pid: int
+    since: str
+    restarts: int
+
+
+class ProcessesChanged(Message):
+    """Supervisor tells control which processes run; sent at start and after every start or death."""
+
+    processes: list[ProcessInfo]
+
+
+class FirewallReported(Message):
+    """Supervisor tells control the state of isolation and firewall for `rosrv status`."""
+
+    isolation: str
+    report: dict[str, Any]
+
+
+class ProbeFailed(Message):
+    """The ROSMaster port could be reached by another user: control stops serving nodes and says why."""
+
+    reason: str
+
+
+class ProbePassed(Message):
+    """The ROSMaster port is hidden (again)."""
+
+
+class RouteWanted(Message):
+    """Control asks which address of the machine a host uses to reach the appliance (netns isolation)."""
+
+    host: str
+
+
+class RouteFound(Message):
+    """Supervisor's answer to `RouteWanted`; `address` is None where the peer's own route is the right one."""
+
+    host: str
+    address: str | None
+
+
+class ApplianceStopRequested(Message):
+    """Control asks the supervisor to end the appliance (the `shutdown` call of the Master API, granted)."""
+
+    reason: str
+
+
+class SignatureWanted(Message):
+    """Control asks the signer to sign an audit checkpoint."""
+
+    number: int
+    text: bytes
+
+
+class SignatureMade(Message):
+    """The signer's Ed25519 signature (64 bytes) over `SignatureWanted.text`, and its raw public key (32)."""
+
+    number: int
+    signature: bytes
+    public_key: bytes
+
+
+# --- link: control <-> relay ------------------------------------------------------------------------------
+# `key` is the key of an incarnation. Control states what is wanted; the relay reports what it sees.
+
+
+class StateBegan(Message):
+    """Control restates everything: what is not said again before `StateEnded` is gone."""
+
+    epoch: int
+
+
+class StateEnded(Message):
+    """End of the restatement that began with the same epoch."""
+
+    epoch: int
+
+
+class NodePlaced(Message):
+    """An incarnation and the listening socket that stands for its TCPROS port.
+
+    `host` is the address the node is called at, `name` the node's name (its `callerid`).
+    """
+
+    descriptors: ClassVar[int] = 1
+    key: str
+    name: str
+    host: str
+
+
+class NodeWithdrawn(Message):
+    """An incarnation is gone: its port is closed, its connections are cut."""
+
+    key: str
+
+
+class PublicationPlaced(Message):
+    """The incarnation publishes this topic (type as registered, `*` when unknown)."""
+
+    key: str
+    topic: str
+    type: str
+
+
+class PublicationWithdrawn(Message):
+    """The incarnation publishes this topic no longer: its connections are cut."""
+
+    key: str
+    topic: str
+
+
+class ServicePlaced(Message):
+    """The incarnation offers this service at `host:port` (TCPROS)."""
+
+    key: str
+    service: str
+    host: str
+    port: int
+
+
+class ServiceWithdrawn(Message):
+    """The incarnation offers this service no longer: its connections are cut."""
+
+    key: str
+    service: str
+
+
+class GrantInstalled(Message):
+    """This subscriber (host, caller_id) may have this topic of that incarnation."""
+
+    key: str
+    topic: str
+    host: str
+    caller_id: str
+
+
+class GrantRevoked(Message):
+    """The grant is gone; a connection that stands on it is cut."""
+
+    key: str
+    topic: str
+    host: str
+    caller_id: str
+
+
+class ClientGranted(Message):
+    """This host may call this service of that incarnation."""
+
+    key: str
+    service: str
+    host: str
+
+
+class ClientRevoked(Message):
+    """The host may no longer call the service; connections that stand on it are cut."""
+
+    key: str
+    service: str
+    host: str
+
+
+class UpstreamWanted(Message):
+    """The relay needs the publisher's TCPROS address for a topic: control calls `requestTopic` there."""
+
+    key: str
+    topic: str
+
+
+class UpstreamFound(Message):
+    """Answer to `UpstreamWanted`: connect here."""
+
+    key: str
+    topic: str
+    host: str
+    port: int
+
+
+class UpstreamRefused(Message):
+    """Answer to `UpstreamWanted`: the publisher cannot be asked or said no; the relay asks again later."""
+
+    key: str
+    topic: str
+    reason: str
+
+
+class UpstreamLost(Message):
+    """A connection to a publisher broke or could not be made: control looks at the node at once."""
+
+    key: str
+    topic: str
+    reason: str
+
+
+class ConnectionOpened(Message):
+    """A subscriber (`topic` set) or a client (`service` set) is connected through the relay."""
+
+    number: int
+    key: str
+    resource: str
+    kind: str  # "topic" or "service"
+    host: str
+    caller_id: str
+
+
+class ConnectionClosed(Message):
+    """A connection that was reported open is closed; `reason` is empty for an orderly end."""
+
+    number: int
+    reason: str
+
+
+class ConnectionRefused(Message):
+    """Somebody connected to a relay port and was refused; `resource` is what the header asked for."""
+
+    key: str
+    resource: str
+    host: str
+    caller_id: str
+    reason: str
+    count: int  # repeated identical refusals are folded
+
+
+class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
+    """What went through one relayed topic since the last report."""
+
+    key: str
+    resource: str
+    messages: int
+    bytes: int
+    dropped: int  # at slow subscribers
+    subscribers: int
+
+
+class TrafficReported(Message):
+    """Counters of all relayed topics and services that changed; once a second at most."""
+
+    rows: list[TopicTraffic]
+
+
+Lifeline = (
+    Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
+    | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | RouteWanted
+    | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
+)  # fmt: skip
+
+RelayLink = (
+    StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
+    | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
+    | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | ConnectionOpened | ConnectionClosed
+    | ConnectionRefused | TrafficReported
+)  # fmt: skip
+
+SignerLink = SignatureWanted | SignatureMade

@@ -1,0 +1,68 @@
+"""The nouns of the access policy: what is asked, and what is answered.
+
+`Request` and `Decision` are the contract between the policy and everything that asks it: RVMaster, the
+`rosrv policy` verbs, REST and the console show the same text.
+"""
+
+import enum
+import ipaddress
+from dataclasses import dataclass
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+class Category(enum.StrEnum):
+    """What kind of thing a request touches; one section of the policy each (parameters share one)."""
+
+    NODE = "node"  # use a node name                [Nodes]
+    PUBLISH = "publish"  # publish a topic          [Publishers]
+    SUBSCRIBE = "subscribe"  # subscribe to a topic [Subscribers]
+    COMMAND = "command"  # make a call              [Commands]
+    OFFER = "offer"  # offer a service              [Services]
+    CALL = "call"  # call a service                 [Clients]
+    READ = "read"  # read a parameter               [Parameters] read …
+    WRITE = "write"  # write a parameter            [Parameters] write …
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One question to the policy.
+
+    `resource` is a resolved, canonical ROS name (topics, services, parameters, nodes) or, for
+    `Category.COMMAND`, the exact name of a call. `caller_id` is a claim; the policy decides by `host`.
+    """
+
+    host: Address
+    caller_id: str
+    category: Category
+    resource: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Where in the policy a decision stands."""
+
+    section: str  # as written in the documentation: "Publishers"
+    key: str  # as written in the file: "/arm/**", "default", "read /ns/**"
+    file: str
+    line: int  # counted from 1
+
+    def __str__(self) -> str:
+        """`[Publishers] /arm/** (landshark.ini:12)`."""
+        return f"[{self.section}] {self.key} ({self.file}:{self.line})"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The answer to a `Request`.
+
+    `rule` is the rule that decided, or None when no rule speaks of the request. `reason` is a sentence for a
+    person; the same text is in the answer to the node, the audit record, `rosrv policy explain` and the
+    console. `would_deny` is set when the section is in audit-only mode: `allowed` is then True although the
+    rules say no.
+    """
+
+    allowed: bool
+    rule: Rule | None
+    reason: str
+    would_deny: bool = False
