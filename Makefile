@@ -1,0 +1,40 @@
+# `make help` lists the targets. Two commands on a fresh machine: `make demo` and `make test`.
+# Every target installs what it needs first (scripts/setup; quick when there is nothing to do).
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+BIN := .venv/bin
+PYTEST := $(BIN)/pytest
+CHECKED := appliance tests examples
+
+.PHONY: help setup demo check test test-system bench clean
+
+help: ## list the targets
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
+
+setup: ## install what is missing: Debian packages and .venv
+	@scripts/setup
+
+demo: setup ## the appliance at work: a simulated robot, its operator and an attacker, in about a minute
+	@$(BIN)/rosrv demo $(ARGS)
+
+check: setup ## format, lint, types, dependency directions, unit tests
+	$(BIN)/ruff format --check $(CHECKED)
+	$(BIN)/ruff check $(CHECKED)
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(PYTEST) tests/unit -n 2 --quiet
+
+test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
+	$(PYTEST) tests/integration --quiet --durations=10
+
+test-system: setup ## the whole product: demo, namespaces, firewall
+	$(PYTEST) tests/system --quiet --durations=10
+
+bench: setup ## measure and compare with a plain master (benchmarks/README.md)
+	$(BIN)/python -m benchmarks $(ARGS)
+
+clean: ## remove what was built, .venv included
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
