@@ -24,6 +24,8 @@ from appliance.channel.messages import Message
 _LENGTH = struct.Struct(">I")
 _RECEIVE_SIZE = 262_144
 _MAX_DESCRIPTORS = 64
+_MAX_UNCLAIMED = 65_536
+_MAX_READS = 64  # in one go, so that an end that never stops writing leaves time for others
 
 
 class ChannelClosedError(Exception):
@@ -37,12 +39,16 @@ class ChannelFullError(Exception):
 class Channel:
     """One end of a link that carries the messages of `union` (a union of `Message` structs)."""
 
-    def __init__(self, sock: socket.socket, union: Any, *, limit: int = 64 << 20) -> None:
+    def __init__(
+        self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
+    ) -> None:
+        """`limit` bounds the backlog of what is sent, `longest` one received message; both in bytes."""
         sock.setblocking(False)
         self._socket = sock
         self._encoder = msgspec.msgpack.Encoder()
         self._decoder = msgspec.msgpack.Decoder(union)
         self._limit = limit
+        self._longest = longest
         self._incoming = bytearray()
         self._descriptors: deque[int] = deque()
         self._outgoing: deque[tuple[bytes, list[int]]] = deque()
@@ -75,7 +81,11 @@ class Channel:
         while self._outgoing:
             data, descriptors = self._outgoing[0]
             try:
-                sent = socket.send_fds(self._socket, [data], descriptors) if descriptors else self._socket.send(data)
+                sent = (
+                    socket.send_fds(self._socket, [data], descriptors)
+                    if descriptors
+                    else self._socket.send(data)
+                )
             except BlockingIOError:
                 break
             except OSError as error:
@@ -93,18 +103,24 @@ class Channel:
         """Read what has arrived: whole messages with their descriptors, which the caller now owns.
 
         Raises `ChannelClosedError` when the other end is gone, and `msgspec.DecodeError` for a message that is
-        not of this link.
+        not of this link, is too long, or came without its descriptors: the link is of no use after that.
         """
         closed = False
-        while True:
+        for _turn in range(_MAX_READS):
             try:
-                data, descriptors, _flags, _address = socket.recv_fds(self._socket, _RECEIVE_SIZE, _MAX_DESCRIPTORS)
+                data, descriptors, flags, _address = socket.recv_fds(
+                    self._socket, _RECEIVE_SIZE, _MAX_DESCRIPTORS
+                )
             except BlockingIOError:
                 break
             except OSError:
-                data, descriptors = b"", []
+                data, descriptors, flags = b"", [], 0
             self._descriptors.extend(descriptors)
             self._incoming += data
+            if flags & socket.MSG_CTRUNC:
+                raise msgspec.DecodeError("descriptors were lost: this process has too many files open")
+            if len(self._descriptors) > _MAX_UNCLAIMED:
+                raise msgspec.DecodeError(f"more than {_MAX_UNCLAIMED} descriptors that no message speaks of")
             if not data:
                 closed = True
                 break
@@ -114,14 +130,18 @@ class Channel:
         return messages
 
     def _take_messages(self) -> list[tuple[Any, tuple[int, ...]]]:
-        messages = []
+        messages: list[tuple[Any, tuple[int, ...]]] = []
         position, available = 0, len(self._incoming)
         while available - position >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._incoming, position)
+            if length > self._longest:
+                raise msgspec.DecodeError(f"a message of {length} bytes; {self._longest} are allowed")
             end = position + _LENGTH.size + length
             if end > available:
                 break
             message = self._decoder.decode(bytes(self._incoming[position + _LENGTH.size : end]))
+            if len(self._descriptors) < message.descriptors:
+                raise msgspec.DecodeError(f"{type(message).__name__} came without its descriptors")
             messages.append((message, tuple(self._descriptors.popleft() for _ in range(message.descriptors))))
             position = end
         del self._incoming[:position]
@@ -132,8 +152,12 @@ class Channel:
         loop: asyncio.AbstractEventLoop,
         received: Callable[[Any, tuple[int, ...]], None],
         closed: Callable[[], None],
+        refused: Callable[[str], None] | None = None,
     ) -> None:
-        """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once."""
+        """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once.
+
+        What is not of this link closes it: `refused(reason)` is called then, or `closed()` where none is given.
+        """
         self._loop = loop
 
         def readable() -> None:
@@ -142,6 +166,13 @@ class Channel:
             except ChannelClosedError:
                 self.close()
                 closed()
+                return
+            except msgspec.DecodeError as error:
+                self.close()
+                if refused is None:
+                    closed()
+                else:
+                    refused(str(error))
                 return
             for message, descriptors in messages:
                 received(message, descriptors)
