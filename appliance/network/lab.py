@@ -1,0 +1,184 @@
+"""A lab: hosts on one Ethernet, each a network namespace, for tests and the demonstration.
+
+```
+with Lab("rosrv-test") as lab:
+    robot = lab.host("robot", "10.77.0.10/24", "fd77::10/64")
+    process = robot.popen(["rosmaster", "--core"])
+```
+
+The bridge between the hosts is in a namespace of its own: nothing appears in the machine's own namespace,
+and two labs may use the same addresses at the same time. Leaving the block ends every process that lives in
+one of the lab's namespaces and deletes them. A lab whose process died without doing so is cleared away when
+the next lab with the same prefix starts.
+"""
+
+import contextlib
+import itertools
+import os
+import re
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from appliance.network import links
+from appliance.network.namespaces import Namespace, NetworkError, namespaces, require_privileges
+
+END_SECONDS = 3.0  # what a process of the lab has to end after SIGTERM, before SIGKILL
+INTERFACE = "eth0"
+_BRIDGE = "br0"
+
+T = TypeVar("T")
+
+
+class Host:
+    """One machine of the lab: a namespace with `lo` and `eth0` up."""
+
+    def __init__(self, name: str, namespace: Namespace, port: str, addresses: tuple[str, ...]) -> None:
+        self.name = name
+        self.namespace = namespace
+        self.port = port  # the bridge's end of the cable
+        self.interfaces = addresses
+
+    @property
+    def address(self) -> str:
+        """The host's first address, without prefix length."""
+        return self.interfaces[0].partition("/")[0]
+
+    @property
+    def address6(self) -> str:
+        """The host's first IPv6 address, without prefix length."""
+        for text in self.interfaces:
+            if ":" in text:
+                return text.partition("/")[0]
+        raise NetworkError(f"the host {self.name} was given no IPv6 address")
+
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a program on the host; the lab ends it at the latest when it closes."""
+        return self.namespace.popen(args, **options)
+
+    def run(self, function: Callable[[], T]) -> T:
+        """Call `function` in a thread on the host."""
+        return self.namespace.run(function)
+
+    def entered(self) -> contextlib.AbstractContextManager[None]:
+        """Be on the host with the calling thread for the length of a block (no await inside)."""
+        return self.namespace.entered()
+
+
+class Lab:
+    """Hosts on a common bridge; a context manager. `prefix` tells its namespaces from all others."""
+
+    _numbers = itertools.count(1)
+
+    def __init__(self, prefix: str) -> None:
+        if not re.fullmatch(r"[a-z][a-z0-9-]{0,31}", prefix):
+            raise ValueError(f"{prefix!r} is no lab prefix: small letters, digits and - only")
+        self.prefix = prefix
+        self._mark = f"{prefix}.{os.getpid()}.{next(self._numbers)}"
+        self._switch = Namespace(f"{self._mark}.switch")
+        self.hosts: dict[str, Host] = {}
+
+    def __enter__(self) -> Self:
+        require_privileges("a lab of network namespaces")
+        clear_leftovers(self.prefix)
+        try:
+            self._switch.create()
+            links.set_link(self._switch, "lo", up=True)
+            links.create_bridge(self._switch, _BRIDGE)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def host(self, name: str, *addresses: str, gateway: str | None = None) -> Host:
+        """Add a host with its addresses (`10.77.0.10/24`, `fd77::10/64`), and a default route by `gateway`."""
+        if name in self.hosts:
+            raise ValueError(f"the lab has a host {name} already")
+        if not addresses:
+            raise ValueError(f"the host {name} needs an address such as 10.77.0.10/24")
+        namespace = Namespace(f"{self._mark}.{name}").create()
+        port = f"port{len(self.hosts)}"
+        self.hosts[name] = host = Host(name, namespace, port, addresses)
+        links.set_link(namespace, "lo", up=True)
+        links.create_veth(namespace, INTERFACE, self._switch, port)
+        links.attach(self._switch, port, _BRIDGE)
+        for address in addresses:
+            links.add_address(namespace, INTERFACE, address)
+        if gateway is not None:
+            links.add_route(namespace, "default", gateway)
+        return host
+
+    def unplug(self, host: Host) -> None:
+        """Take the host's cable out: packets are lost from now on."""
+        links.set_link(self._switch, host.port, up=False)
+
+    def plug(self, host: Host) -> None:
+        """Put the host's cable back in."""
+        links.set_link(self._switch, host.port, up=True)
+
+    def close(self) -> None:
+        """End every process in the lab and delete it; closing twice is fine."""
+        _clear([*(host.namespace for host in self.hosts.values()), self._switch])
+        self.hosts.clear()
+
+
+def clear_leftovers(prefix: str) -> list[str]:
+    """Clear away the labs of this prefix whose process is gone; return the names of their namespaces."""
+    pattern = re.compile(re.escape(prefix) + r"\.(\d+)\.\d+\.")
+    left = []
+    for namespace in namespaces(prefix + "."):
+        found = pattern.match(namespace.name)
+        if found is not None and not Path("/proc", found[1]).exists():
+            left.append(namespace)
+    _clear(left)
+    return [namespace.name for namespace in left]
+
+
+def _clear(gone: Sequence[Namespace]) -> None:
+    """End what lives in these namespaces, then delete them."""
+    pids = [pid for namespace in gone for pid in namespace.processes()]
+    _end(pids)
+    for namespace in gone:
+        namespace.delete()
+
+
+def _end(pids: Sequence[int]) -> None:
+    """End processes by id: SIGTERM, and SIGKILL for those that are still there after END_SECONDS."""
+    descriptors: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            descriptors[os.pidfd_open(pid)] = pid
+    try:
+        for number, limit in ((signal.SIGTERM, END_SECONDS), (signal.SIGKILL, END_SECONDS)):
+            _signal_and_wait(descriptors, number, limit)
+    finally:
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit: float) -> None:
+    """Send a signal to the processes still there and wait until all have ended, at most `limit` seconds."""
+    poll = select.poll()
+    waiting = set(descriptors)
+    for descriptor in descriptors:
+        try:
+            signal.pidfd_send_signal(descriptor, number)
+        except ProcessLookupError:
+            waiting.discard(descriptor)
+        else:
+            poll.register(descriptor, select.POLLIN)
+    deadline = time.monotonic() + limit
+    while waiting and (left := deadline - time.monotonic()) > 0:
+        for descriptor, _ in poll.poll(left * 1000):
+            poll.unregister(descriptor)
+            waiting.discard(descriptor)

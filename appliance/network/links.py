@@ -1,0 +1,186 @@
+"""Interfaces, addresses and routes inside a namespace, over netlink.
+
+Every function names the namespace it works in and waits until the kernel has done it. Addresses are written
+`10.77.0.10/24` or `fd77::10/64`; an IPv6 address is usable at once (no duplicate address detection: the
+networks made here have no strangers on them).
+"""
+
+import ipaddress
+import os
+import socket
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from pyroute2 import IPRoute
+from pyroute2.netlink.exceptions import NetlinkError
+
+from appliance.network.namespaces import Namespace, NetworkError
+
+IFNAMSIZ = 15  # characters
+_IFA_F_NODAD = 0x02
+
+T = TypeVar("T")
+
+
+def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
+    """Make a veth pair, one end in each namespace, both up."""
+    for name in (near_name, far_name):
+        if not 0 < len(name) <= IFNAMSIZ:
+            raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
+    descriptor = far.open()
+    try:
+        _netlink(
+            near,
+            f"making the veth pair {near_name} - {far_name}",
+            lambda route: route.link(
+                "add", ifname=near_name, kind="veth", peer={"ifname": far_name, "net_ns_fd": descriptor}
+            ),
+        )
+    finally:
+        os.close(descriptor)
+    set_link(near, near_name, up=True)
+    set_link(far, far_name, up=True)
+
+
+def create_bridge(namespace: Namespace, name: str) -> None:
+    """Make a bridge that forwards from the first frame (no spanning tree), up."""
+    _netlink(
+        namespace,
+        f"making the bridge {name}",
+        lambda route: route.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0),
+    )
+    set_link(namespace, name, up=True)
+
+
+def attach(namespace: Namespace, name: str, bridge: str) -> None:
+    """Make the interface `name` a port of `bridge`."""
+    _netlink(
+        namespace,
+        f"attaching {name} to {bridge}",
+        lambda route: route.link("set", index=_index(route, name), master=_index(route, bridge)),
+    )
+
+
+def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
+    """Set an interface up or down (`lo` included)."""
+    _netlink(
+        namespace,
+        f"setting {name} {'up' if up else 'down'}",
+        lambda route: route.link("set", index=_index(route, name), state="up" if up else "down"),
+    )
+
+
+def delete_link(namespace: Namespace, name: str) -> None:
+    """Delete an interface (of a veth pair: both ends). Deleting what is not there is fine."""
+
+    def delete(route: Any) -> None:
+        for index in route.link_lookup(ifname=name):
+            route.link("del", index=index)
+
+    _netlink(namespace, f"deleting {name}", delete)
+
+
+def add_address(namespace: Namespace, name: str, address: str) -> None:
+    """Give the interface `name` an address with its prefix length."""
+    interface = ipaddress.ip_interface(address)
+    flags = _IFA_F_NODAD if interface.version == 6 else 0
+    _netlink(
+        namespace,
+        f"adding {address} to {name}",
+        lambda route: route.addr(
+            "add",
+            index=_index(route, name),
+            address=str(interface.ip),
+            prefixlen=interface.network.prefixlen,
+            flags=flags,
+        ),
+    )
+
+
+def add_route(namespace: Namespace, destination: str, via: str) -> None:
+    """Route `destination` (a network, or "default") through the address `via`."""
+    family = _family(via)
+    where = (
+        ("::/0" if family == socket.AF_INET6 else "0.0.0.0/0") if destination == "default" else destination
+    )
+    _netlink(
+        namespace,
+        f"routing {destination} via {via}",
+        lambda route: route.route("add", family=family, dst=where, gateway=via),
+    )
+
+
+def links(namespace: Namespace) -> list[str]:
+    """Return the names of the interfaces."""
+    found = _netlink(
+        namespace,
+        "listing interfaces",
+        lambda route: [link.get_attr("IFLA_IFNAME") for link in route.get_links()],
+    )
+    return [str(name) for name in found]
+
+
+def addresses(namespace: Namespace) -> list[str]:
+    """Return every address of every interface, with its prefix length; link-local ones included."""
+
+    def read(route: Any) -> list[str]:
+        return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr()]
+
+    return _netlink(namespace, "listing addresses", read)
+
+
+def networks(namespace: Namespace) -> list[str]:
+    """Return every network that a route or an address of the namespace names, default routes left out."""
+
+    def read(route: Any) -> list[str]:
+        routes = [
+            f"{entry.get_attr('RTA_DST')}/{entry['dst_len']}"
+            for entry in route.get_routes()
+            if entry["dst_len"]
+        ]
+        held = [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr()]
+        return [str(ipaddress.ip_interface(text).network) for text in routes + held]
+
+    return sorted(set(_netlink(namespace, "listing routes", read)))
+
+
+def source_address_for(namespace: Namespace, peer: str) -> str:
+    """Return the address of this namespace that a packet to `peer` leaves with, as the routing table says.
+
+    Raises: NetworkError when there is no way to that address.
+    """
+    family = _family(peer)
+
+    def look_up(route: Any) -> str:
+        for answer in route.route("get", family=family, dst=peer):
+            source = answer.get_attr("RTA_PREFSRC")
+            if source:
+                return str(source)
+        raise NetworkError(f"no source address for {peer} in {namespace.name}")
+
+    return _netlink(namespace, f"looking up the route to {peer}", look_up)
+
+
+def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
+    """Do `work` with a netlink socket of the namespace; errors say what was attempted and where."""
+
+    def inside() -> T:
+        with IPRoute() as route:
+            return work(route)
+
+    try:
+        return namespace.run(inside)
+    except NetlinkError as error:
+        hint = ": needs root (CAP_NET_ADMIN); run it with sudo" if error.code in (1, 13) else ""
+        raise NetworkError(f"{what} in {namespace.name}: {os.strerror(error.code)}{hint}") from error
+
+
+def _index(route: Any, name: str) -> int:
+    found = route.link_lookup(ifname=name)
+    if not found:
+        raise NetworkError(f"there is no interface {name}")
+    return int(found[0])
+
+
+def _family(address: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ipaddress.ip_address(address).version == 6 else socket.AF_INET

@@ -1,0 +1,278 @@
+"""Network namespaces: make one, run code or a program inside it, take it away.
+
+A namespace here is a name under `/run/netns`, as `ip netns` makes them, so everything can also be looked at
+with `ip netns exec NAME …`. Being in a namespace is a property of a *thread*: each piece of work gets a
+thread of its own that moves into the namespace and ends there. Three things follow, and they are why it is
+done this way:
+
+1. No other thread of this process ever sees the namespace, and there is no way back that could fail.
+2. A program started with `popen` is inside before its first instruction: nothing runs between fork and exec
+   but what `subprocess` does anyway, so it is safe in a process with threads.
+3. The netlink library may be used whether or not the calling thread runs an asyncio loop.
+
+The one price: a program that asks to be killed with its parent *thread* (`PR_SET_PDEATHSIG`) is killed at
+once, since that thread ends when `popen` returns. Use `entered()` for such a program.
+"""
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import re
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+DIRECTORY = Path("/run/netns")
+_CLONE_NEWNET = 0x40000000
+_MS_BIND, _MS_REC, _MS_SHARED, _MNT_DETACH = 0x1000, 0x4000, 0x100000, 2
+_CAP_NET_ADMIN, _CAP_SYS_ADMIN = 12, 21
+_VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+
+T = TypeVar("T")
+
+
+class NetworkError(RuntimeError):
+    """This machine's network stands in the way; the message says what, where and what to do."""
+
+
+class PrivilegeError(NetworkError):
+    """The caller may not change the network of this machine."""
+
+
+def has_privileges() -> bool:
+    """Tell whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which all of this needs."""
+    wanted = 1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return found is not None and int(found[1], 16) & wanted == wanted
+
+
+def require_privileges(what: str) -> None:
+    """Raise PrivilegeError, naming `what` is wanted, unless namespaces can be made here."""
+    if not has_privileges():
+        raise PrivilegeError(
+            f"{what} needs root (CAP_SYS_ADMIN and CAP_NET_ADMIN): run it with sudo, "
+            "or choose `isolation: container` in a container that has them, or `isolation: none`"
+        )
+
+
+class Namespace:
+    """A network namespace, by name. Making the object touches nothing: see `create` and `exists`."""
+
+    def __init__(self, name: str) -> None:
+        if not _VALID_NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name for a network namespace: letters, digits and _ . - only")
+        self.name = name
+        self.path = DIRECTORY / name
+
+    @classmethod
+    def own(cls) -> "Namespace":
+        """Return the namespace this process lives in; it can be neither made nor deleted."""
+        return _OwnNamespace()
+
+    def __repr__(self) -> str:
+        return f"Namespace({self.name!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Namespace) and other.path == self.path
+
+    def __hash__(self) -> int:
+        return hash(self.path)
+
+    def exists(self) -> bool:
+        """Tell whether a namespace is mounted under this name (a bare file left by a crash is none)."""
+        try:
+            here, above = self.path.stat(), self.path.parent.stat()
+        except OSError:
+            return False
+        return here.st_dev != above.st_dev
+
+    def create(self) -> "Namespace":
+        """Make it, with `lo` down and nothing else in it.
+
+        Raises: PrivilegeError; NetworkError if there is one of that name already.
+        """
+        require_privileges(f"making the network namespace {self.name}")
+        with _directory_lock():
+            if self.exists():
+                raise NetworkError(f"there is a network namespace {self.name} already ({self.path})")
+            self.path.touch(mode=0o444)
+            try:
+                _in_thread(self._unshare_and_mount)
+            except BaseException:
+                self.path.unlink(missing_ok=True)
+                raise
+        return self
+
+    def _unshare_and_mount(self) -> None:
+        libc = _libc()
+        if libc.unshare(_CLONE_NEWNET) != 0:
+            raise _os_failure("unshare", self.name)
+        _mount("/proc/thread-self/ns/net", self.path, _MS_BIND)
+
+    def delete(self) -> None:
+        """Take the name away (if it is there); the namespace itself ends with the last process in it."""
+        if self.exists():
+            require_privileges(f"deleting the network namespace {self.name}")
+            if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
+                raise _os_failure("umount", self.name)
+        self.path.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """Be in the namespace with the calling thread for the length of the block, and back afterwards.
+
+        For short synchronous work (open a socket, start a program); never await inside the block.
+        """
+        home = os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self._enter()
+            try:
+                yield
+            finally:
+                _setns(home, "the thread's own namespace")
+        finally:
+            os.close(home)
+
+    def run(self, function: Callable[[], T]) -> T:
+        """Call `function` in a thread inside the namespace; return what it returns, raise what it raises."""
+
+        def inside() -> T:
+            self._enter()
+            return function()
+
+        return _in_thread(inside)
+
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a program inside the namespace; `options` are those of `subprocess.Popen`."""
+        return self.run(lambda: subprocess.Popen(args, **options))
+
+    def sysctl(self, key: str, value: str | None = None) -> str:
+        """Set the kernel setting `key` (`net.ipv4.ip_forward`) if `value` is given; return what it is."""
+        path = Path("/proc/sys", *key.split("."))
+
+        def access() -> str:
+            if value is not None:
+                path.write_text(value, encoding="ascii")
+            return path.read_text(encoding="ascii").strip()
+
+        try:
+            return self.run(access)
+        except OSError as error:
+            raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
+
+    def processes(self) -> list[int]:
+        """Return the ids of the processes that live in the namespace, this one never among them."""
+        if not self.exists():
+            return []
+        mark = self.path.stat()
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdecimal() and int(entry.name) != os.getpid():
+                with contextlib.suppress(OSError):
+                    seen = (entry / "ns/net").stat()
+                    if (seen.st_dev, seen.st_ino) == (mark.st_dev, mark.st_ino):
+                        found.append(int(entry.name))
+        return sorted(found)
+
+    def open(self) -> int:
+        """Return a new descriptor of the namespace (netlink moves interfaces by it); the caller closes it."""
+        try:
+            return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise NetworkError(
+                f"there is no network namespace {self.name} ({self.path}: {error.strerror})"
+            ) from error
+
+    def _enter(self) -> None:
+        descriptor = self.open()
+        try:
+            _setns(descriptor, self.name)
+        finally:
+            os.close(descriptor)
+
+
+class _OwnNamespace(Namespace):
+    """The namespace the process was started in."""
+
+    def __init__(self) -> None:
+        self.name = "(own)"
+        self.path = Path(f"/proc/{os.getpid()}/ns/net")
+
+    def exists(self) -> bool:
+        return True
+
+    def create(self) -> Namespace:
+        raise NetworkError("the namespace of this process exists already")
+
+    def delete(self) -> None:
+        raise NetworkError("the namespace of this process cannot be deleted")
+
+
+def namespaces(prefix: str = "") -> list[Namespace]:
+    """Return the named namespaces of this machine whose name begins with `prefix`, dead names included."""
+    if not DIRECTORY.is_dir():
+        return []
+    names = sorted(entry.name for entry in DIRECTORY.iterdir())
+    return [Namespace(name) for name in names if name.startswith(prefix) and _VALID_NAME.fullmatch(name)]
+
+
+def _in_thread(function: Callable[[], T]) -> T:
+    """Call `function` in a thread that ends with it."""
+    outcome: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            outcome.set_result(function())
+        except BaseException as error:  # noqa: BLE001 - handed to the caller, who waits for it
+            outcome.set_exception(error)
+
+    thread = threading.Thread(target=work, name="namespace", daemon=True)
+    thread.start()
+    thread.join()
+    return outcome.result()
+
+
+@contextlib.contextmanager
+def _directory_lock() -> Iterator[None]:
+    """Make `/run/netns` a shared mount, as `ip netns add` does, while no other process of ours is at it."""
+    DIRECTORY.mkdir(mode=0o755, exist_ok=True)
+    lock = os.open(DIRECTORY.parent / "rosrv-netns.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not _is_mount_point(DIRECTORY):
+            _mount(DIRECTORY, DIRECTORY, _MS_BIND | _MS_REC)
+            _mount("none", DIRECTORY, _MS_SHARED | _MS_REC)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _is_mount_point(path: Path) -> bool:
+    """Tell whether something is mounted here (`os.path.ismount` is blind to a bind onto itself)."""
+    with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
+        return any(line.split(" ", 5)[4] == str(path) for line in lines)
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _mount(source: str | Path, target: Path, flags: int) -> None:
+    if _libc().mount(os.fsencode(source), os.fsencode(target), b"none", ctypes.c_ulong(flags), None) != 0:
+        raise _os_failure("mount", str(target))
+
+
+def _setns(descriptor: int, name: str) -> None:
+    if _libc().setns(descriptor, _CLONE_NEWNET) != 0:
+        raise _os_failure("setns", name)
+
+
+def _os_failure(call: str, name: str) -> NetworkError:
+    number = ctypes.get_errno()
+    hint = ": needs root (CAP_SYS_ADMIN); run it with sudo" if number in (1, 13) else ""
+    return NetworkError(f"network namespace {name}: {call}: {os.strerror(number)}{hint}")

@@ -1,0 +1,148 @@
+"""Tests of the lab: hosts that are network namespaces."""
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance.network import links
+from appliance.network.lab import Lab, clear_leftovers
+from appliance.network.namespaces import Namespace, NetworkError, namespaces
+from tests.support.requirements import need_root
+
+
+@pytest.fixture(autouse=True)
+def _root() -> None:
+    need_root()
+
+
+def test_hosts_reach_each_other_over_both_families() -> None:
+    """A program on one host accepts a connection from another host, over IPv4 and IPv6."""
+    with Lab("rosrv-lab") as lab:
+        robot = lab.host("robot", "10.77.0.10/24", "fd77::10/64")
+        operator = lab.host("operator", "10.77.0.11/24", "fd77::11/64")
+        for family, address in ((socket.AF_INET, robot.address), (socket.AF_INET6, robot.address6)):
+            with robot.entered(), socket.create_server((address, 0), family=family) as server:
+                port = server.getsockname()[1]
+                with operator.entered(), socket.create_connection((address, port), timeout=10):
+                    connection, (peer, *_) = server.accept()
+                    connection.close()
+            assert peer == (operator.address if family == socket.AF_INET else operator.address6)
+
+
+def test_popen_runs_the_program_itself_on_the_host() -> None:
+    """The process started on a host sees that host's address, and its pid is the program's own."""
+    with Lab("rosrv-lab") as lab:
+        robot = lab.host("robot", "10.77.0.10/24")
+        process = robot.popen(
+            ["ip", "-br", "-4", "address", "show", "eth0"], stdout=subprocess.PIPE, text=True
+        )
+        out, _ = process.communicate(timeout=20)
+        assert "10.77.0.10/24" in out
+        with pytest.raises(FileNotFoundError):
+            robot.popen(["/nonexistent/program"])
+
+
+def test_a_thread_in_a_namespace_leaves_the_others_where_they_are() -> None:
+    """After work inside a namespace the calling thread is where it was, even when the work fails."""
+    before = Path("/proc/thread-self/ns/net").readlink()
+    with Lab("rosrv-lab") as lab:
+        robot = lab.host("robot", "10.77.0.10/24")
+        inside = robot.run(lambda: Path("/proc/thread-self/ns/net").readlink())
+        assert inside != before
+        with pytest.raises(ZeroDivisionError):
+            robot.run(lambda: 1 // 0)
+        with pytest.raises(ZeroDivisionError), robot.entered():
+            _ = 1 // 0
+        assert Path("/proc/thread-self/ns/net").readlink() == before
+
+
+def test_works_under_a_running_event_loop() -> None:
+    """A lab can be made and used by a coroutine."""
+
+    async def main() -> list[str]:
+        with Lab("rosrv-lab") as lab:
+            return links.links(lab.host("robot", "10.77.0.10/24").namespace)
+
+    assert sorted(asyncio.run(main())) == ["eth0", "lo"]
+
+
+def test_closing_ends_every_process_and_leaves_nothing() -> None:
+    """Leaving the block ends processes on its hosts, stubborn ones too, and deletes every namespace."""
+    stubborn = (
+        "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "print('up', flush=True); signal.pause()"
+    )
+    with Lab("rosrv-lab") as lab:
+        robot = lab.host("robot", "10.77.0.10/24")
+        process = robot.popen([sys.executable, "-c", stubborn], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()
+    assert process.wait(timeout=10) == -signal.SIGKILL
+    process.stdout.close()
+    assert [space for space in namespaces("rosrv-lab.") if f".{os.getpid()}." in space.name] == []
+
+
+def test_what_a_crashed_lab_left_is_cleared_away() -> None:
+    """The next lab of the same prefix ends the processes and deletes the namespaces of a killed one."""
+    program = (
+        "import sys; from appliance.network.lab import Lab\n"
+        "lab = Lab('rosrv-labcrash').__enter__()\n"
+        "child = lab.host('robot', '10.77.0.10/24').popen(['sleep', '600'])\n"
+        "print(child.pid, flush=True); sys.stdin.read()"
+    )
+    crashed = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert crashed.stdout is not None
+    assert crashed.stdin is not None
+    orphan = int(crashed.stdout.readline())
+    crashed.kill()
+    crashed.wait(timeout=10)
+    crashed.stdin.close()
+    crashed.stdout.close()
+    cleared = clear_leftovers("rosrv-labcrash")
+    assert sorted(name.rpartition(".")[2] for name in cleared) == ["robot", "switch"]
+    stat = Path("/proc", str(orphan), "stat")
+    assert not stat.exists() or stat.read_text(encoding="ascii").rpartition(")")[2].split()[0] == "Z"
+    assert namespaces("rosrv-labcrash.") == []
+
+
+def test_an_unplugged_host_is_not_reached() -> None:
+    """Taking the cable out loses packets; putting it back in lets them pass again."""
+    with Lab("rosrv-lab") as lab:
+        robot = lab.host("robot", "10.77.0.10/24")
+        operator = lab.host("operator", "10.77.0.11/24")
+        with robot.entered():
+            server = socket.create_server((robot.address, 0))
+        with server:
+            port = server.getsockname()[1]
+            lab.unplug(robot)
+            with operator.entered(), pytest.raises(OSError, match=r"timed out|No route"):
+                socket.create_connection((robot.address, port), timeout=0.3)
+            lab.plug(robot)
+            with operator.entered(), socket.create_connection((robot.address, port), timeout=10):
+                pass
+
+
+def test_a_namespace_is_made_once_and_deleted_for_good() -> None:
+    """Making a second one of the same name is an error that names it; deleting twice is none."""
+    space = Namespace(f"rosrv-once.{os.getpid()}")
+    space.create()
+    try:
+        assert space.exists()
+        with pytest.raises(NetworkError, match=rf"namespace {space.name} already"):
+            space.create()
+        assert space.sysctl("net.ipv4.ip_forward", "1") == "1"
+        assert space.processes() == []
+    finally:
+        space.delete()
+    space.delete()
+    assert not space.exists()
+    with pytest.raises(NetworkError, match="there is no network namespace"):
+        space.run(lambda: None)
