@@ -1,0 +1,1 @@
+"""ROS 1 on the wire, without I/O: names, URIs, XML-RPC, TCPROS and message definitions."""

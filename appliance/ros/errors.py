@@ -1,0 +1,33 @@
+"""What can be wrong with ROS traffic, named by who is at fault.
+
+A `PeerError` is the sender's fault: its text says what was wrong, where, and what to do, and may be sent back
+to the sender as it stands. An `EncodingError` is ours: we tried to write what ROS has no notation for.
+"""
+
+
+class RosError(Exception):
+    """Base of every error of `appliance.ros`."""
+
+
+class EncodingError(RosError):
+    """What we were about to send has no notation on the wire (a control character, an integer of 64 bits)."""
+
+
+class PeerError(RosError):
+    """The sender's fault."""
+
+
+class InvalidNameError(PeerError):
+    """A name outside the ROS grammar."""
+
+
+class InvalidUriError(PeerError):
+    """A node or service URI that cannot be used."""
+
+
+class ProtocolError(PeerError):
+    """Bytes that are not the protocol they should be."""
+
+
+class LimitExceededError(ProtocolError):
+    """Well-formed as far as it was read, but larger, deeper or longer than the limits allow."""

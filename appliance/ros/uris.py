@@ -1,0 +1,107 @@
+"""Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
+
+Invariants: the host is a host name, an IPv4 address or an IPv6 address in brackets and nothing else; the port
+is there and between 1 and 65535; there is no user info, query or fragment. What two parsers could read in two
+ways is refused.
+"""
+
+import ipaddress
+import re
+from dataclasses import dataclass
+
+from appliance.ros.errors import InvalidUriError
+
+MAX_URI_LENGTH = 1024
+"""Characters in one URI."""
+
+_URI = re.compile(
+    r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://"
+    r"(?P<host>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_.-]{1,253})"
+    r"(?P<port>:[0-9]{1,5})?"
+    r"(?P<path>/[A-Za-z0-9_.~!$&'()*+,;=:@%/-]*)?\Z"
+)
+_SHOWN = 80  # characters of a refused URI that are repeated in the error
+
+
+@dataclass(frozen=True, slots=True)
+class NodeUri:
+    """The parts of a URI; `host` is without brackets, `path` starts with `/` (empty for a service)."""
+
+    scheme: str
+    host: str
+    port: int
+    path: str
+
+
+def parse_node_uri(text: str) -> NodeUri:
+    """Parse the URI of a node's XML-RPC API; raises `InvalidUriError`."""
+    return _parse(text, "http", "node API", "http://host:port/")
+
+
+def parse_service_uri(text: str) -> NodeUri:
+    """Parse the URI of a service, whose path is empty; raises `InvalidUriError`."""
+    uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
+    if uri.path not in ("", "/"):
+        raise InvalidUriError(f"service URI {_show(text)} has a path; write rosrpc://host:port")
+    return NodeUri(uri.scheme, uri.host, uri.port, "")
+
+
+def node_uri(host: str, port: int, path: str = "/") -> str:
+    """Write the URI of a node's XML-RPC API; an IPv6 `host` is put in brackets."""
+    return f"http://{_bracketed(host)}:{port}{path}"
+
+
+def service_uri(host: str, port: int) -> str:
+    """Write the URI of a service; an IPv6 `host` is put in brackets."""
+    return f"rosrpc://{_bracketed(host)}:{port}"
+
+
+def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
+    if len(text) > MAX_URI_LENGTH:
+        raise InvalidUriError(f"{what} URI of {len(text)} characters; at most {MAX_URI_LENGTH} are allowed")
+    found = _URI.match(text)
+    if found is None:
+        raise InvalidUriError(f"{what} URI {_show(text)} {_complaint(text)}; write {form}")
+    if found["scheme"].lower() != scheme:
+        raise InvalidUriError(
+            f"{what} URI {_show(text)} has the scheme {_show(found['scheme'])}; write {form}"
+        )
+    if found["port"] is None:
+        raise InvalidUriError(f"{what} URI {_show(text)} has no port; write {form}")
+    port = int(found["port"][1:])
+    if not 1 <= port <= 65535:
+        raise InvalidUriError(f"{what} URI {_show(text)} has port {port}; a port is between 1 and 65535")
+    return NodeUri(
+        scheme, _host(found["host"], text, what), port, found["path"] or ("/" if scheme == "http" else "")
+    )
+
+
+def _host(host: str, text: str, what: str) -> str:
+    if not host.startswith("["):
+        return host
+    try:
+        return str(ipaddress.IPv6Address(host[1:-1]))
+    except ValueError:
+        raise InvalidUriError(f"{what} URI {_show(text)} has no valid IPv6 address in its brackets") from None
+
+
+def _complaint(text: str) -> str:
+    if not text:
+        return "is empty"
+    if not text.isascii() or not text.isprintable() or " " in text:
+        return "has a space, a control character or a character outside ASCII"
+    if "://" not in text:
+        return "has no scheme"
+    rest = text.split("://", 1)[1]
+    for mark, name in (("@", "user info"), ("?", "a query"), ("#", "a fragment")):
+        if mark in (rest.split("/", 1)[0] if mark == "@" else rest):
+            return f"has {name}"
+    return "has no valid host, port and path"
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _show(text: str) -> str:
+    return ascii(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
