@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import msgspec
 
 
-class Message(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
+class Message(msgspec.Struct, frozen=True, tag=True, tag_field="message", forbid_unknown_fields=True):
     """A message between two processes of the appliance."""
 
     descriptors: ClassVar[int] = 0
