@@ -38,7 +38,11 @@ class Stop(Message):
 
 
 class Ready(Message):
-    """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports)."""
+    """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports).
+
+    Control's `detail` has `master` (the URI nodes are told), `revision` (of the policy), `rosout_master` (the URI
+    of the loopback listener for the appliance's own nodes) and `inner_port` (of the inner faces).
+    """
 
     detail: dict[str, Any] = {}
 

@@ -1,0 +1,159 @@
+"""The configuration of the appliance: every key with its default, as `appliance.yaml` spells it.
+
+`appliance.config_sources` reads the file, the environment and the flags into it; the supervisor writes
+the result to `run/config.json` in the state directory, from where the other processes load it. A key is
+here because something reads it.
+"""
+
+import ipaddress
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ByteSize, ConfigDict, Field, IPvAnyAddress, IPvAnyNetwork
+
+_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
+
+Seconds = Annotated[float, Field(gt=0, le=86_400 * 365, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+Size = Annotated[ByteSize, Field(gt=0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def split_address(text: str) -> tuple[str, int]:
+    """`HOST:PORT` or `[IPv6]:PORT` as host and port. Raises `ValueError`, which says what is wrong."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isascii() or not port.isdigit() or int(port) > 65_535:
+        raise ValueError(
+            f"{text!r} is not HOST:PORT, for example 0.0.0.0:11311 or [::]:11311 (port 0: any free one)"
+        )
+    if host.startswith("[") and host.endswith("]"):
+        return str(ipaddress.IPv6Address(host[1:-1])), int(port)
+    if ":" in host:
+        raise ValueError(f"{text!r}: an IPv6 address is written in brackets, for example [::1]:11311")
+    if not _HOST_NAME.fullmatch(host):
+        raise ValueError(f"{host!r} is not an address of this machine")
+    return host, int(port)
+
+
+def _checked_address(text: str) -> str:
+    split_address(text)
+    return text
+
+
+class Advertisement(_Section):
+    """The address that nodes of one network are told the appliance has."""
+
+    network: IPvAnyNetwork
+    address: IPvAnyAddress
+
+
+class Limits(_Section):
+    """What RVMaster and the node faces accept; the defaults are beyond a large robot."""
+
+    body_bytes: Size = Field(default=ByteSize(16 << 20), description="body of a request")
+    elements: Count = Field(default=1_000_000, description="values in one request")
+    nesting: Count = Field(default=100, description="arrays and structs inside each other")
+    string_bytes: Size = Field(default=ByteSize(8 << 20), description="one string")
+    multicall_parts: Count = Field(default=100_000, description="calls in one system.multicall")
+    header_bytes: Size = Field(default=ByteSize(64 << 10), description="request line and headers")
+    header_seconds: Seconds = Field(default=10, description="until request line and headers must be there")
+    idle_seconds: Seconds = Field(default=300, description="a kept-alive connection without a request")
+    connections_per_host: Count = 512
+    connections: Count = Field(default=4096, description="of all hosts")
+    nodes_per_host: Count = 500
+    topics_per_host: Count = 5000
+    node_call_seconds: Seconds = Field(default=3, description="a call that the appliance makes to a node")
+    offload_bytes: Size = Field(
+        default=ByteSize(256 << 10), description="larger bodies are parsed outside the event loop"
+    )
+
+
+class Audit(_Section):
+    """The audit log."""
+
+    durability: Literal["strict", "batched"] = Field(
+        default="batched", description="strict: on disk before the answer; batched: within 50 ms"
+    )
+    on_audit_failure: Literal["deny", "allow"] = Field(
+        default="deny", description="what is answered while the log cannot be written"
+    )
+    checkpoint_records: Count = Field(default=1000, description="records after which a checkpoint is signed")
+    checkpoint_seconds: Seconds = Field(default=60, description="seconds after which a checkpoint is signed")
+    retention_days: Seconds | None = Field(
+        default=None, description="older records are removed, and that is recorded"
+    )
+    retention_bytes: Size | None = Field(
+        default=None, description="beyond this size the oldest records are removed"
+    )
+
+
+class Liveness(_Section):
+    """When a node counts as gone; all in seconds."""
+
+    interval: Seconds = Field(default=5, description="between two looks at a node")
+    silent: Seconds = Field(default=20, description="without an answer until the node is unregistered")
+    shadow: Seconds = Field(default=600, description="for which a gone node's registration can come back")
+
+
+class Relay(_Section):
+    """What the relay accepts and holds."""
+
+    header_bytes: Size = Field(default=ByteSize(64 << 10), description="TCPROS connection header")
+    header_seconds: Seconds = Field(default=10, description="until the connection header must be there")
+    message_bytes: Size = Field(default=ByteSize(256 << 20), description="one message")
+    queue_messages: Count = Field(default=1000, description="messages waiting for one subscriber")
+    queue_bytes: Size = Field(default=ByteSize(64 << 20), description="bytes waiting for one subscriber")
+
+
+class Firewall(_Section):
+    """The firewall around the ROSMaster (isolation netns and container)."""
+
+    backend: Literal["auto", "iptables", "nft"] = Field(
+        default="auto", description="auto: what the kernel really enforces"
+    )
+
+
+class Settings(_Section):
+    """All of it."""
+
+    policy: Path = Field(
+        default=Path("policies/default.ini"), description="the access policy; read again on reload"
+    )
+    state: Path = Field(
+        Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
+    )
+    listen: Annotated[str, AfterValidator(_checked_address)] = Field(
+        default="0.0.0.0:11311",
+        description="where nodes find their master",
+    )
+    rosmaster_port: int = Field(
+        # Not 11411, where rosserial's TCP server listens, and below the ports the kernel gives to clients.
+        default=12311,
+        ge=0,
+        le=65_535,
+        description="loopback port of the hidden ROSMaster; 0: any free one",
+    )
+    isolation: Literal["container", "netns", "none"] = Field(
+        default="none", description="where the appliance lives; none: no firewall, for development only"
+    )
+    relays: Count = Field(default=1, le=1, description="relay processes")
+    advertise: list[Advertisement] = []
+    limits: Limits = Limits()
+    audit: Audit = Audit()
+    liveness: Liveness = Liveness()
+    relay: Relay = Relay()
+    firewall: Firewall = Firewall()
+
+    @property
+    def listen_address(self) -> tuple[str, int]:
+        """`listen` as host and port."""
+        return split_address(self.listen)
+
+
+def load_resolved(path: Path) -> Settings:
+    """What the supervisor wrote for its children. Raises `OSError`, `pydantic.ValidationError`."""
+    return Settings.model_validate_json(path.read_bytes())

@@ -1,0 +1,228 @@
+"""From file, environment and flags to `Settings`: later ones override earlier ones.
+
+    1. defaults
+    2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory if there
+       is one)
+    3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
+    4. flags
+
+Every mistake is reported, all at once, each with where it stands and, for a key nobody knows, the
+nearest that is one. Relative paths in the file are relative to the file's folder; elsewhere to the
+working directory.
+"""
+
+import difflib
+import re
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from appliance.config import Settings
+
+DEFAULT_FILE = Path("appliance.yaml")
+_PREFIX = "ROSRV_"
+_NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN"}
+# What Kubernetes and container links put there for a service that happens to be named `rosrv`.
+_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
+_PATH_KEYS = ("policy", "state")
+
+KeyPath = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One thing that is wrong, and where it stands: `appliance.yaml:12`, `ROSRV_LISTEN`, `--listen`."""
+
+    place: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.text}"
+
+
+class ConfigError(Exception):
+    """The configuration is wrong; `mistakes` has everything that is."""
+
+    def __init__(self, mistakes: list[Mistake]) -> None:
+        super().__init__("\n".join(map(str, mistakes)))
+        self.mistakes = mistakes
+
+
+def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
+    """The settings in force. A flag that is None was not given. Raises `ConfigError`."""
+    gathered = _Gathered()
+    chosen = _choose_file(file, environment)
+    if chosen is not None:
+        gathered.add_file(chosen)
+    gathered.add_environment(environment)
+    gathered.add_flags(flags)
+    return gathered.settings()
+
+
+def _choose_file(file: Path | None, environment: Mapping[str, str]) -> Path | None:
+    if file is not None:
+        return file
+    if environment.get("ROSRV_CONFIG"):
+        return Path(environment["ROSRV_CONFIG"])
+    return DEFAULT_FILE if DEFAULT_FILE.exists() else None
+
+
+class _Gathered:
+    """What was said so far, where each key was said, and what was wrong with it."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, Any] = {}
+        self._places: dict[KeyPath, str] = {}
+        self._mistakes: list[Mistake] = []
+
+    def add_file(self, file: Path) -> None:
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+            raise ConfigError([Mistake(str(file), f"cannot be read: {reason}")]) from error
+        try:
+            node = yaml.compose(text, Loader=yaml.SafeLoader)
+            self._note_places(file, node, ())
+            values = yaml.safe_load(text)
+        except yaml.MarkedYAMLError as error:
+            line = error.problem_mark.line + 1 if error.problem_mark else 1
+            raise ConfigError([Mistake(f"{file}:{line}", f"is not YAML: {error.problem}")]) from error
+        except (yaml.YAMLError, RecursionError, ValueError) as error:
+            raise ConfigError([Mistake(str(file), f"is not YAML: {error}")]) from error
+        if values is None:
+            return
+        if not isinstance(values, dict):
+            raise ConfigError([Mistake(f"{file}:1", "must have lines of the form `key: value`")])
+        for key in _PATH_KEYS:
+            if isinstance(values.get(key), str):
+                values[key] = str(file.absolute().parent / values[key])
+        self._values = values
+
+    def add_environment(self, environment: Mapping[str, str]) -> None:
+        for name in sorted(environment):
+            if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
+                continue
+            path = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
+            value: Any = environment[name]
+            if value[:1] in "[{":
+                try:
+                    value = yaml.safe_load(value)
+                except yaml.YAMLError as error:
+                    self._mistakes.append(Mistake(name, f"is not YAML: {error}"))
+                    continue
+            self._set(path, value, name)
+
+    def add_flags(self, flags: Mapping[str, Any]) -> None:
+        for key, value in flags.items():
+            if value is not None:
+                self._set((key,), value, "--" + key.replace("_", "-"))
+
+    def settings(self) -> Settings:
+        try:
+            settings = Settings.model_validate(self._values)
+        except ValidationError as error:
+            for detail in error.errors(include_url=False):
+                self._mistakes.append(
+                    self._mistake(detail["type"], detail["loc"], detail["msg"], detail.get("ctx"))
+                )
+            raise ConfigError(self._mistakes) from error
+        if self._mistakes:
+            raise ConfigError(self._mistakes)
+        return settings.model_copy(update={key: getattr(settings, key).absolute() for key in _PATH_KEYS})
+
+    def _set(self, path: KeyPath, value: Any, place: str) -> None:
+        table: Any = self._values
+        for key in path[:-1]:
+            if not isinstance(table.get(key), dict):
+                table[key] = {}
+            table = table[key]
+        table[path[-1]] = value
+        # Where the file stands no longer matters for what is under this key.
+        for older in [one for one in self._places if one[: len(path)] == path]:
+            del self._places[older]
+        self._places[path] = place
+
+    def _note_places(self, file: Path, node: yaml.Node | None, path: KeyPath) -> None:
+        if isinstance(node, yaml.MappingNode):
+            seen: set[str] = set()
+            for key, value in node.value:
+                place = f"{file}:{key.start_mark.line + 1}"
+                name = str(key.value)
+                if name in seen:
+                    self._mistakes.append(Mistake(place, f"{_dotted((*path, name))} is given a second time"))
+                seen.add(name)
+                self._places[*path, name] = place
+                self._note_places(file, value, (*path, name))
+        elif isinstance(node, yaml.SequenceNode):
+            for index, value in enumerate(node.value):
+                self._places[*path, index] = f"{file}:{value.start_mark.line + 1}"
+                self._note_places(file, value, (*path, index))
+
+    def _mistake(self, kind: str, path: KeyPath, text: str, context: Any) -> Mistake:
+        place = self._place_of(path)
+        if kind == "extra_forbidden":
+            return Mistake(place, _unknown_key(path))
+        if kind == "missing":
+            return Mistake(place, f"{_dotted(path)} must be given")
+        if kind == "value_error" and context:
+            text = str(context["error"])
+        return Mistake(place, f"{_dotted(path)}: {text[:1].lower()}{text[1:]}, not {self._value_at(path)!r}")
+
+    def _place_of(self, path: KeyPath) -> str:
+        for length in range(len(path), 0, -1):
+            if path[:length] in self._places:
+                return self._places[path[:length]]
+        return "configuration"
+
+    def _value_at(self, path: KeyPath) -> Any:
+        value: Any = self._values
+        for key in path:
+            try:
+                value = value[key]
+            except (KeyError, IndexError, TypeError):
+                break
+        return str(value) if isinstance(value, Path) else value
+
+
+def _dotted(path: KeyPath) -> str:
+    return ".".join(map(str, path))
+
+
+def _unknown_key(path: KeyPath) -> str:
+    known = sorted(_keys_at(Settings, path[:-1]))
+    nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
+    if not nearest:
+        # A key that stands on the wrong level is the other common mistake.
+        elsewhere = [_dotted(one) for one in _all_keys(Settings, ()) if one[-1] == path[-1]]
+        nearest = elsewhere[:1]
+    advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
+    return f"unknown key {_dotted(path)}: {advice}"
+
+
+def _keys_at(model: type[BaseModel], path: KeyPath) -> set[str]:
+    for key in path:
+        if isinstance(key, int):
+            continue
+        model = _section_of(model.model_fields[key].annotation) or model
+    return set(model.model_fields)
+
+
+def _all_keys(model: type[BaseModel], path: KeyPath) -> Iterator[KeyPath]:
+    for name, field in model.model_fields.items():
+        yield (*path, name)
+        section = _section_of(field.annotation)
+        if section is not None:
+            yield from _all_keys(section, (*path, name))
+
+
+def _section_of(annotation: Any) -> type[BaseModel] | None:
+    inner = typing.get_args(annotation)
+    if inner:
+        return next(filter(None, map(_section_of, inner)), None)
+    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None

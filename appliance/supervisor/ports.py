@@ -1,0 +1,76 @@
+"""Whether a port is free, and who has it when it is not."""
+
+import errno
+import socket
+from pathlib import Path
+
+from appliance.supervisor.errors import StartError
+
+
+def free_port() -> int:
+    """A loopback port that nobody listens on now."""
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def require_free(host: str, port: int) -> None:
+    """Raise `StartError` when nobody could listen on this address, and say who does where that is known."""
+    if port == 0:
+        return
+    try:
+        family, kind, protocol, _name, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except socket.gaierror as error:
+        raise StartError(f"{host!r} is not an address of this machine: {error.strerror}") from error
+    with socket.socket(family, kind, protocol) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            sock.bind(address)
+            sock.listen()
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise StartError(f"cannot listen on {host}:{port}: {error.strerror}") from error
+            raise StartError(
+                f"port {port} ({host}) is in use{_by_whom(port)}: stop that or choose another port"
+            ) from error
+
+
+def _by_whom(port: int) -> str:
+    inodes = _listening_inodes(port)
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and inodes & _socket_inodes(process):
+            try:
+                title = (
+                    (process / "cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace").strip()
+                )
+            except OSError:
+                title = ""
+            return f" by process {process.name} ({title[:120]})"
+    return ""
+
+
+def _listening_inodes(port: int) -> set[str]:
+    found = set()
+    for name in ("tcp", "tcp6"):
+        try:
+            rows = Path("/proc/net", name).read_text().splitlines()[1:]
+        except OSError:
+            continue
+        for fields in map(str.split, rows):
+            if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
+                found.add(f"socket:[{fields[9]}]")
+    return found
+
+
+def _socket_inodes(process: Path) -> set[str]:
+    found = set()
+    try:
+        for descriptor in (process / "fd").iterdir():
+            try:
+                found.add(str(descriptor.readlink()))
+            except OSError:
+                continue
+    except OSError:
+        pass
+    return found

@@ -1,0 +1,109 @@
+"""The state directory: whose part is whose, who may look, and that only one appliance uses it at a time.
+
+state/            0711  root: others may pass through, not look around
+state/lock        0600  held while an appliance runs; names its process id
+state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
+state/run/        0755  the resolved configuration for the children
+state/control/    0700  rosrv          and so on, one folder for each role, for its user only
+"""
+
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import Role
+from appliance.supervisor.users import account_of
+
+ADMIN_SOCKET = "admin.sock"
+
+
+class StateDirectory:
+    """The state directory of one running appliance; holds its lock until `close`."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the directory where needed and take its lock. Raises `StartError`."""
+        self.path = path.absolute()
+        try:
+            self.path.mkdir(mode=0o711, parents=True, exist_ok=True)
+            self.path.chmod(0o711)
+            self._lock = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise StartError(
+                f"state directory {self.path} cannot be used: {error.strerror}; name another with --state DIR"
+            ) from error
+        self._take_lock()
+
+    @property
+    def config(self) -> Path:
+        """Where the children find the resolved configuration."""
+        return self.path / "run" / "config.json"
+
+    def prepare(self, roles: Iterable[Role]) -> None:
+        """Give each role its part. Raises `StartError` where a part is somebody else's."""
+        self._folder("run", os.geteuid(), os.getegid(), 0o755)
+        for role in roles:
+            account = account_of(role.user)
+            self._folder(role.part, account.uid, account.gid, 0o700)
+
+    def write_config(self, text: str) -> None:
+        """Write what the children read."""
+        new = self.config.with_suffix(".new")
+        new.write_text(text)
+        new.chmod(0o644)
+        new.replace(self.config)
+
+    def open_admin_socket(self) -> socket.socket:
+        """The listening socket that the other verbs connect to; one left by an earlier life is replaced."""
+        path = self.path / ADMIN_SOCKET
+        path.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        except OSError as error:
+            listener.close()
+            raise StartError(
+                f"{path} cannot be made: {error}; name a shorter path with --state DIR"
+            ) from error
+        finally:
+            os.umask(mask)
+        listener.listen(64)
+        return listener
+
+    def close(self) -> None:
+        """Remove what only a running appliance has, and let the lock go."""
+        (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
+        self.config.unlink(missing_ok=True)
+        os.ftruncate(self._lock, 0)
+        os.close(self._lock)
+
+    def _take_lock(self) -> None:
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            owner = os.pread(self._lock, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(self._lock)
+            raise StartError(
+                f"an appliance uses the state directory {self.path} already (process {owner}): "
+                f"stop it, or name another directory with --state DIR"
+            ) from error
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, f"{os.getpid()}\n".encode(), 0)
+
+    def _folder(self, name: str, uid: int, gid: int, mode: int) -> None:
+        path = self.path / name
+        try:
+            path.mkdir(mode=0o700)
+            os.chown(path, uid, gid)
+        except FileExistsError:
+            found = path.lstat()
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != uid:
+                raise StartError(
+                    f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
+                    f"run it as that user, `chown -R {uid}:{gid} {path}`, or name another --state DIR"
+                ) from None
+        path.chmod(mode)

@@ -1,0 +1,406 @@
+"""Starts, watches and restarts the processes of the appliance.
+
+Invariants:
+
+1. Nothing that comes from a node or a browser is parsed here. From a child come only the messages in
+   `_COMMANDS`; a child that sends anything else is killed and started again.
+2. A process that dies is started again within a second; one that does not answer for five seconds is killed.
+3. Whenever one end of a link is new, both ends get a fresh link; a new control gets every kept socket
+   back first, then its links, then who is running.
+4. Ending takes less than five seconds, whatever the children do, and leaves no process behind.
+"""
+
+import asyncio
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+import structlog
+
+from appliance.channel.messages import (
+    ApplianceStopRequested,
+    Failed,
+    FirewallReported,
+    Message,
+    Pong,
+    ProcessesChanged,
+    ProcessInfo,
+    Ready,
+    RouteFound,
+    RouteWanted,
+    SocketDropped,
+    SocketKept,
+    SocketRestored,
+    SocketsRestored,
+    Stop,
+)
+from appliance.supervisor import health
+from appliance.supervisor.child import Plan
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.kept import KeptSockets, RefusedSocketError
+from appliance.supervisor.life import Life, Reports, link, program_environment
+from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.users import account_of
+
+ADMIN = "admin"
+_BACKOFF = (0.0, 0.2, 0.5, 1.0)
+_LONG_LIFE_SECONDS = 10.0
+_LOUD_AFTER = 5
+_START_SECONDS = 60.0
+_STOP_SECONDS = 3.0
+_TERMINATE_SECONDS = 0.3
+_LAST_SECONDS = 1.0
+
+_FROM_ANY = (Pong, Ready, Failed)
+_FROM_CONTROL = (SocketKept, SocketDropped, RouteWanted, ApplianceStopRequested)
+
+log = structlog.get_logger()
+
+
+class ControlReady(msgspec.Struct, frozen=True):
+    """What control says when nodes may connect (`Ready.detail`)."""
+
+    master: str
+    revision: int
+    rosout_master: str
+    inner_port: int
+
+
+@dataclass
+class Post:
+    """A place in the table that is to be filled at all times while the appliance runs."""
+
+    role: Role
+    index: int
+    life: Life | None = None
+    lives: int = 0
+    short_lives: int = 0
+    due: asyncio.TimerHandle | None = None
+
+
+class Supervisor:
+    """The processes of one appliance. `run` is its whole life."""
+
+    def __init__(
+        self,
+        roles: tuple[Role, ...],
+        facts: Facts,
+        *,
+        admin: socket.socket,
+        ready: Callable[[ControlReady], None],
+        relays: int = 1,
+        isolation: str = "none",
+    ) -> None:
+        """`admin` is handed to control; `ready` is called once, when nodes may connect."""
+        self._facts = facts
+        self._posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
+        self._kept = KeptSockets()
+        self._kept.keep(ADMIN, admin.detach())
+        self._ready = ready
+        self._is_ready = False
+        self._isolation = isolation
+        self._reports = Reports(self._received, self._violated, self._died)
+        self._stopping = asyncio.Event()
+        self._someone_died = asyncio.Event()
+        self._failure: str | None = None
+        self._asking: set[asyncio.Task[None]] = set()
+        self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+    async def run(self) -> None:
+        """Start everything, keep it running, and end it on SIGTERM or SIGINT.
+
+        Raises `StartError` when the appliance cannot start or go on; by then everything is stopped.
+        """
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.stop)
+        watch = asyncio.create_task(self._watch())
+        try:
+            await self._start()
+            await self._stopping.wait()
+        finally:
+            watch.cancel()
+            with suppress(asyncio.CancelledError):
+                await watch
+            await self._end()
+            self._kept.close()
+        if self._failure is not None:
+            raise StartError(self._failure)
+
+    def stop(self, failure: str | None = None) -> None:
+        """End the appliance; `failure` is why it cannot go on, nothing for an orderly end."""
+        if not self._stopping.is_set():
+            self._failure = failure
+            self._stopping.set()
+
+    # --- starting -----------------------------------------------------------------------------------------
+
+    async def _start(self) -> None:
+        for post in self._posts:
+            if post.role.after is None and not self._stopping.is_set():
+                self._fill(post)
+                if post.role.asks:
+                    await self._until_answering(post)
+        asyncio.get_running_loop().call_later(_START_SECONDS, self._check_started)
+
+    async def _until_answering(self, post: Post) -> None:
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline and not self._stopping.is_set():
+            if post.life is not None and await self._answers(1.0):
+                post.life.heard()
+                return
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._stopping.wait(), 0.05)
+
+    def _check_started(self) -> None:
+        if not self._is_ready:
+            self.stop(
+                f"the appliance was not ready after {_START_SECONDS:.0f} seconds; the log says what happened"
+            )
+
+    def _fill(self, post: Post) -> None:
+        post.due = None
+        if self._stopping.is_set():
+            return
+        here, there = socket.socketpair()
+        try:
+            post.life = Life(
+                post.role.name, post.index, self._plan(post, there.fileno()), here, self._reports
+            )
+        except OSError as error:
+            here.close()
+            log.error("process cannot be started", role=post.role.name, error=str(error))
+            self._fill_later(post)
+            return
+        finally:
+            there.close()
+        post.lives += 1
+        log.info("process started", role=post.role.name, pid=post.life.pid, restarts=post.lives - 1)
+        if post.role.name == "control":
+            self._equip_control(post.life)
+        self._link(post)
+        self._tell_processes()
+
+    def _plan(self, post: Post, lifeline: int) -> Plan:
+        role, facts = post.role, self._facts
+        home = str(facts.part(role.part))
+        plan = Plan(
+            parent=os.getpid(),
+            lifeline=lifeline,
+            account=account_of(role.user),
+            home=home,
+            network=role.network,
+            files=role.files,
+            entry=role.entry,
+            index=post.index if role.indexed else None,
+            path=str(role.path(facts)) if role.path else None,
+        )
+        if role.program is None:
+            return plan
+        program = role.program(facts)
+        return msgspec.structs.replace(
+            plan, argv=program.argv, environment=program_environment(home, dict(program.environment))
+        )
+
+    def _equip_control(self, life: Life) -> None:
+        for name, descriptor in self._kept:
+            life.send(SocketRestored(name), (descriptor,))
+        life.send(SocketsRestored(len(self._kept)))
+        life.send(FirewallReported(isolation=self._isolation, report={}))
+
+    def _link(self, post: Post) -> None:
+        for other in self._posts:
+            if other.role.name in post.role.links and post.life is not None and other.life is not None:
+                link(post.life, other.life)
+
+    # --- what children say --------------------------------------------------------------------------------
+
+    def _received(self, life: Life, message: Any, descriptors: tuple[int, ...]) -> None:
+        allowed = _FROM_ANY + (_FROM_CONTROL if life.role == "control" else ())
+        if not isinstance(message, allowed):
+            for descriptor in descriptors:
+                os.close(descriptor)
+            self._violated(life, f"sent {type(message).__name__}, which it may not send")
+            return
+        match message:
+            case Pong():
+                life.heard()
+            case Ready(detail):
+                self._child_ready(life, detail)
+            case Failed(reason):
+                log.error("process cannot serve", role=life.role, reason=reason)
+                self.stop(reason)
+            case SocketKept(name):
+                self._keep(life, name, descriptors[0])
+            case SocketDropped(name):
+                if name != ADMIN:
+                    self._kept.drop(name)
+            case RouteWanted(host):
+                life.send(RouteFound(host, None))
+            case ApplianceStopRequested(reason):
+                log.warning("control asks to end the appliance", reason=reason)
+                self.stop()
+
+    def _keep(self, life: Life, name: str, descriptor: int) -> None:
+        if name == ADMIN:
+            os.close(descriptor)
+            self._violated(life, "sent a socket under the name of the admin socket")
+            return
+        try:
+            self._kept.keep(name, descriptor)
+        except RefusedSocketError as error:
+            log.error("socket is not kept, a restart of control would lose it", reason=str(error))
+
+    def _child_ready(self, life: Life, detail: dict[str, Any]) -> None:
+        life.ready = True
+        life.heard()
+        if life.role != "control":
+            return
+        try:
+            said = msgspec.convert(detail, ControlReady)
+        except msgspec.ValidationError as error:
+            self._violated(life, f"said it is ready, but not where: {error}")
+            return
+        self._facts = replace(self._facts, rosout_master=said.rosout_master)
+        for post in self._posts:
+            if post.role.after == life.role and post.life is None and post.due is None:
+                self._fill(post)
+        if not self._is_ready:
+            self._is_ready = True
+            self._ready(said)
+
+    def _violated(self, life: Life, what: str) -> None:
+        log.critical("process is killed", role=life.role, pid=life.pid, reason=f"it {what}")
+        life.kill()
+
+    # --- watching -----------------------------------------------------------------------------------------
+
+    async def _watch(self) -> None:
+        before = time.monotonic()
+        while True:
+            await asyncio.sleep(1.0)
+            now = time.monotonic()
+            slept, before = now - before - 1.0, now
+            for post in self._posts:
+                if post.life is not None:
+                    self._look_at(post, post.life, slept)
+
+    def _look_at(self, post: Post, life: Life, slept: float) -> None:
+        if slept > 1.0:
+            life.forgive(slept)
+        if post.role.asks:
+            self._ask(life)
+        elif life.is_program:
+            return
+        else:
+            life.ping()
+        if life.silent_too_long:
+            log.error("process does not answer and is killed", role=life.role, pid=life.pid)
+            life.kill()
+
+    def _ask(self, life: Life) -> None:
+        if self._asking:
+            return
+
+        async def ask() -> None:
+            if await self._answers(10.0):
+                life.heard()
+
+        task = asyncio.create_task(ask())
+        self._asking.add(task)
+        task.add_done_callback(self._asking.discard)
+
+    async def _answers(self, seconds: float) -> bool:
+        return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), seconds)
+
+    def _died(self, life: Life, code: int) -> None:
+        post = next(one for one in self._posts if one.life is life)
+        post.life = None
+        self._someone_died.set()
+        if self._stopping.is_set():
+            return
+        lived = time.monotonic() - life.started
+        post.short_lives = post.short_lives + 1 if lived < _LONG_LIFE_SECONDS else 0
+        log.error("process died", role=life.role, pid=life.pid, end=_end_of(code), lived=round(lived, 3))
+        self._tell_processes()
+        if post.short_lives >= _LOUD_AFTER:
+            if not self._is_ready:
+                self.stop(f"{life.role} died {post.short_lives} times ({_end_of(code)}); the log says why")
+                return
+            log.critical("process keeps dying", role=life.role, times=post.short_lives)
+        self._fill_later(post)
+
+    def _fill_later(self, post: Post) -> None:
+        delay = _BACKOFF[min(max(post.short_lives - 1, 0), len(_BACKOFF) - 1)]
+        post.due = asyncio.get_running_loop().call_later(delay, self._fill, post)
+
+    def _tell_processes(self) -> None:
+        rows = [
+            ProcessInfo(_title(post), life.pid, life.since, post.lives - 1)
+            for post in self._posts
+            if (life := post.life) is not None
+        ]
+        own = ProcessInfo("supervisor", os.getpid(), self._since, 0)
+        self._tell_control(ProcessesChanged([own, *rows]))
+
+    def _tell_control(self, message: Message) -> None:
+        for post in self._posts:
+            if post.role.name == "control" and post.life is not None:
+                post.life.send(message)
+
+    # --- ending -------------------------------------------------------------------------------------------
+
+    async def _end(self) -> None:
+        self._stopping.set()
+        for task in self._asking:
+            task.cancel()
+        for post in self._posts:
+            if post.due is not None:
+                post.due.cancel()
+        await self._end_some([one for one in self._posts if not one.role.outlives_control], _STOP_SECONDS)
+        await self._end_some(self._posts, _LAST_SECONDS)
+
+    async def _end_some(self, posts: list[Post], seconds: float) -> None:
+        for post in posts:
+            if post.life is None:
+                continue
+            if post.life.is_program:
+                post.life.kill(signal.SIGTERM)
+            else:
+                post.life.send(Stop())
+        if await self._all_gone(posts, seconds):
+            return
+        self._signal(posts, signal.SIGTERM)
+        if await self._all_gone(posts, _TERMINATE_SECONDS):
+            return
+        self._signal(posts, signal.SIGKILL)
+        await self._all_gone(posts, _LAST_SECONDS)
+
+    def _signal(self, posts: list[Post], number: signal.Signals) -> None:
+        for post in posts:
+            if post.life is not None:
+                log.warning("process did not end", role=post.role.name, pid=post.life.pid, signal=number.name)
+                post.life.kill(number)
+
+    async def _all_gone(self, posts: list[Post], seconds: float) -> bool:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while any(post.life is not None for post in posts):
+                    self._someone_died.clear()
+                    await self._someone_died.wait()
+        return all(post.life is None for post in posts)
+
+
+def _title(post: Post) -> str:
+    return post.role.name if post.index == 0 else f"{post.role.name}-{post.index}"
+
+
+def _end_of(code: int) -> str:
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"

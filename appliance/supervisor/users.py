@@ -1,0 +1,40 @@
+"""Whom the children run as.
+
+Started as root, each role has a user of its own: the one with the role's name in the user database,
+else a numeric id kept for it (so the appliance also runs where nobody made the users, in a container
+for example). Started otherwise, everything runs as the caller, and nothing is dropped because nothing
+is held.
+"""
+
+import os
+import pwd
+from dataclasses import dataclass
+
+NUMERIC_IDS = {
+    "rosrv": 61011,
+    "rosmaster": 61012,
+    "rosrv-relay": 61013,
+    "rosrv-api": 61014,
+    "rosrv-signer": 61015,
+}
+
+
+@dataclass(frozen=True)
+class Account:
+    """A user as the kernel knows it."""
+
+    name: str
+    uid: int
+    gid: int
+
+
+def account_of(user: str) -> Account:
+    """The account that a role's user stands for here. Raises `KeyError` for a user that is no role's."""
+    numeric = NUMERIC_IDS[user]
+    if os.geteuid() != 0:
+        return Account(user, os.geteuid(), os.getegid())
+    try:
+        entry = pwd.getpwnam(user)
+    except KeyError:
+        return Account(user, numeric, numeric)
+    return Account(user, entry.pw_uid, entry.pw_gid)
