@@ -1,0 +1,109 @@
+"""A record as columns of the database and back. Strangers' text is kept as it is; what cannot be kept is escaped.
+
+Lone surrogates (undecodable bytes), integers beyond 64 bits and objects that are no data cannot be stored in
+SQLite or JSON: they become their escaped or printed form. A record is bounded: past `LARGEST_DETAIL` bytes the
+long strings in it are cut, and say how long they were.
+"""
+
+from typing import Any
+
+import msgspec
+
+from appliance.audit.chain import StoredColumns
+from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference, Severity
+
+LARGEST_DETAIL = 65_536
+LONGEST_TEXT = 4_096
+_DEEPEST = 16
+_MOST_ITEMS = 256
+_encoder = msgspec.json.Encoder(order="deterministic")
+_decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+def to_columns(record: Record, sequence: int) -> StoredColumns:
+    """The columns of a record that takes the place `sequence`. Never fails, whatever the record holds."""
+    try:
+        columns = _columns(record, sequence)
+        if len(columns.detail) <= LARGEST_DETAIL and _short(columns):
+            return columns
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        pass
+    return _columns(_plain_record(record), sequence)
+
+
+def _columns(record: Record, sequence: int) -> StoredColumns:
+    rule = record.rule
+    section, key, file, line = (None,) * 4 if rule is None else (rule.section, rule.key, rule.file, rule.line)
+    return StoredColumns(
+        sequence, record.id, record.time, SCHEMA_VERSION, record.event, record.severity.value, record.decision,
+        record.host, record.caller_id, record.category, record.resource, section, key, file, line,
+        record.revision, record.reason, record.duration_us, _encoder.encode(record.detail),
+    )  # fmt: skip
+
+
+def _short(columns: StoredColumns) -> bool:
+    for value in columns:
+        if type(value) is str:
+            if len(value) > LONGEST_TEXT:
+                return False
+            if not value.isascii():
+                value.encode()
+    return True
+
+
+def from_columns(columns: StoredColumns) -> Record:
+    """The record that was stored."""
+    rule = None
+    if columns.rule is not None:
+        rule = RuleReference(
+            columns.rule, columns.rule_key or "", columns.rule_file or "", columns.rule_line or 0
+        )
+    return Record(
+        id=columns.id, time=columns.time, event=columns.event, severity=Severity(columns.severity),
+        decision=columns.decision, host=columns.host, caller_id=columns.caller_id, category=columns.category,
+        resource=columns.resource, rule=rule, revision=columns.revision, reason=columns.reason,
+        duration_us=columns.duration_us, detail=_decode_detail(columns.detail),
+    )  # fmt: skip
+
+
+def _plain_record(record: Record) -> Record:
+    fields = {name: _plain(getattr(record, name)) for name in record.__struct_fields__ if name not in _TYPED}
+    rule = record.rule
+    if rule is not None:
+        rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), rule.line)
+    detail = _plain(record.detail)
+    if len(_encoder.encode(detail)) > LARGEST_DETAIL:
+        detail = {"cut": "the details were too large to keep", "keys": sorted(detail)[:_MOST_ITEMS]}
+        if len(_encoder.encode(detail)) > LARGEST_DETAIL:
+            del detail["keys"]
+    return Record(**{**fields, "severity": record.severity, "rule": rule, "detail": detail})
+
+
+_TYPED = ("severity", "rule", "detail")
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    if value is None or isinstance(value, bool | float):
+        return value
+    if isinstance(value, int):
+        return value if -(1 << 63) <= value < 1 << 63 else str(value)
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, bytes | bytearray):
+        return _text(bytes(value[:LONGEST_TEXT]).decode("ascii", "backslashreplace"))
+    if depth >= _DEEPEST:
+        return "(nested too deeply)"
+    if isinstance(value, dict):
+        pairs = list(value.items())[:_MOST_ITEMS]
+        plain = {_text(str(key)): _plain(item, depth + 1) for key, item in pairs}
+        return plain if len(value) == len(pairs) else {**plain, "...": f"{len(value) - len(pairs)} more"}
+    if isinstance(value, list | tuple | set | frozenset):
+        items = [_plain(item, depth + 1) for item in list(value)[:_MOST_ITEMS]]
+        return items if len(value) == len(items) else [*items, f"... {len(value) - len(items)} more"]
+    return _text(repr(value))
+
+
+def _text(value: str) -> str:
+    if len(value) > LONGEST_TEXT:
+        value = f"{value[: LONGEST_TEXT - 64]}... ({len(value)} characters)"
+    return value.encode("utf-8", "backslashreplace").decode()

@@ -1,0 +1,35 @@
+"""The stable names of what is recorded: the registry that documentation and search filters are made from.
+
+A name is never reused for something else and never renamed; a new one is added here with its line of
+description before it is recorded.
+"""
+
+EVENTS: dict[str, str] = {
+    "decision": "A request was decided by the policy (allow, deny, would deny).",
+    "registered": "A node registered a publication, subscription, service or parameter subscription.",
+    "unregistered": "A node withdrew a registration.",
+    "revoked": "A registration, grant or connection was taken back because the policy no longer allows it.",
+    "node lost": "A node no longer answers; its registrations are kept back until it returns or is removed.",
+    "node returned": "A lost node answers again.",
+    "takeover": "A node registered under a name that another host holds.",
+    "policy loaded": "A policy came into force; `detail` has who, from where and what changed.",
+    "policy refused": "A new policy has errors and was refused whole; the last good one stays in force.",
+    "process started": "A process of the appliance started.",
+    "process died": "A process of the appliance ended without being told to.",
+    "appliance started": "The appliance is in service.",
+    "appliance stopped": "The appliance ended in an orderly way.",
+    "connection opened": "A subscriber or service client is connected through the relay.",
+    "connection closed": "A connection through the relay ended.",
+    "connection refused": "Somebody connected without a grant, or with a header that is not allowed.",
+    "limit exceeded": "A peer sent more, larger or faster than the limits allow.",
+    "probe failed": "The hidden ROS Master could be reached from outside; nodes are not served until it is mended.",
+    "probe passed": "The ROS Master is hidden (again).",
+    "reconciled": "The reconcile loop found and mended a difference between wanted and seen.",
+    "denials folded": "Repetitions of a denial that was recorded before; `detail` has how many, first and last.",
+    "log begun": "The first record of a new log; `detail.earlier_log_missing` says that a log was here before.",
+    "records removed": "Old records were removed by retention; `detail` has which, how many, why, and their last hash.",
+    "records lost": "Records could not be kept while the log could not be written; `detail` has how many and when.",
+    "checkpoint": "The state of the chain up to the record before was sealed for signing.",
+    "signature refused": "A checkpoint's signature is wrong or made with another key than the pinned one.",
+    "log failed": "The log could not be written for a time and can be again; `detail` has the reason and how long.",
+}

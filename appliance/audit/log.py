@@ -1,0 +1,432 @@
+"""The audit log as its owner sees it: `record` puts a record into a queue, a thread writes it.
+
+Invariants:
+1. `record` never blocks and never raises: it appends to a queue. All else is done by the log's own thread.
+2. Order is kept: what was recorded first has the smaller sequence.
+3. Nothing is dropped silently: while the log cannot be written (`failed`), records wait, up to `queue_limit`;
+   those past it are counted and the count is recorded when writing works again.
+4. A barrier (`flushed`, `wait_durable`) is answered when every record before it is on disk (fsync), or with
+   the reason why it is not; a denial that was folded is on disk as a count.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.folding import Folder, FoldSettings, Key, summary
+from appliance.audit.ids import IdSource
+from appliance.audit.record import Record, Severity
+from appliance.audit.signatures import Signatures, Signer
+from appliance.audit.writer import ChainWriter
+
+Durability = Literal["strict", "batched"]
+Settled = Callable[[str | None], None]
+_GATHER_SECONDS = 0.02
+_RETRY_SECONDS = 0.5
+_LARGEST_BATCH = 2048
+_IDLE_SECONDS = 1.0
+_CLOSE_SECONDS = 10.0
+_WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
+
+
+class Lag(NamedTuple):
+    """How far the disk is behind: records that wait, and seconds since nothing waited."""
+
+    records: int
+    seconds: float
+
+
+class _Barrier(NamedTuple):
+    settled: Settled
+
+
+class _Waiter(NamedTuple):
+    loop: asyncio.AbstractEventLoop
+    future: asyncio.Future[str | None]
+
+
+class _Signature(NamedTuple):
+    number: int
+    signature: bytes
+    public_key: bytes
+
+
+class _AskSignatures(NamedTuple):
+    pass
+
+
+class AuditLog:
+    """The log at `path`, open for writing.
+
+    `durability` says when writing starts: `strict` at once (group commit), `batched` after gathering for 20 ms;
+    both fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is
+    first, and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        durability: Durability = "batched",
+        checkpoint_every: int = 1000,
+        checkpoint_seconds: float = 60.0,
+        fold: FoldSettings | None = None,
+        signer: Signer | None = None,
+        queue_limit: int = 100_000,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.path = path
+        self.ids = IdSource(clock=clock)
+        self.strict = durability == "strict"
+        self._clock = clock
+        self._checkpoint_every = checkpoint_every
+        self._checkpoint_seconds = checkpoint_seconds
+        self._queue_limit = queue_limit
+        self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
+        self._signatures = Signatures(path, signer)
+        self._queue: deque[Any] = deque()
+        self._held: list[Record] = []
+        self._barriers: list[_Barrier | _Waiter] = []
+        self._writer: ChainWriter | None = None
+        self._failed: str | None = "the log is being opened"
+        self._failed_since = 0
+        self._caught_up = time.monotonic()
+        self._unsealed = 0
+        self._sealed_at = time.monotonic()
+        self._lost = _Lost()
+        self._idle = False
+        self._ended = False
+        self._wake = threading.Event()
+        self._hurry = threading.Event()
+        self._stopping = threading.Event()
+        self._opened = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="audit log", daemon=True)
+        self._thread.start()
+        self._opened.wait()
+
+    # --- for the owner, from any thread ---------------------------------------------------------------------
+
+    def record(self, record: Record) -> None:
+        """Take a record into the log. Its `detail` must not be changed afterwards."""
+        if len(self._queue) + len(self._held) >= self._queue_limit:
+            self._lost.add(record)
+        else:
+            self._put(record)
+
+    def flushed(self, settled: Settled) -> None:
+        """Call `settled(None)` when all that was recorded so far is on disk, else `settled(reason)`.
+
+        It is called on the log's thread.
+        """
+        self._put(_Barrier(settled))
+        self._hurry.set()
+
+    async def wait_durable(self) -> str | None:
+        """Wait until all that was recorded so far is on disk; the reason when it cannot be written."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str | None] = loop.create_future()
+        self._put(_Waiter(loop, future))
+        if not self.strict:
+            self._hurry.set()
+        return await future
+
+    @property
+    def failed(self) -> str | None:
+        """Why the log cannot be written now; None when it can."""
+        return self._failed
+
+    @property
+    def lag(self) -> Lag:
+        """How far the disk is behind."""
+        waiting = len(self._queue) + len(self._held)
+        return Lag(waiting, time.monotonic() - self._caught_up if waiting else 0.0)
+
+    def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
+        """The signer's answer: kept if it is right and made with the pinned key, else recorded as refused."""
+        self._put(_Signature(number, signature, public_key))
+
+    def request_signatures(self) -> None:
+        """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
+        self._put(_AskSignatures())
+
+    def close(self) -> None:
+        """Write what waits, make a last checkpoint and close; `failed` says why something was not written."""
+        self._stopping.set()
+        self._hurry.set()
+        self._wake.set()
+        self._thread.join(_CLOSE_SECONDS)
+
+    def _put(self, item: Any) -> None:
+        self._queue.append(item)
+        # The writer sets `_idle` before it looks at the queue a last time: it sees the item or we see idle.
+        if self._idle:
+            self._idle = False
+            self._wake.set()
+        if self._ended:
+            self._refuse_queued()
+
+    # --- the log's thread -----------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            self._serve()
+        except BaseException as error:
+            # A defect of ours: the owner must see that nothing is recorded any more, and deny.
+            self._failed = f"{self.path}: the log's thread ended: {type(error).__name__}: {error}"
+            raise
+        finally:
+            self._failed = self._failed or f"{self.path}: the log is closed"
+            self._ended = True
+            self._opened.set()
+            self._answer_barriers()
+            self._refuse_queued()
+
+    def _refuse_queued(self) -> None:
+        with contextlib.suppress(IndexError):
+            while True:
+                item = self._queue.popleft()
+                if isinstance(item, _Barrier | _Waiter):
+                    _answer([item], self._failed)
+
+    def _serve(self) -> None:
+        self._attempt(self._open)
+        self._opened.set()
+        while not self._stopping.is_set():
+            self._wait()
+            self._turn()
+        self._turn()
+        self._held.extend(self._folder.finish())
+        self._unsealed += len(self._held)
+        if self._attempt(self._write) and self._unsealed:
+            self._attempt(self._seal)
+        self._answer_barriers()
+        if self._writer is not None:
+            self._writer.close()
+
+    def _turn(self) -> None:
+        """Take what is queued, write it, and do what is due."""
+        while True:
+            more = self._drain()
+            now = time.monotonic()
+            self._held.extend(self._folder.expire(now))
+            written = self._attempt(self._write)
+            self._answer_barriers()
+            if not more or not written:
+                break
+        if self._failed is None and self._seal_is_due():
+            self._attempt(self._seal)
+        if self._writer is not None and not self._queue:
+            self._attempt(self._index)
+
+    def _wait(self) -> None:
+        if self._failed is not None:
+            self._stopping.wait(_RETRY_SECONDS)
+            return
+        self._wake.clear()
+        self._idle = True
+        if not self._queue:
+            self._caught_up = time.monotonic()
+            self._wake.wait(self._until_due())
+        self._idle = False
+        if self._queue and not self.strict:
+            self._hurry.wait(_GATHER_SECONDS)
+        self._hurry.clear()
+        if self._stopping.is_set():
+            self._hurry.set()
+
+    def _until_due(self) -> float:
+        now = time.monotonic()
+        due = self._folder.next_due()
+        waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
+        if self._unsealed:
+            waits.append(self._sealed_at + self._checkpoint_seconds - now)
+        return max(0.001, min(waits))
+
+    def _drain(self) -> bool:
+        """Move what is queued to where it is handled; whether more is left."""
+        now = time.monotonic()
+        queue, offer = self._queue, self._folder.offer
+        for _ in range(_LARGEST_BATCH):
+            if not queue:
+                return False
+            item = queue.popleft()
+            if isinstance(item, Record):
+                self._held.extend(offer(item, now))
+            elif isinstance(item, _Signature):
+                self._attempt(partial(self._keep_signature, item))
+            elif isinstance(item, _AskSignatures):
+                self._attempt(self._ask_signatures)
+            else:
+                self._barriers.append(item)
+        return bool(queue)
+
+    def _attempt(self, action: Callable[[], None]) -> bool:
+        """Do something with the database; whether it succeeded. A failure closes it until the next try."""
+        try:
+            if self._writer is None and action != self._open:
+                self._open()
+            action()
+        except _WRITE_ERRORS as error:
+            self._fail(error)
+            return False
+        return True
+
+    def _fail(self, error: Exception) -> None:
+        if self._failed_since == 0:
+            self._failed_since = self._clock()
+        reason = str(error)
+        self._failed = reason if str(self.path) in reason else f"{self.path}: {reason}"
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            with contextlib.suppress(sqlite3.Error):
+                writer.close()
+
+    def _open(self) -> None:
+        earlier = self._signatures.key_was_pinned
+        writer = ChainWriter(self.path, self._clock())
+        self.ids.raise_floor(writer.last_id)
+        self._writer = writer
+        if writer.created:
+            detail = {"log": writer.log_id, "earlier_log_missing": earlier}
+            self._held.insert(
+                0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
+            )
+        self._unsealed = writer.sequence - writer.checkpoint_sequence
+        left = writer.open_folds()
+        if left and not self._folder.touched:
+            writer.close_folds([summary(one, self.ids.next(), self._clock(), recovered=True) for one in left])
+        if not self._failed_since:
+            self._failed = None
+        self._signatures.ask(writer)
+
+    def _write(self) -> None:
+        writer = self._writer
+        if writer is None:
+            raise LogUnreadableError(self._failed or "the log is not open")
+        while self._held or self._folder.touched or self._failed_since:
+            batch = self._held[:_LARGEST_BATCH]
+            touched = tuple(self._folder.touched)
+            report = self._report_of_failure()
+            writer.append(batch + report, [(_fold_key(key), self._folder.state(key)) for key in touched])
+            del self._held[: len(batch)]
+            self._folder.touched.difference_update(touched)
+            self._unsealed += len(batch) + len(report)
+            self._caught_up = time.monotonic()
+            self._failed, self._failed_since = None, 0
+            if self._lost.count:
+                self._held.append(
+                    self._own("records lost", Severity.ALARM, "the queue was full", self._lost.take())
+                )
+
+    def _report_of_failure(self) -> list[Record]:
+        if not self._failed_since:
+            return []
+        detail = {"since": self._failed_since, "until": self._clock()}
+        return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
+
+    def _seal_is_due(self) -> bool:
+        waited = time.monotonic() - self._sealed_at
+        return self._unsealed >= self._checkpoint_every or (
+            self._unsealed > 0 and waited >= self._checkpoint_seconds
+        )
+
+    def _seal(self) -> None:
+        writer = self._writer
+        if writer is None:
+            return
+        self._sealed_at = time.monotonic()
+        checkpoint, text = writer.seal(self._clock())
+        detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
+        writer.append([self._own("checkpoint", Severity.DEBUG, "", detail)])
+        self._unsealed = 0
+        self._signatures.sealed(checkpoint.number, text)
+
+    def _keep_signature(self, item: _Signature) -> None:
+        if self._writer is None:
+            return
+        refusal = self._signatures.keep(self._writer, item.number, item.signature, item.public_key)
+        if refusal is not None:
+            detail = {"number": item.number, "public_key": item.public_key.hex()}
+            self._held.append(self._own("signature refused", Severity.ALARM, refusal, detail))
+
+    def _ask_signatures(self) -> None:
+        if self._writer is not None:
+            self._signatures.ask(self._writer)
+
+    def _index(self) -> None:
+        while self._writer is not None and not self._queue and self._writer.index_text():
+            pass
+
+    def _answer_barriers(self) -> None:
+        result = self._failed if self._held or self._folder.touched else None
+        barriers, self._barriers = self._barriers, []
+        _answer(barriers, result)
+
+    def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> Record:
+        return Record(
+            id=self.ids.next(),
+            time=self._clock(),
+            event=event,
+            severity=severity,
+            reason=reason,
+            detail=detail,
+        )
+
+
+class _Lost:
+    """Counts records that did not fit into the queue."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._first = self._last = 0
+        self._lock = threading.Lock()
+
+    def add(self, record: Record) -> None:
+        with self._lock:
+            self._first = self._first if self.count else record.time
+            self._last = record.time
+            self.count += 1
+
+    def take(self) -> dict[str, Any]:
+        with self._lock:
+            detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
+            self.count = 0
+            return detail
+
+
+def _answer(barriers: list[_Barrier | _Waiter], result: str | None) -> None:
+    """Answer barriers; those of one event loop with one call into it."""
+    for loop, group in itertools.groupby(
+        barriers, lambda one: one.loop if isinstance(one, _Waiter) else None
+    ):
+        futures = []
+        for one in group:
+            if isinstance(one, _Waiter):
+                futures.append(one.future)
+            else:
+                one.settled(result)
+        if loop is not None:
+            # A closed loop raises RuntimeError: nobody waits any more.
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(_settle, futures, result)
+
+
+def _settle(futures: list[asyncio.Future[str | None]], result: str | None) -> None:
+    for future in futures:
+        if not future.done():
+            future.set_result(result)
+
+
+def _fold_key(key: Key) -> bytes:
+    return msgspec.json.encode(key)

@@ -1,0 +1,116 @@
+"""Signatures of checkpoints: which are asked for, and whether what comes back may be kept.
+
+Invariants:
+1. A signature is kept only if it is right for the checkpoint's text and made with the pinned key.
+2. The key of the first right signature is pinned in `<log>.pub` (PEM) and never replaced by the program.
+3. A checkpoint stays unsigned as long as the signer is away and is asked for again (`ask`), oldest first, a
+   bounded number at a time.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
+
+from appliance.audit.writer import ChainWriter
+
+Signer = Callable[[int, bytes], None]
+_ASKED_AT_ONCE = 64
+
+
+class KeyUnreadableError(Exception):
+    """A public key file is missing or is no Ed25519 key in PEM."""
+
+
+def pinned_key_path(log: Path) -> Path:
+    """Where the public key of a log is pinned."""
+    return log.with_name(log.stem + ".pub")
+
+
+def read_public_key(path: Path) -> bytes:
+    """The raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
+    try:
+        key = load_pem_public_key(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise KeyUnreadableError(f"{path}: not a public key in PEM: {error}") from error
+    if not isinstance(key, Ed25519PublicKey):
+        raise KeyUnreadableError(f"{path}: not an Ed25519 public key")
+    return key.public_bytes_raw()
+
+
+def signature_is_right(public_key: bytes, signature: bytes, text: bytes) -> bool:
+    """Whether `signature` over `text` was made with the private half of `public_key`."""
+    try:
+        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, text)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+class Signatures:
+    """Asks the signer for signatures and keeps those that are right."""
+
+    def __init__(self, log: Path, signer: Signer | None) -> None:
+        self._pin = pinned_key_path(log)
+        self._signer = signer
+        self._asked: set[int] = set()
+
+    @property
+    def key_was_pinned(self) -> bool:
+        """Whether a log in this place has ever been signed."""
+        return self._pin.exists()
+
+    def sealed(self, number: int, text: bytes) -> None:
+        """A checkpoint was made: ask for its signature, unless enough are asked for already."""
+        if len(self._asked) < _ASKED_AT_ONCE:
+            self._ask(number, text)
+
+    def ask(self, writer: ChainWriter) -> None:
+        """The signer is (back) in service, or is asked once more: ask for what is still unsigned."""
+        self._asked.clear()
+        if self._signer is not None:
+            for number, text in writer.unsigned(_ASKED_AT_ONCE):
+                self._ask(number, text)
+
+    def _ask(self, number: int, text: bytes) -> None:
+        if self._signer is None:
+            return
+        self._asked.add(number)
+        self._signer(number, text)
+
+    def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
+        """Keep a signature; the reason when it is refused."""
+        self._asked.discard(number)
+        text = writer.checkpoint_text(number)
+        if text is None:
+            return f"there is no checkpoint {number}"
+        if not signature_is_right(public_key, signature, text):
+            return f"the signature of checkpoint {number} is wrong"
+        if self._pin.exists():
+            try:
+                pinned = read_public_key(self._pin)
+            except KeyUnreadableError as error:
+                return str(error)
+            if pinned != public_key:
+                return f"checkpoint {number} was signed with {public_key.hex()}, but {self._pin} has {pinned.hex()}"
+        else:
+            _pin_key(self._pin, public_key)
+        writer.keep_signature(number, signature, public_key)
+        if not self._asked:
+            self.ask(writer)
+        return None
+
+
+def _pin_key(path: Path, public_key: bytes) -> None:
+    key = Ed25519PublicKey.from_public_bytes(public_key)
+    text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    making = path.with_name(path.name + ".new")
+    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o644)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    making.rename(path)

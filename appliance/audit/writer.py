@@ -1,0 +1,234 @@
+"""Appends records to the database and extends the chain. Used by one thread, in one process.
+
+Invariants:
+1. The head (sequence and hash) moves only after the commit that wrote it.
+2. One writer: a lock on `<log>.lock` is held as long as the log is open.
+3. The file is the same one all the time: removed or replaced under us, writing stops with an error.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit import database
+from appliance.audit.chain import (
+    NO_CHECKPOINT,
+    Checkpoint,
+    StoredColumns,
+    checkpoint_hash,
+    genesis,
+    record_hash,
+)
+from appliance.audit.columns import to_columns
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.folding import FoldState
+from appliance.audit.record import Record
+
+# Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy event
+# loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a second.
+_ROWS_PER_INSERT = 64
+_WIDTH = len(StoredColumns._fields) + 1
+_ROW = "(" + ", ".join("?" * _WIDTH) + ")"
+_CHECKED_AT_OPENING = 256
+_TEXT_ROWS = 256
+
+
+def _insert(rows: int) -> str:
+    return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
+
+
+_INSERTS = {rows: _insert(rows) for rows in (_ROWS_PER_INSERT, 8, 1)}
+
+
+class ChainWriter:
+    """The open database of a log, and the head of its chain."""
+
+    def __init__(self, path: Path, begun: int) -> None:
+        """Open the log at `path`, or make it. Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`."""
+        self.path = path
+        self._lock = _take_lock(path)
+        try:
+            self.created = not path.exists()
+            if self.created:
+                database.create(path, begun)
+            self._connection = database.open_for_writing(path)
+            try:
+                self._file = _identity(path)
+                self._read_head()
+            except BaseException:
+                self._connection.close()
+                raise
+        except BaseException:
+            os.close(self._lock)
+            raise
+
+    def _read_head(self) -> None:
+        execute = self._connection.execute
+        (self.log_id,) = execute("SELECT id FROM log").fetchone()
+        rows = execute(
+            f"SELECT {database.COLUMNS}, hash FROM record ORDER BY sequence DESC LIMIT ?",  # noqa: S608  fixed names
+            (_CHECKED_AT_OPENING,),
+        ).fetchall()
+        rows.reverse()
+        self.sequence, self.hash, self.last_id = 0, genesis(self.log_id), ""
+        for number, row in enumerate(rows):
+            follows = number > 0 or row[0] == 1
+            if follows and (row[0] != self.sequence + 1 or record_hash(self.hash, row[:-1]) != row[-1]):
+                raise LogUnreadableError(
+                    f"{self.path}: record {row[0]} does not fit the chain, so the log was changed; run"
+                    " 'rosrv audit verify', keep the file as evidence and move it away to begin a new log"
+                )
+            self.sequence, self.hash = row[0], row[-1]
+            self.last_id = max(self.last_id, row[1])
+        last = execute(
+            "SELECT number, sequence, text FROM checkpoint ORDER BY number DESC LIMIT 1"
+        ).fetchone()
+        self.checkpoint_number, self.checkpoint_sequence, self._checkpoint_hash = 0, 0, NO_CHECKPOINT
+        if last is not None:
+            self.checkpoint_number, self.checkpoint_sequence = last[0], last[1]
+            self._checkpoint_hash = checkpoint_hash(last[2])
+
+    def append(self, records: Sequence[Record], folds: Iterable[tuple[bytes, FoldState | None]] = ()) -> None:
+        """Write records and what is counted but not yet summarised, in one transaction, to the disk."""
+        self._check_file()
+        execute = self._connection.execute
+        execute("BEGIN IMMEDIATE")
+        try:
+            sequence, digest, last_id = self._insert(records)
+            for key, state in folds:
+                if state is None:
+                    execute("DELETE FROM open_fold WHERE key = ?", (key,))
+                else:
+                    execute(
+                        "INSERT OR REPLACE INTO open_fold VALUES (?, ?)", (key, msgspec.json.encode(state))
+                    )
+            execute("COMMIT")
+        except BaseException:
+            self._roll_back()
+            raise
+        self.sequence, self.hash, self.last_id = sequence, digest, last_id
+
+    def _insert(self, records: Sequence[Record]) -> tuple[int, bytes, str]:
+        sequence, digest, last_id = self.sequence, self.hash, self.last_id
+        position, remaining = 0, len(records)
+        while remaining:
+            rows = next(size for size in _INSERTS if size <= remaining)
+            values: list[object] = []
+            for record in records[position : position + rows]:
+                sequence += 1
+                columns = to_columns(record, sequence)
+                digest = record_hash(digest, columns)
+                values += columns
+                values.append(digest)
+                last_id = max(last_id, columns.id)
+            self._connection.execute(_INSERTS[rows], values)
+            position += rows
+            remaining -= rows
+        return sequence, digest, last_id
+
+    def seal(self, time: int) -> tuple[Checkpoint, bytes]:
+        """Make the next checkpoint, over everything written so far."""
+        checkpoint = Checkpoint(
+            self.log_id,
+            self.checkpoint_number + 1,
+            self.sequence,
+            self.hash.hex(),
+            time,
+            self._checkpoint_hash,
+        )
+        text = checkpoint.text()
+        self._check_file()
+        self._connection.execute(
+            "INSERT INTO checkpoint (number, sequence, text) VALUES (?, ?, ?)",
+            (checkpoint.number, checkpoint.sequence, text),
+        )
+        self.checkpoint_number, self.checkpoint_sequence = checkpoint.number, checkpoint.sequence
+        self._checkpoint_hash = checkpoint_hash(text)
+        return checkpoint, text
+
+    def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
+        """Number and text of checkpoints that wait for their signature, oldest first."""
+        query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
+        return self._connection.execute(query, (limit,)).fetchall()
+
+    def checkpoint_text(self, number: int) -> bytes | None:
+        """The text of a checkpoint."""
+        row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
+        return None if row is None else bytes(row[0])
+
+    def keep_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
+        """Store a checkpoint's signature, once."""
+        self._connection.execute(
+            "UPDATE checkpoint SET signature = ?, public_key = ? WHERE number = ? AND signature IS NULL",
+            (signature, public_key, number),
+        )
+
+    def open_folds(self) -> list[FoldState]:
+        """What was counted and not summarised when the log was last closed by a crash."""
+        rows = self._connection.execute("SELECT state FROM open_fold").fetchall()
+        return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
+
+    def close_folds(self, summaries: Sequence[Record]) -> None:
+        """Write the summaries of `open_folds` in place of them."""
+        keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
+        self.append(summaries, [(key, None) for key in keys])
+
+    def index_text(self) -> bool:
+        """Enter some more records into the full-text index; whether there is more to enter."""
+        self._check_file()
+        (through,) = self._connection.execute("SELECT through FROM indexed").fetchone()
+        if through >= self.sequence:
+            return False
+        end = min(through + _TEXT_ROWS, self.sequence)
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            self._connection.execute(
+                f"INSERT INTO words (rowid, text) SELECT sequence, {database.TEXT_OF_RECORD} FROM record"  # noqa: S608  fixed names
+                " WHERE sequence > ? AND sequence <= ?",
+                (through, end),
+            )
+            self._connection.execute("UPDATE indexed SET through = ?", (end,))
+            self._connection.execute("COMMIT")
+        except BaseException:
+            self._roll_back()
+            raise
+        return bool(end < self.sequence)
+
+    def _check_file(self) -> None:
+        if _identity(self.path) != self._file:
+            raise LogUnreadableError(
+                f"{self.path}: the log was removed or replaced while it was written; put it back, or stop the"
+                " appliance and move what is there away to begin a new log"
+            )
+
+    def _roll_back(self) -> None:
+        if self._connection.in_transaction:
+            self._connection.execute("ROLLBACK")
+
+    def close(self) -> None:
+        """Close the database and let another writer have it."""
+        try:
+            self._connection.close()
+        finally:
+            os.close(self._lock)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _take_lock(path: Path) -> int:
+    lock = os.open(path.with_name(path.name + ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise LogUnreadableError(f"{path}: another process writes this log") from error
+    return lock
