@@ -35,8 +35,8 @@ def resolve(name: str, caller_id: str) -> str:
     """Return the canonical global name of the topic, service or node that `name` is for `caller_id`.
 
     `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id`
-    is the global namespace, as for ROSMaster. Raises `InvalidNameError` for a name outside the ROS grammar, for
-    the global namespace itself, and for a relative name of a caller that has no valid name.
+    is the global namespace, as for ROSMaster. Raises `InvalidNameError` for a name outside the ROS grammar,
+    for the global namespace itself, and for a relative name of a caller that has no valid name.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -61,8 +61,8 @@ def check_caller_id(caller_id: str) -> str:
     """Return `caller_id` unchanged; raises `InvalidNameError` unless it is a canonical global name."""
     if _CANONICAL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
         raise InvalidNameError(
-            f"caller_id {_show(caller_id)} is not a global ROS name: write it as /name or /namespace/name, with "
-            f"letters, digits and '_', no '//' and no '/' at the end, at most {MAX_NAME_LENGTH} characters"
+            f"caller_id {_show(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
+            f"with letters, digits and '_', no '//', no '/' at the end, at most {MAX_NAME_LENGTH} characters"
         )
     return caller_id
 

@@ -1,4 +1,4 @@
-"""XML-RPC as ROS 1 speaks it, without I/O: bytes to values under limits, values to bytes.
+"""Reading an XML-RPC document: bytes to values under limits.
 
 Reading is a walk over one table, `_GRAMMAR`: what may stand in which element, in which order. Elements,
 attributes, text between elements and values that the table or XML-RPC do not know are refused. Beside the
@@ -9,113 +9,18 @@ Invariants:
 
 1. The document starts with an optional XML declaration and the root element. So there is no document type,
    hence no entity but the five of XML, no external reference; processing instructions are refused anywhere.
-2. One pass in time linear in the body; nothing is kept but values, and number, depth and size are bounded.
-3. A value that `parse_*` returns has one notation: `build_*` of it is read back as the same value by us, by
-   Python's `xmlrpc.client` (rosmaster, rospy) and, `\\r` apart, by XmlRpc++ (roscpp).
-4. Every error of a parser is a `PeerError`; every error of a builder is an `EncodingError`.
+2. One pass in time linear in the body; only values are kept; their number, depth and size are bounded.
+3. Every error is a `PeerError`, with the byte where it was seen.
 """
 
 import binascii
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from datetime import datetime
-from typing import Any, TypeAlias
 from xml.parsers import expat
 
-from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
-
-Value: TypeAlias = "bool | int | float | str | bytes | datetime | list[Value] | dict[str, Value] | None"
-"""What a parameter or an answer of XML-RPC can be."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Upper bounds for one document; the defaults are beyond what a large robot sends."""
-
-    body: int = 16 << 20  # bytes
-    elements: int = 1_000_000  # values, those in arrays and structs included
-    depth: int = 100  # nested arrays and structs
-    string: int = 8 << 20  # characters of one string, bytes of one base64 value
-    parts: int = 100_000  # calls in one system.multicall
-
-
-DEFAULT_LIMITS = Limits()
-
-
-@dataclass(frozen=True, slots=True)
-class MethodCall:
-    """A request: the name of the method, as it came, and its parameters."""
-
-    method: str
-    params: tuple[Value, ...]
-
-
-class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the answer was a fault
-    """The answer was a fault: the method could not be carried out."""
-
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(f"fault {code}: {text}")
-        self.code = code
-        self.text = text
-
-
-def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
-    """Parse a request; raises `ProtocolError` or `LimitExceededError`."""
-    document = _Document(body, limits, "methodCall")
-    params = document.values
-    if document.method == "system.multicall" and params:
-        parts = params[0]
-        if isinstance(parts, list) and len(parts) > limits.parts:
-            raise LimitExceededError(
-                f"system.multicall of {len(parts)} calls; at most {limits.parts} are allowed"
-            )
-    return MethodCall(document.method, tuple(params))
-
-
-def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value:
-    """Parse an answer; raises `FaultReceived` if it is a fault, `ProtocolError` or `LimitExceededError`."""
-    document = _Document(body, limits, "methodResponse")
-    if len(document.values) != 1:
-        raise ProtocolError(f"answer with {len(document.values)} values; it has one")
-    value = document.values[0]
-    if not document.is_fault:
-        return value
-    if isinstance(value, dict):
-        code, text = value.get("faultCode"), value.get("faultString")
-        if type(code) is int and isinstance(text, str):
-            raise FaultReceived(code, text)
-    raise ProtocolError("fault without an integer faultCode and a string faultString")
-
-
-def build_call(method: str, params: Sequence[Value]) -> bytes:
-    """Write a request; raises `EncodingError` for what XML-RPC has no notation for."""
-    out = ["<?xml version='1.0'?>\n<methodCall>\n<methodName>", _text(method), "</methodName>\n<params>\n"]
-    for value in params:
-        out.append("<param>\n")
-        _write(value, out, 0)
-        out.append("</param>\n")
-    out.append("</params>\n</methodCall>\n")
-    return "".join(out).encode()
-
-
-def build_response(value: Value) -> bytes:
-    """Write an answer; raises `EncodingError` for what XML-RPC has no notation for."""
-    out = ["<?xml version='1.0'?>\n<methodResponse>\n<params>\n<param>\n"]
-    _write(value, out, 0)
-    out.append("</param>\n</params>\n</methodResponse>\n")
-    return "".join(out).encode()
-
-
-def build_fault(code: int, text: str) -> bytes:
-    """Write a fault; characters of `text` that XML has no notation for are replaced by `?`."""
-    out = ["<?xml version='1.0'?>\n<methodResponse>\n<fault>\n"]
-    _write({"faultCode": code, "faultString": _NOT_XML.sub("?", text)}, out, 0)
-    out.append("</fault>\n</methodResponse>\n")
-    return "".join(out).encode()
-
-
-# --- reading ----------------------------------------------------------------------------------------------
+from appliance.ros.errors import LimitExceededError, ProtocolError
+from appliance.ros.xmlrpc.values import Limits, Value
 
 _HEAD = re.compile(
     rb"(?:\xef\xbb\xbf)?"
@@ -164,10 +69,11 @@ _DATE_TIME = re.compile(
     r"[ \t\r\n]*([0-9]{4})([0-9]{2})([0-9]{2})T([0-9]{2}):([0-9]{2}):([0-9]{2})[ \t\r\n]*\Z"
 )
 _BASE64 = re.compile(r"[A-Za-z0-9+/]*={0,2}\Z")
+_PIECE = 64 << 10  # bytes given to expat at once
 _NO_SPACE = str.maketrans("", "", _SPACE)
 
 
-class _Document:
+class Document:
     """One document while it is read; afterwards `method`, `values` and `is_fault` are what was in it."""
 
     __slots__ = ("_depth", "_elements", "_expat", "_follow", "_keys", "_limits", "_stack", "_state", "_text",
@@ -196,12 +102,31 @@ class _Document:
         parser.CharacterDataHandler = self._text.append
         parser.ProcessingInstructionHandler = self._refuse_instruction
         try:
-            parser.Parse(body, True)
+            self._parse(body)
         except expat.ExpatError as error:
             what = expat.ErrorString(error.code)
             raise ProtocolError(f"not well-formed XML at byte {parser.ErrorByteIndex}: {what}") from None
         finally:
             del self._expat  # the parser refers to this object: no cycle is left behind
+
+    def _parse(self, body: bytes) -> None:
+        """Feed the parser in pieces, and refuse a tag that is longer than one.
+
+        When a handler raises, expat still goes through the rest of its piece and keeps a stack of the
+        elements it sees there. A tag that a piece does not end is looked at again with the next one, and its
+        attributes are collected. Small pieces and short tags bound all three.
+        """
+        parser = self._expat
+        if len(body) <= _PIECE:
+            parser.Parse(body, True)
+            return
+        view = memoryview(body)
+        for start in range(0, len(body), _PIECE):
+            piece = view[start : start + _PIECE]
+            parser.Parse(piece, False)
+            if start + len(piece) - parser.CurrentByteIndex > _PIECE:
+                raise self._error(f"a tag or comment of more than {_PIECE} bytes")
+        parser.Parse(b"", True)
 
     def _start(self, tag: str, attributes: list[str]) -> None:
         follow = _GRAMMAR[self._state].get(tag)
@@ -335,17 +260,17 @@ class _Document:
         return ProtocolError(f"not XML-RPC at byte {self._expat.CurrentByteIndex}: {what}")
 
 
-_READ: Mapping[str, Callable[[_Document], Value]] = {
-    "string": _Document._string,
-    "int": _Document._integer,
-    "i4": _Document._integer,
-    "boolean": _Document._boolean,
-    "double": _Document._double,
-    "dateTime.iso8601": _Document._date_time,
-    "base64": _Document._base64,
-    "nil": _Document._nil,
-    "name": _Document._member_name,
-    "methodName": _Document._method_name,
+_READ: Mapping[str, Callable[[Document], Value]] = {
+    "string": Document._string,
+    "int": Document._integer,
+    "i4": Document._integer,
+    "boolean": Document._boolean,
+    "double": Document._double,
+    "dateTime.iso8601": Document._date_time,
+    "base64": Document._base64,
+    "nil": Document._nil,
+    "name": Document._member_name,
+    "methodName": Document._method_name,
 }
 
 
@@ -363,103 +288,3 @@ def _check_head(body: bytes, limits: Limits, root: str) -> None:
         raise ProtocolError(f"encoding {encoding.decode()} at byte {head.start(1)}; write UTF-8")
     if found != root:
         raise ProtocolError(f"<{found}> at byte {head.start(2) - 1}; expected <{root}>")
-
-
-# --- writing ----------------------------------------------------------------------------------------------
-
-_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
-_MAX_WRITE_DEPTH = 200  # well below Python's own limit, far above what is read
-
-
-def _text(string: str) -> str:
-    if not string.isprintable():
-        bad = _NOT_XML.search(string)
-        if bad is not None:
-            raise EncodingError(
-                f"string with {bad[0]!a} at {bad.start()}: XML has no notation for this character"
-            )
-    if "&" in string:
-        string = string.replace("&", "&amp;")
-    if "<" in string:
-        string = string.replace("<", "&lt;")
-    if ">" in string:
-        string = string.replace(">", "&gt;")
-    if "\r" in string:
-        string = string.replace("\r", "&#13;")  # a bare one is read back as a line feed
-    return string
-
-
-def _write(value: Value, out: list[str], depth: int) -> None:
-    if depth > _MAX_WRITE_DEPTH:
-        raise EncodingError(f"value nested deeper than {_MAX_WRITE_DEPTH}")
-    writer = _WRITERS.get(type(value))
-    if writer is None:
-        raise EncodingError(f"value of type {type(value).__name__}: XML-RPC has no notation for it")
-    writer(value, out, depth)
-
-
-def _write_string(value: str, out: list[str], _depth: int) -> None:
-    out.append(f"<value><string>{_text(value)}</string></value>\n")
-
-
-def _write_boolean(value: bool, out: list[str], _depth: int) -> None:
-    out.append("<value><boolean>1</boolean></value>\n" if value else "<value><boolean>0</boolean></value>\n")
-
-
-def _write_integer(value: int, out: list[str], _depth: int) -> None:
-    if not -0x80000000 <= value <= 0x7FFFFFFF:
-        raise EncodingError(f"integer {value}: XML-RPC integers have 32 bits")
-    out.append(f"<value><int>{value}</int></value>\n")
-
-
-def _write_double(value: float, out: list[str], _depth: int) -> None:
-    out.append(f"<value><double>{value!r}</double></value>\n")
-
-
-def _write_date_time(value: datetime, out: list[str], _depth: int) -> None:
-    if value.tzinfo is not None or value.microsecond:
-        raise EncodingError(f"time {value}: XML-RPC has whole seconds and no time zones")
-    text = (
-        f"{value.year:04}{value.month:02}{value.day:02}T{value.hour:02}:{value.minute:02}:{value.second:02}"
-    )
-    out.append(f"<value><dateTime.iso8601>{text}</dateTime.iso8601></value>\n")
-
-
-def _write_base64(value: bytes, out: list[str], _depth: int) -> None:
-    out.append(f"<value><base64>\n{binascii.b2a_base64(value).decode()}</base64></value>\n")
-
-
-def _write_array(value: Sequence[Value], out: list[str], depth: int) -> None:
-    out.append("<value><array><data>\n")
-    for item in value:
-        _write(item, out, depth + 1)
-    out.append("</data></array></value>\n")
-
-
-def _write_struct(value: Mapping[str, Value], out: list[str], depth: int) -> None:
-    out.append("<value><struct>\n")
-    for key, item in value.items():
-        if not isinstance(key, str):
-            raise EncodingError(f"struct member {key!a}: its name is not a string")
-        out.append(f"<member>\n<name>{_text(key)}</name>\n")
-        _write(item, out, depth + 1)
-        out.append("</member>\n")
-    out.append("</struct></value>\n")
-
-
-def _write_nil(_value: None, _out: list[str], _depth: int) -> None:
-    raise EncodingError("None: ROS has no notation for it (roscpp and rosmaster cannot read or send <nil/>)")
-
-
-_WRITERS: Mapping[type, Callable[[Any, list[str], int], None]] = {
-    str: _write_string,
-    bool: _write_boolean,
-    int: _write_integer,
-    float: _write_double,
-    datetime: _write_date_time,
-    bytes: _write_base64,
-    list: _write_array,
-    tuple: _write_array,
-    dict: _write_struct,
-    type(None): _write_nil,
-}
