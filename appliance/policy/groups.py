@@ -1,0 +1,228 @@
+"""The right side of a rule: groups, addresses, networks, `host:NAME` and `*`, as atoms of a host table."""
+
+import ipaddress
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.hosts import EVERYONE, Atom, HostTable, Network, canonical_network
+from appliance.policy.model import Address
+from appliance.policy.reader import Entry, SectionText, Word
+
+ROBOT = "robot"
+_HOST = "host:"
+_GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*", re.ASCII)
+_HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
+_LIKE_ADDRESS = re.compile(r"[0-9.]+(/.*)?|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%.*)?(/.*)?|[0-9.]*/.*", re.ASCII)
+_SHOWN_LIMIT = 80
+
+
+@dataclass(slots=True)
+class Group:
+    """One line of `[Groups]`; `used` says whether a rule or another group names it."""
+
+    atom: Atom
+    word: Word | None
+    values: tuple[Word, ...] = ()
+    used: bool = False
+
+
+class Groups:
+    """The groups of one file; `atoms(words)` is what a value means, with every mistake in it noted."""
+
+    def __init__(
+        self,
+        table: HostTable,
+        findings: Findings,
+        hosts: Mapping[str, Address],
+        robot: Collection[Address | Network],
+    ) -> None:
+        self.robot = tuple(_as_network(member) for member in robot)
+        self.groups: dict[str, Group] = {ROBOT: Group(table.group(), None, used=True)}
+        self._table = table
+        self._findings = findings
+        self._hosts = hosts
+        self._kept: dict[str, Atom] = {}
+        self._warned_loopback = False
+        self._warned_hosts: set[str] = set()
+        table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
+
+    def define(self, section: SectionText | None) -> None:
+        """Read `[Groups]`: groups may name groups that stand below them."""
+        if section is None:
+            return
+        for entry in section.entries:
+            self._declare(entry)
+        for group in self.groups.values():
+            self._table.put(self.atoms(group.values), group.atom)
+        self._find_cycles()
+
+    def _declare(self, entry: Entry) -> None:
+        word = entry.key
+        first = self.groups.get(word.text)
+        if word.text == ROBOT:
+            text = (
+                'the group "robot" is predefined (the machine the appliance stands next to): use another name'
+            )
+            self._findings.error(word.line, word.column, text)
+        elif first is not None and first.word is not None:
+            text = f"the group {quoted(word.text)} is defined already at line {first.word.line}"
+            self._findings.error(word.line, word.column, text)
+        elif not _GROUP_NAME.fullmatch(word.text):
+            text = f"{quoted(word.text)} is not a group name: letters, digits and _ . - after a letter"
+            self._findings.error(word.line, word.column, text)
+        else:
+            self.groups[word.text] = Group(self._table.group(), word, entry.values)
+
+    def atoms(self, words: Iterable[Word]) -> frozenset[Atom]:
+        """The atoms of a value; words that mean nothing are errors, words said twice are warnings."""
+        atoms: set[Atom] = set()
+        for word in words:
+            if self._findings.full:
+                break
+            atom = self._atom(word)
+            if atom is None:
+                continue
+            if atom in atoms:
+                self._findings.warn(
+                    word.line, word.column, f"{quoted(word.text)} is said twice in this value"
+                )
+            atoms.add(atom)
+        return frozenset(atoms)
+
+    def _atom(self, word: Word) -> Atom | None:
+        text = word.text
+        if text == "*":
+            return EVERYONE
+        group = self.groups.get(text)
+        if group is not None:
+            group.used = True
+            return group.atom
+        if text.startswith(_HOST):
+            return self._enrolled(word)
+        if text not in self._kept:
+            network = self._network(word)
+            if network is None:
+                return None
+            self._kept[text] = self._table.network(network)
+        return self._kept[text]
+
+    def _network(self, word: Word) -> Network | None:
+        text = word.text
+        if not _LIKE_ADDRESS.fullmatch(text):
+            wanted = meant(text, self.groups) or "; a value is a group, an address, a network, host:NAME or *"
+            self._findings.error(word.line, word.column, f"no group {quoted(text)} is defined{wanted}")
+            return None
+        try:
+            network = canonical_network(ipaddress.ip_network(text))
+        except ValueError:
+            self._findings.error(word.line, word.column, _address_fault(text))
+            return None
+        if network.is_loopback and self.robot and not self._warned_loopback and not self._robot_is_loopback():
+            self._warned_loopback = True
+            robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
+            fault = f"{text} is the appliance itself here; the robot is {robot}: write robot if you mean it"
+            self._findings.warn(word.line, word.column, fault)
+        return network
+
+    def _robot_is_loopback(self) -> bool:
+        return any(member.is_loopback for member in self.robot)
+
+    def _enrolled(self, word: Word) -> Atom | None:
+        name = word.text.removeprefix(_HOST)
+        address = self._hosts.get(name)
+        if address is not None:
+            return self._table.network(_as_network(address))
+        if not _HOST_NAME.fullmatch(name):
+            text = f"{quoted(word.text)} is not host:NAME with the name of a certificate"
+            self._findings.error(word.line, word.column, text)
+        elif name not in self._warned_hosts:
+            self._warned_hosts.add(name)
+            guess = meant(name, self._hosts.keys())
+            text = f"no host {quoted(name)} is enrolled: host:{name} matches nobody until it is{guess}"
+            self._findings.warn(word.line, word.column, text)
+        return None
+
+    def _find_cycles(self) -> None:
+        """Note an error for each group that contains itself, once per cycle."""
+        done: set[str] = {ROBOT}
+        for start in self.groups:
+            path: list[str] = []
+            on_path: set[str] = set()
+            waiting: list[tuple[str, bool]] = [(start, True)]
+            while waiting:
+                name, entering = waiting.pop()
+                if not entering:
+                    on_path.discard(path.pop())
+                    done.add(name)
+                elif name in on_path:
+                    self._note_cycle(path[path.index(name) :])
+                elif name not in done:
+                    path.append(name)
+                    on_path.add(name)
+                    waiting.append((name, False))
+                    values = self.groups[name].values
+                    waiting.extend((w.text, True) for w in values if w.text in self.groups)
+
+    def _note_cycle(self, cycle: list[str]) -> None:
+        word = self.groups[cycle[0]].word
+        if word is not None:
+            shown = cycle if len(cycle) < 8 else [*cycle[:6], "…"]
+            text = f"the group contains itself: {' = '.join([*shown, cycle[0]])}"
+            self._findings.error(word.line, word.column, text)
+
+    def shown(self, words: Iterable[Word]) -> str:
+        """A value for a person: groups with few addresses are spelled out."""
+        parts: list[str] = []
+        length = 0
+        for word in words:
+            part = self._spelled_out(word)
+            if parts and length + len(part) > _SHOWN_LIMIT:
+                parts.append("…")
+                break
+            parts.append(part)
+            length += len(part) + 2
+        return ", ".join(parts)
+
+    def _spelled_out(self, word: Word) -> str:
+        text = word.text if len(word.text) <= _SHOWN_LIMIT else word.text[:_SHOWN_LIMIT] + "…"
+        if text.startswith(_HOST):
+            address = self._hosts.get(text.removeprefix(_HOST))
+            return f"{text} ({address})" if address else f"{text} (not enrolled)"
+        if text == ROBOT:
+            members = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
+            return f"robot ({members})" if 0 < len(members) <= 40 else text
+        group = self.groups.get(text)
+        if group is None:
+            return "every host" if text == "*" else text
+        inside = ", ".join(member.text for member in group.values[:3])
+        return f"{text} ({inside})" if len(group.values) <= 2 and 0 < len(inside) <= 40 else text
+
+
+def _as_network(member: Address | Network) -> Network:
+    if isinstance(member, ipaddress.IPv4Network | ipaddress.IPv6Network):
+        return canonical_network(member)
+    return canonical_network(ipaddress.ip_network(int(member)) if member.version == 4 else _single_v6(member))
+
+
+def _single_v6(address: Address) -> Network:
+    return ipaddress.IPv6Network((int(address), 128))
+
+
+def _address_fault(text: str) -> str:
+    """Why a text that looks like an address or a network is none."""
+    address, slash, _ = text.partition("/")
+    if "%" in text:
+        return f"{quoted(text)} has a zone: write the address alone"
+    try:
+        ipaddress.ip_address(address)
+    except ValueError:
+        return f"{quoted(text)} is not an IP address"
+    if not slash:
+        return f"{quoted(text)} is not an IP address"
+    try:
+        network = ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        return f"{quoted(text)} is not a network: the part after the slash is a number of bits"
+    return f"{quoted(text)} has bits set beyond its prefix: did you mean {network} or {address}?"

@@ -1,0 +1,119 @@
+"""Which hosts a rule means: networks, groups, and a prefix tree that knows which of them hold an address.
+
+Every network and every group is a number (an *atom*). A rule keeps the atoms of its value; a host has the
+atoms of all networks that contain it and of all groups that contain those. A rule means a host when they share
+an atom, so neither memory nor time multiplies rules by group sizes.
+
+Invariants:
+1. An IPv4 address that arrives mapped into IPv6 (::ffff:a.b.c.d) is the IPv4 address.
+2. Atoms of a host are computed once and kept for at most `_KEPT_HOSTS` hosts.
+"""
+
+import ipaddress
+from collections.abc import Iterable
+from typing import Final
+
+from appliance.policy.model import Address
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+Atom = int
+
+EVERYONE: Final[Atom] = 0
+"""The atom of `*`: every host has it."""
+
+_KEPT_HOSTS = 1024
+_BITS = {4: 32, 6: 128}
+
+
+def canonical_address(address: Address) -> Address:
+    """The IPv4 address of an IPv4-mapped IPv6 address; any other address as it is."""
+    if isinstance(address, ipaddress.IPv6Address):
+        return address.ipv4_mapped or address
+    return address
+
+
+def canonical_network(network: Network) -> Network:
+    """The IPv4 network of a network within ::ffff:0:0/96; any other network as it is."""
+    if isinstance(network, ipaddress.IPv6Network) and network.prefixlen >= 96:
+        mapped = network.network_address.ipv4_mapped
+        if mapped is not None:
+            return ipaddress.IPv4Network((int(mapped), network.prefixlen - 96))
+    return network
+
+
+class HostTable:
+    """Networks and groups of one policy; built once, then only asked."""
+
+    __slots__ = ("_kept", "_lengths", "_networks", "_parents", "_tables")
+
+    def __init__(self) -> None:
+        self._parents: list[list[Atom]] = [[]]  # of each atom; atom 0 is EVERYONE
+        self._networks: dict[Network, Atom] = {}
+        # version -> prefix length -> leading bits -> atom of the network
+        self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
+        self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
+        self._kept: dict[tuple[int, int], frozenset[Atom]] = {}
+
+    def network(self, network: Network) -> Atom:
+        """The atom of a network, made when it is new."""
+        network = canonical_network(network)
+        atom = self._networks.get(network)
+        if atom is None:
+            atom = self._networks[network] = self.group()
+            shift = _BITS[network.version] - network.prefixlen
+            bits = int(network.network_address) >> shift
+            table = self._tables[network.version].setdefault(network.prefixlen, {})
+            table[bits] = atom
+            self._lengths[network.version] = [
+                (_BITS[network.version] - length, entries)
+                for length, entries in self._tables[network.version].items()
+            ]
+        return atom
+
+    def group(self) -> Atom:
+        """A new atom."""
+        self._parents.append([])
+        return len(self._parents) - 1
+
+    def put(self, members: Iterable[Atom], group: Atom) -> None:
+        """Make atoms members of a group."""
+        for member in members:
+            self._parents[member].append(group)
+
+    def parents(self, atom: Atom) -> list[Atom]:
+        """The groups that contain the atom directly."""
+        return self._parents[atom]
+
+    def atoms_of(self, address: Address) -> frozenset[Atom]:
+        """Every atom that holds the address; `EVERYONE` always among them."""
+        key = (address.version, int(address))
+        kept = self._kept.get(key)
+        if kept is None:
+            if len(self._kept) >= _KEPT_HOSTS:
+                self._kept.clear()
+            kept = self._kept[key] = self._find(canonical_address(address))
+        return kept
+
+    def _find(self, address: Address) -> frozenset[Atom]:
+        number = int(address)
+        waiting = [EVERYONE]
+        for shift, table in self._lengths[address.version]:
+            atom = table.get(number >> shift)
+            if atom is not None:
+                waiting.append(atom)
+        return self.above(waiting)
+
+    def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
+        """The atoms and every group that contains one of them, at any depth."""
+        waiting = list(atoms)
+        found = set(waiting)
+        while waiting:
+            for parent in self._parents[waiting.pop()]:
+                if parent not in found:
+                    found.add(parent)
+                    waiting.append(parent)
+        return frozenset(found)
+
+    def networks(self) -> dict[Network, Atom]:
+        """Every network of the policy and its atom."""
+        return dict(self._networks)

@@ -1,0 +1,286 @@
+"""A compiled policy, and the one function that decides: `Policy.decide(request)`.
+
+Pure: the same request always gets the same answer, without I/O and without a clock.
+
+Invariants:
+1. What no rule grants is denied, except that a missing extension section leaves its category free.
+2. Exactly one rule decides a request: the most specific key of its section, or `default`.
+3. `Decision.reason` is a sentence shorter than 300 characters.
+4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
+"""
+
+import ipaddress
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from appliance.policy import commands
+from appliance.policy.findings import Finding, quoted
+from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
+from appliance.policy.keys import Key, KeyTree
+from appliance.policy.model import Address, Category, Decision, Request, Rule
+from appliance.policy.names import is_resolved_name
+from appliance.policy.sections import BY_CATEGORY, PHRASES
+
+DEFAULT_PORTS = range(19001, 21001)
+
+_KEPT_DECISIONS = 8192
+_KEPT_NAME = 256
+_PARAMETERS = frozenset({Category.READ, Category.WRITE})
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledRule:
+    """One line of a deciding section; `key` is None for `default`, `shown` names its hosts for a person."""
+
+    rule: Rule
+    key: Key | None
+    atoms: frozenset[Atom]
+    shown: str
+    column: int
+
+    def grants(self, atoms: frozenset[Atom]) -> bool:
+        """Whether a host with these atoms is among the hosts of the rule."""
+        return not self.atoms.isdisjoint(atoms)
+
+
+@dataclass(slots=True)
+class RuleTable:
+    """The rules of one category; `audit_only` lets pass what they deny."""
+
+    tree: KeyTree[CompiledRule] = field(default_factory=KeyTree)
+    default: CompiledRule | None = None
+    rules: list[CompiledRule] = field(default_factory=list)
+    audit_only: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyParts:
+    """What the compiler hands over; see the attributes of `Policy` of the same names."""
+
+    text: str
+    file: str
+    warnings: tuple[Finding, ...]
+    hosts: HostTable
+    named: frozenset[Atom]
+    tables: Mapping[Category, RuleTable]
+    present: frozenset[Category]
+    ports: range
+    monitored_topics: frozenset[str]
+    monitored_services: frozenset[str]
+    takeover: str
+    enrolled: Mapping[str, Address]
+    robot: tuple[Network, ...]
+
+
+class Policy:
+    """A policy in force (or about to be); made by `compile_policy` only.
+
+    `text` and `file` are what it was compiled from; `warnings` the lint; `ports` the ports for node proxies
+    and relay; `monitored_topics` and `monitored_services` the names in `[Monitor]`; `takeover` is `same-host` or
+    `granted`; `enrolled` and `robot` are the addresses that were given for `host:NAME` and `robot`.
+    """
+
+    def __init__(self, parts: PolicyParts) -> None:
+        self.text = parts.text
+        self.file = parts.file
+        self.warnings = parts.warnings
+        self.ports = parts.ports
+        self.monitored_topics = parts.monitored_topics
+        self.monitored_services = parts.monitored_services
+        self.takeover = parts.takeover
+        self.enrolled = parts.enrolled
+        self.robot = parts.robot
+        self._hosts = parts.hosts
+        self._named = parts.named
+        self._tables = parts.tables
+        self._present = parts.present
+        self._kept: dict[tuple[int, int, Category, str], Decision] = {}
+        self._kept_below: dict[tuple[int, int, Category, str, bool], Decision] = {}
+        self._any_audit_only = any(table.audit_only for table in parts.tables.values())
+
+    def decide(self, request: Request) -> Decision:
+        """Whether the rules of the request's own category let its host touch its resource.
+
+        For calls that make a node part of the graph the `[Nodes]` right is a second question:
+        `decide_with_node` asks both.
+        """
+        host = request.host
+        key = (host.version, int(host), request.category, request.resource)
+        decision = self._kept.get(key)
+        if decision is None:
+            decision = self._decide(request)
+            if len(request.resource) <= _KEPT_NAME:
+                if len(self._kept) >= _KEPT_DECISIONS:
+                    self._kept.clear()
+                self._kept[key] = decision
+        return decision
+
+    def decide_with_node(self, request: Request) -> Decision:
+        """The decision on the whole call: `[Nodes]` first where the call makes a node part of the graph."""
+        if needs_node_rule(request):
+            node = self.decide(replace(request, category=Category.NODE, resource=request.caller_id))
+            if not node.allowed:
+                return node
+            decision = self.decide(request)
+            if decision.allowed and not decision.would_deny and node.would_deny:
+                return node
+            return decision
+        return self.decide(request)
+
+    def decide_parameter(
+        self, request: Request, *, subtree: bool = True, namespace: bool = False
+    ) -> Decision:
+        """Whether a parameter call may touch the key and what is below it.
+
+        `subtree`: a rule below the key that denies the host denies the call. `namespace`: the key is known to
+        hold other keys; then the rule for those of them that have no key of their own must grant the host too
+        (an exact key `/arm` says nothing of `/arm/speed`).
+        """
+        decision = self.decide(request)
+        if (
+            not decision.allowed
+            or decision.would_deny
+            or request.category not in self._present
+            or not subtree
+        ):
+            return decision
+        host = request.host
+        key = (host.version, int(host), request.category, request.resource, namespace)
+        kept = self._kept_below.get(key)
+        if kept is None:
+            kept = self._decide_below(request, namespace) or decision
+            if len(request.resource) <= _KEPT_NAME:
+                if len(self._kept_below) >= _KEPT_DECISIONS:
+                    self._kept_below.clear()
+                self._kept_below[key] = kept
+        return kept
+
+    def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
+        """The denial of the call on `request.resource` because of a key below it, if there is one."""
+        table = self._tables[request.category]
+        atoms = self._hosts.atoms_of(request.host)
+        deciding = table.tree.below(request.resource)
+        if namespace:
+            inherited = table.tree.find_for_subtree(request.resource) or table.default
+            if inherited is None:
+                reason = f"{_what(request, may=False)}: no key of [Parameters] matches what is below it"
+                return _decided(False, None, reason, table.audit_only)
+            deciding = itertools.chain(deciding, [inherited])
+        for rule in deciding:
+            if not rule.grants(atoms):
+                reason = f"{_what(request, may=False)} with what is below it: {_only(rule)}"
+                reason += f", by {_place(rule.rule)}"
+                return _decided(False, rule.rule, reason, table.audit_only)
+        return None
+
+    def knows(self, address: Address) -> bool:
+        """Whether any rule names this address: if not, its requests need not even be read.
+
+        With a section in audit-only mode every address is known, because its requests pass.
+        """
+        return self._any_audit_only or not self._named.isdisjoint(self._hosts.atoms_of(address))
+
+    def hosts_named(self) -> tuple[Network, ...]:
+        """Every address and network that a rule names, itself or through groups (`*` is not among them)."""
+        networks = self._hosts.networks().items()
+        return tuple(net for net, atom in networks if not self._named.isdisjoint(self._hosts.above([atom])))
+
+    def has_section(self, category: Category) -> bool:
+        """Whether the file has the section that decides this category."""
+        return category in self._present
+
+    def audit_only(self, category: Category) -> bool:
+        """Whether requests of this category pass although the rules deny them."""
+        return self._tables[category].audit_only
+
+    def rules(self, category: Category) -> tuple[CompiledRule, ...]:
+        """The rules of a category in the order of the file, `default` included."""
+        return tuple(self._tables[category].rules)
+
+    def _decide(self, request: Request) -> Decision:
+        category = request.category
+        table = self._tables[category]
+        if category not in self._present:
+            return self._without_section(request, table)
+        name = request.resource
+        if category is Category.COMMAND:
+            return self._decide_command(request, table)
+        if not is_resolved_name(name) and not (name == "/" and category in _PARAMETERS):
+            return _decided(False, None, f"{quoted(name)} is not a resolved ROS name", False)
+        return self._apply(request, table, table.tree.find(name) or table.default)
+
+    def _decide_command(self, request: Request, table: RuleTable) -> Decision:
+        name = commands.ALIASES.get(request.resource, request.resource)
+        if name not in commands.COMMANDS:
+            elsewhere = commands.DECIDED_ELSEWHERE.get(name)
+            known = (
+                f"{name} is decided by {elsewhere}" if elsewhere else f"{quoted(name)} is not a known call"
+            )
+            return _decided(False, None, known, False)
+        found = table.tree.find(name)
+        if name not in commands.NAMED_ONLY:
+            return self._apply(request, table, found or table.default)
+        if found is None:
+            reason = f"{_what(request, may=False)}: only its own key in [Commands] grants it, never default"
+            return _decided(False, None, reason, False)
+        decision = self._apply(request, table, found)
+        # audit-only is for learning what a robot does; no robot needs these calls, so they never just pass.
+        return replace(decision, allowed=False, would_deny=False) if decision.would_deny else decision
+
+    def _apply(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
+        if found is None:
+            section = BY_CATEGORY[request.category].name
+            reason = f"{_what(request, may=False)}: no key of [{section}] matches and it has no default"
+            return _decided(False, None, reason, table.audit_only)
+        if found.grants(self._hosts.atoms_of(request.host)):
+            return Decision(True, found.rule, f"{_what(request, may=True)} by {_place(found.rule)}")
+        phrase = PHRASES[request.category].format(_shortened(request.resource))
+        host = canonical_address(request.host)
+        reason = f"{host} is not among the hosts that may {phrase}: {_only(found)}, by {_place(found.rule)}"
+        return _decided(False, found.rule, reason, table.audit_only)
+
+    def _without_section(self, request: Request, table: RuleTable) -> Decision:
+        decider = BY_CATEGORY[request.category]
+        if decider.extension:
+            phrase = PHRASES[request.category].format(_shortened(request.resource))
+            return Decision(True, None, f"no [{decider.name}] section: every host may {phrase}")
+        reason = f"{_what(request, may=False)}: the policy has no [{decider.name}] section, so nobody may"
+        return _decided(False, None, reason, table.audit_only)
+
+
+def needs_node_rule(request: Request) -> bool:
+    """Whether the request makes a node part of the graph, so that `[Nodes]` decides as well."""
+    if request.category is Category.COMMAND:
+        return request.resource in commands.NODE_RULE_COMMANDS
+    return request.category in {Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER}
+
+
+def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) -> Decision:
+    if audit_only and not allowed:
+        return Decision(True, rule, reason, would_deny=True)
+    return Decision(allowed, rule, reason)
+
+
+def _what(request: Request, *, may: bool) -> str:
+    phrase = PHRASES[request.category].format(_shortened(request.resource))
+    return f"{canonical_address(request.host)} {'may' if may else 'may not'} {phrase}"
+
+
+def _only(rule: CompiledRule) -> str:
+    return f"only {rule.shown} may" if rule.shown else "nobody may"
+
+
+def _shortened(text: str, limit: int = 60) -> str:
+    shown = text if len(text) <= limit else text[: limit - 1] + "…"
+    return shown if shown.isprintable() else quoted(text, limit)
+
+
+def _place(rule: Rule) -> str:
+    file = rule.file.rpartition("/")[2]
+    return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"
+
+
+def address_of(text: str) -> Address:
+    """An IP address from text, IPv4-mapped ones as IPv4; raises ValueError."""
+    return canonical_address(ipaddress.ip_address(text))

@@ -1,0 +1,99 @@
+"""Compiles the lines of the deciding sections into rule tables, and notes what is wrong with them."""
+
+from appliance.policy import commands
+from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.groups import Groups
+from appliance.policy.keys import BadKeyError, Form, Key, parse_key
+from appliance.policy.model import Category, Rule
+from appliance.policy.policy import CompiledRule, RuleTable
+from appliance.policy.reader import Entry, SectionText, Word
+from appliance.policy.sections import Decider
+
+DEFAULT = "default"
+_VERBS = {"read": Category.READ, "write": Category.WRITE}
+
+
+class RuleCompiler:
+    """Fills one `RuleTable` per category."""
+
+    def __init__(self, file: str, groups: Groups, findings: Findings) -> None:
+        self.tables = {category: RuleTable() for category in Category}
+        self._file = file
+        self._groups = groups
+        self._findings = findings
+
+    def add_section(self, decider: Decider, section: SectionText) -> None:
+        """Add every line of one section."""
+        first_lines: dict[tuple[Category, str], int] = {}
+        for entry in section.entries:
+            if self._findings.full:
+                return
+            atoms = self._groups.atoms(entry.values)
+            split = self._category_and_name(decider, entry)
+            if split is None:
+                continue
+            category, name = split
+            if category is Category.COMMAND:
+                name = Word(commands.ALIASES.get(name.text, name.text), name.line, name.column)
+            first = first_lines.setdefault((category, name.text), name.line)
+            if first != name.line:
+                text = f"the key {quoted(entry.key.text)} stands already at line {first}: put its hosts there"
+                self._error(entry.key, text)
+                continue
+            key = self._key(category, name)
+            if key is None and name.text != DEFAULT:
+                continue
+            rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
+            shown = self._groups.shown(entry.values)
+            self._add(category, CompiledRule(rule, key, atoms, shown, entry.key.column))
+
+    def _add(self, category: Category, rule: CompiledRule) -> None:
+        table = self.tables[category]
+        table.rules.append(rule)
+        if rule.key is None:
+            table.default = rule
+        else:
+            table.tree.add(rule.key, rule)
+
+    def _category_and_name(self, decider: Decider, entry: Entry) -> tuple[Category, Word] | None:
+        """Which category a line speaks of; the lines of `[Parameters]` begin with it."""
+        if len(decider.categories) == 1:
+            return decider.categories[0], entry.key
+        verb, _, name = entry.key.text.partition(" ")
+        category = _VERBS.get(verb)
+        if category is None or not name:
+            text = "a key here is read or write and a name, as read /ns/** or write default"
+            self._error(entry.key, f"{quoted(entry.key.text)}: {text}")
+            return None
+        return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
+
+    def _key(self, category: Category, name: Word) -> Key | None:
+        """The parsed key; None for `default` and (with an error noted) for a bad one."""
+        if name.text == DEFAULT:
+            return None
+        if category is Category.COMMAND:
+            return self._command(name)
+        try:
+            return parse_key(name.text)
+        except BadKeyError as fault:
+            if meant(name.text, [DEFAULT]) and not name.text.startswith("/"):
+                self._error(name, f"{quoted(name.text)}: did you mean default?")
+            else:
+                self._error(name, f"{quoted(name.text)}: {fault}")
+            return None
+
+    def _command(self, name: Word) -> Key | None:
+        elsewhere = commands.DECIDED_ELSEWHERE.get(name.text)
+        if name.text in commands.COMMANDS:
+            return Key(Form.EXACT, name.text)
+        if elsewhere is not None:
+            self._error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
+        elif "*" in name.text:
+            self._error(name, f"{quoted(name.text)}: commands have no patterns; default is what is left")
+        else:
+            guess = meant(name.text, [*commands.COMMANDS, *commands.DECIDED_ELSEWHERE, DEFAULT])
+            self._error(name, f"unknown command {quoted(name.text)}{guess}")
+        return None
+
+    def _error(self, word: Word, text: str) -> None:
+        self._findings.error(word.line, word.column, text)

@@ -1,0 +1,126 @@
+"""The sections that decide nothing: `[Ports]`, `[Monitor]` and `[Options]`."""
+
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.names import is_resolved_name
+from appliance.policy.policy import DEFAULT_PORTS
+from appliance.policy.reader import Entry, SectionText
+from appliance.policy.sections import DECIDERS
+
+TAKEOVERS = ("same-host", "granted")
+_MASTER_PORT = 11311
+_RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What `[Options]` says: when another host may take a node name over; the sections in audit-only mode."""
+
+    takeover: str = TAKEOVERS[0]
+    audit_only: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Monitor:
+    """What `[Monitor]` says: topics and services that are relayed even without a spec."""
+
+    topics: frozenset[str] = frozenset()
+    services: frozenset[str] = frozenset()
+
+
+def read_ports(section: SectionText | None, findings: Findings) -> range:
+    """The ports for node proxies and relay, first to last."""
+    ports = DEFAULT_PORTS
+    for entry in _entries(section, ("range",), findings):
+        ports = _range(entry, findings) or DEFAULT_PORTS
+    return ports
+
+
+def _range(entry: Entry, findings: Findings) -> range | None:
+    word = entry.values[0] if entry.values else entry.key
+    found = _RANGE.fullmatch("".join(value.text for value in entry.values))
+    first, last = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not found:
+        findings.error(word.line, word.column, "expected range = FIRST-LAST, as 19001-20000")
+    elif not 1024 <= first < last <= 65535:
+        text = f"{first}-{last}: the range goes upwards, within 1024 to 65535, two ports for each node"
+        findings.error(word.line, word.column, text)
+    elif first <= _MASTER_PORT <= last:
+        findings.error(
+            word.line, word.column, f"{first}-{last} contains {_MASTER_PORT}, the port of RVMaster"
+        )
+    else:
+        return range(first, last + 1)
+    return None
+
+
+def read_monitor(section: SectionText | None, findings: Findings) -> Monitor:
+    """The names to relay."""
+    names: dict[str, set[str]] = {"topic": set(), "service": set()}
+    for entry in _entries(section, tuple(names), findings):
+        for word in entry.values:
+            if not is_resolved_name(word.text):
+                text = f"{quoted(word.text)} is not a resolved name, as /landshark/gps (no patterns here)"
+                findings.error(word.line, word.column, text)
+            elif word.text in names[entry.key.text]:
+                findings.warn(word.line, word.column, f"{word.text} is said twice")
+            names[entry.key.text].add(word.text)
+    return Monitor(frozenset(names["topic"]), frozenset(names["service"]))
+
+
+def read_options(section: SectionText | None, findings: Findings) -> Options:
+    """The options; what the file does not set keeps its default."""
+    takeover = TAKEOVERS[0]
+    audit_only: frozenset[str] = frozenset()
+    for entry in _entries(section, ("takeover", "audit-only"), findings):
+        if entry.key.text == "takeover":
+            takeover = _takeover(entry, findings)
+        else:
+            audit_only = _audit_only(entry, findings)
+    return Options(takeover, audit_only)
+
+
+def _takeover(entry: Entry, findings: Findings) -> str:
+    text = " ".join(word.text for word in entry.values)
+    if text not in TAKEOVERS:
+        word = entry.values[0] if entry.values else entry.key
+        shown = f"takeover is {' or '.join(TAKEOVERS)}, not {quoted(text)}{meant(text, TAKEOVERS)}"
+        findings.error(word.line, word.column, shown)
+    return text
+
+
+def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
+    by_fold = {decider.name.casefold(): decider.name for decider in DECIDERS}
+    chosen: set[str] = set()
+    for word in entry.values:
+        text = word.text.strip("[]").casefold()
+        if text == "all":
+            chosen.update(by_fold.values())
+        elif text in by_fold:
+            chosen.add(by_fold[text])
+        else:
+            guess = meant(word.text, ["all", *by_fold.values()])
+            known = "" if guess else f"; all, or some of {', '.join(by_fold.values())}"
+            findings.error(word.line, word.column, f"{quoted(word.text)} decides nothing{guess}{known}")
+    return frozenset(chosen)
+
+
+def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
+    """The entries of a section whose keys are known and not repeated; the others are errors."""
+    first_lines: dict[str, int] = {}
+    for entry in section.entries if section else ():
+        word = entry.key
+        if word.text not in keys:
+            guess = (
+                meant(word.text, keys) or f"; [{section.name.text if section else ''}] has {', '.join(keys)}"
+            )
+            findings.error(word.line, word.column, f"unknown key {quoted(word.text)}{guess}")
+        elif word.text in first_lines:
+            text = f"the key {quoted(word.text)} stands already at line {first_lines[word.text]}"
+            findings.error(word.line, word.column, text)
+        else:
+            first_lines[word.text] = word.line
+            yield entry
