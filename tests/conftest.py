@@ -1,0 +1,71 @@
+"""Fixtures that the tests with real nodes share; each ends what it started."""
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import need_root, needs
+from tests.support.rosmaster import PlainMaster
+from tests.support.site import Site
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """An empty Ethernet to put hosts on."""
+    need_root()
+    with Lab("rosrv-test") as lab:
+        yield lab
+
+
+@pytest.fixture
+def appliance(lab: Lab) -> Iterator[Appliance]:
+    """An appliance that lets everything pass, on a host of its own (10.77.0.2), firewall in force."""
+    with Appliance(lab.host("appliance", "10.77.0.2/24")) as running:
+        yield running
+
+
+@pytest.fixture
+def plain_master(lab: Lab, tmp_path: Path) -> Iterator[PlainMaster]:
+    """A plain ROSMaster where the appliance would be."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with PlainMaster(tmp_path, lab.host("master", "10.77.0.2/24")) as running:
+        yield running
+
+
+@pytest.fixture
+def robot(lab: Lab) -> Host:
+    """The host the robot's nodes run on (10.77.0.10)."""
+    return lab.host("robot", "10.77.0.10/24")
+
+
+@pytest.fixture(scope="module", params=["plain", "appliance"])
+def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A robot behind a plain master, and the same robot behind the appliance: a test of it runs with both."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with Lab("rosrv-test") as lab, Site(lab, request.param, tmp_path_factory.mktemp("master")) as site:
+        yield site
+
+
+@pytest.fixture
+def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
+    """The robot's nodes and tools of one test."""
+    with RosSession(site.master_uri, tmp_path, site.robot) as session:
+        yield session
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Add what the nodes and the appliance said to the report of a failure."""
+    report = yield
+    if report.failed and isinstance(item, pytest.Function):
+        for name in ("ros", "site", "appliance", "plain_master"):
+            running: Any = item.funcargs.get(name)
+            if running is not None:
+                report.sections.append((f"What {name} said", running.story()))
+    return report

@@ -1,0 +1,155 @@
+"""The real appliance in a test: `rosrv up` as a user would start it, its audit log, its processes.
+
+with Appliance(host, state, policy=OPEN_POLICY) as appliance:
+    ros = RosSession(appliance.master_uri, home, robot)
+    assert appliance.audit(decision="deny") == []
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, Self
+
+from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
+
+ROSRV = str(Path(sys.executable).parent / "rosrv")
+OPEN_POLICY = """\
+[Nodes]
+default = *
+[Publishers]
+default = *
+[Subscribers]
+default = *
+[Commands]
+default = *
+"""
+
+
+class Appliance:
+    """One running appliance; a context manager."""
+
+    def __init__(
+        self,
+        host: Host | None = None,
+        *,
+        policy: str = OPEN_POLICY,
+        isolation: str | None = None,
+        options: tuple[str, ...] = (),
+    ) -> None:
+        self.host: Host = host or ThisMachine()
+        self.isolation = isolation or ("none" if isinstance(self.host, ThisMachine) else "container")
+        self.options = options
+        # Not pytest's folder: that is closed to the users the appliance's processes run as.
+        self.directory = Path(tempfile.mkdtemp(prefix="rosrv-test-"))
+        self.directory.chmod(0o755)
+        self.state = self.directory / "state"
+        self.policy_file = self.directory / "policy.ini"
+        self.policy_file.write_text(policy)
+        self.monitors = self.directory / "monitors"
+        self.monitors.mkdir()
+        self.process: Process | None = None
+        self.ready: Event = {}
+
+    @property
+    def master_uri(self) -> str:
+        """Where nodes find their master."""
+        return str(self.ready["master"])
+
+    @property
+    def api_uri(self) -> str:
+        """Where REST answers."""
+        return str(self.ready["api"])
+
+    def start(self) -> Self:
+        """Start (again, on the same state); returns when nodes may connect."""
+        loopback = isinstance(self.host, ThisMachine)
+        command = [ROSRV, "up", "--json", "--isolation", self.isolation, "--state", str(self.state)]
+        command += ["--policy", str(self.policy_file), "--monitors", str(self.monitors)]
+        command += ["--listen", "127.0.0.1:0" if loopback else f"{self.host.address}:11311"]
+        if loopback:
+            command += ["--rosmaster-port", "0"]
+        command += [
+            "--api",
+            f"{self.host.address}:{0 if loopback else 8443}",
+            "--api-tls",
+            "off",
+            *self.options,
+        ]
+        self.process = Process(self.host, command, env=_environment(), label="rosrv up")
+        self.ready = self.process.wait_for(event="ready", timeout=60)
+        return self
+
+    def stop(self) -> int:
+        """SIGTERM: the exit status; a clean end takes less than five seconds."""
+        return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
+
+    def rosrv(
+        self, *arguments: str, check: bool = True, timeout: float = LIMIT
+    ) -> subprocess.CompletedProcess[str]:
+        """Another verb of the command, told of this appliance by `--state`."""
+        command = [ROSRV, *arguments, "--state", str(self.state)]
+        done = subprocess.run(
+            command, env=_environment(), capture_output=True, text=True, timeout=timeout, check=False
+        )
+        if check and done.returncode:
+            raise AssertionError(
+                f"{' '.join(command)}: exit status {done.returncode}\n"
+                f"{done.stdout}\n{done.stderr}\n{self.story()}"
+            )
+        return done
+
+    def status(self) -> dict[str, Any]:
+        """`rosrv status --json`."""
+        status: dict[str, Any] = json.loads(self.rosrv("status", "--json").stdout)
+        return status
+
+    def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
+        """`rosrv audit search --json` with these flags; of its records those that have these fields."""
+        lines = self.rosrv("audit", "search", *flags, "--json").stdout.splitlines()
+        records: list[dict[str, Any]] = [json.loads(line) for line in lines if line.strip()]
+        return [
+            record for record in records if all(record.get(key) == value for key, value in fields.items())
+        ]
+
+    def reload(self, policy: str) -> None:
+        """Write the policy file and have it read again."""
+        self.policy_file.write_text(policy)
+        self.rosrv("policy", "reload")
+
+    def pids(self, role: str) -> list[int]:
+        """The process ids of a role, by `rosrv status`."""
+        return [row["pid"] for row in self.status()["processes"] if row["role"] == role]
+
+    def kill(self, role: str) -> int:
+        """SIGKILL to the (first) process of a role: its id."""
+        pid = self.pids(role)[0]
+        os.kill(pid, signal.SIGKILL)
+        return pid
+
+    def story(self) -> str:
+        """What the appliance said, for the message of a failure."""
+        return self.process.story() if self.process else "rosrv up was not started"
+
+    def __enter__(self) -> Self:
+        try:
+            return self.start()
+        except BaseException:
+            self.close()
+            raise
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop and remove the state."""
+        self.stop()
+        subprocess.run(["/bin/rm", "-rf", str(self.directory)], check=True)
+
+
+def _environment() -> dict[str, str]:
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "ROSRV_"))}
+    return kept | {"PYTHONUNBUFFERED": "1"}

@@ -1,0 +1,148 @@
+"""Real ROS nodes: Debian's unmodified rospy and roscpp, and the stock tools, started against a master.
+
+    with RosSession(master_uri, home) as ros:
+        ros.talker("rospy", "/chatter")
+        ros.listener("roscpp", "/chatter").wait_for(event="received")
+
+The programs are in `rospy_nodes/` and `roscpp_nodes/`; both kinds print the same events. A process is told of
+the master by ROS_MASTER_URI and of its own address by ROS_IP, nothing else.
+"""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+from tests.support.processes import LIMIT, Host, Process, ThisMachine
+
+Client = Literal["rospy", "roscpp"]
+PYTHON = "/usr/bin/python3"  # the interpreter rospy is installed for
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+BUILD = ROOT / "build" / "tests"
+
+
+class RosSession:
+    """The nodes and tools of one test; ends all of them, newest first."""
+
+    def __init__(self, master_uri: str, home: Path, host: Host | None = None) -> None:
+        self.master_uri, self.home = master_uri, home
+        self.host: Host = host or ThisMachine()
+        self.processes: list[Process] = []
+
+    def on(self, host: Host) -> "RosSession":
+        """The same session's nodes, started on another host."""
+        other = RosSession(self.master_uri, self.home, host)
+        other.processes = self.processes
+        return other
+
+    def environment(self, host: Host) -> dict[str, str]:
+        """What a node's process sees: of ROS, only the master and its own address."""
+        kept = {
+            key: value
+            for key, value in os.environ.items()
+            if not key.startswith(("ROS_", "ROSRV_", "PYTHON"))
+        }
+        return kept | {
+            "ROS_MASTER_URI": self.master_uri,
+            "ROS_IP": host.address,
+            "ROS_HOME": str(self.home),
+            "ROS_LOG_DIR": str(self.home / "log"),
+            "PYTHONUNBUFFERED": "1",
+            "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+        }
+
+    def start(self, command: Sequence[str], *, label: str | None = None, **environment: str) -> Process:
+        """Any program, in the environment of a node."""
+        process = Process(
+            self.host,
+            command,
+            env=self.environment(self.host) | environment,
+            label=label or Path(command[0]).name,
+            cwd=str(self.home),
+        )
+        self.processes.append(process)
+        return process
+
+    def node(self, client: Client, program: str, *arguments: str, name: str | None = None) -> Process:
+        """A node of the tests, once it says that it is registered; it runs until the session ends."""
+        name = name or f"{program}_{len(self.processes)}"
+        if client == "rospy":
+            command = [PYTHON, str(HERE / "rospy_nodes" / f"{program}.py")]
+        else:
+            command = [str(roscpp_program(program))]
+        process = self.start([*command, *arguments, f"__name:={name}"], label=f"{client} {program}")
+        process.wait_for(event="ready")
+        return process
+
+    def talker(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
+        """Publishes std_msgs/String `hello N` ten times a second; `--latch` once, latched; `--text T`."""
+        return self.node(client, "talker", topic, *options, name=name)
+
+    def listener(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
+        """Subscribes to std_msgs/String; event `received` with `data` and `publisher`."""
+        return self.node(client, "listener", topic, *options, name=name)
+
+    def service_server(self, client: Client, service: str, name: str | None = None) -> Process:
+        """Offers a std_srvs/SetBool that answers with the negation; event `called`."""
+        return self.node(client, "service_server", service, name=name)
+
+    def service_client(self, client: Client, service: str, *options: str, name: str | None = None) -> Process:
+        """Calls a std_srvs/SetBool for each line `true` or `false` on its input; `answered` or `failed`."""
+        return self.node(client, "service_client", service, *options, name=name)
+
+    def parameters(self, client: Client, *options: str, name: str | None = None) -> Process:
+        """Gets, sets and watches parameters as told on its input, see the programs."""
+        return self.node(client, "parameters", *options, name=name)
+
+    def run(
+        self, *command: str, timeout: float = LIMIT, check: bool = True, text: str | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        """A stock tool that ends by itself: its output. `check`: a failure is the test's failure."""
+        popen = self.host.popen(
+            command,
+            env=self.environment(self.host),
+            cwd=str(self.home),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            out, err = popen.communicate(text, timeout=timeout)
+        except subprocess.TimeoutExpired:
+            popen.kill()
+            out, err = popen.communicate()
+            raise AssertionError(f"{' '.join(command)}: no end in {timeout:.0f} s\n{out}\n{err}") from None
+        if check and popen.returncode:
+            raise AssertionError(f"{' '.join(command)}: exit status {popen.returncode}\n{out}\n{err}")
+        return subprocess.CompletedProcess(command, popen.returncode, out, err)
+
+    def story(self) -> str:
+        """What every process said, for the message of a failure."""
+        return "\n".join(process.story() for process in self.processes)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for process in reversed(self.processes):
+            process.stop()
+
+
+def roscpp_program(name: str) -> Path:
+    """The compiled node; compiled on first use and again when its source changes."""
+    source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
+    target = BUILD / name
+    if target.exists() and header.stat().st_mtime > target.stat().st_mtime:
+        target.unlink()
+    subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)
+    return target
+
+
+def has_ros() -> bool:
+    """Whether the stock nodes and tools are installed on this machine."""
+    return all(shutil.which(tool, path="/usr/bin") for tool in ("rosmaster", "rostopic", "roslaunch", "g++"))

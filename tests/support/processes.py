@@ -1,0 +1,231 @@
+"""A process of a test: its events as they are printed, its end by its own id, its output when a test fails.
+
+Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit, and
+never sleeps. What is not JSON (stock tools, warnings) is kept as `{"text": line}`.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, Self
+
+Event = dict[str, Any]
+LIMIT = 30.0  # seconds; generous, the machine may be busy
+
+
+class Host(Protocol):
+    """Where a process runs: the machine itself, or a host of the lab (`appliance.network.lab.Host`)."""
+
+    @property
+    def address(self) -> str:
+        """The address the host is known by."""
+
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a process there."""
+
+
+class ThisMachine:
+    """The machine the tests run on, by its loopback address."""
+
+    address = "127.0.0.1"
+
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a process on this machine."""
+        return subprocess.Popen(list(args), **options)
+
+
+class Process:
+    """A running program, its events in order, and its standard error."""
+
+    def __init__(
+        self,
+        host: Host,
+        command: Sequence[str],
+        *,
+        env: Mapping[str, str],
+        label: str,
+        cwd: str | None = None,
+    ) -> None:
+        self.host, self.command, self.label = host, list(command), label
+        self.events: list[Event] = []
+        self.errors: list[str] = []
+        self._changed = threading.Condition()
+        self._ended = False
+        self.popen = host.popen(
+            command,
+            env=dict(env),
+            cwd=cwd,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="backslashreplace",
+            start_new_session=True,
+        )
+        self._readers = [
+            threading.Thread(target=self._read_events, name=f"{label} stdout", daemon=True),
+            threading.Thread(target=self._read_errors, name=f"{label} stderr", daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        """The process id, as this machine sees it."""
+        return int(self.popen.pid)
+
+    @property
+    def running(self) -> bool:
+        """Whether the process has not ended."""
+        return self.popen.poll() is None
+
+    def wait_for(
+        self,
+        wanted: Callable[[Event], bool] | None = None,
+        *,
+        timeout: float = LIMIT,
+        since: int = 0,
+        **fields: Any,
+    ) -> Event:
+        """The first event (from index `since` on) that `wanted` accepts and that has these fields.
+
+        Fails with everything the process said when it does not come within `timeout` seconds.
+        """
+
+        def accepts(event: Event) -> bool:
+            given = all(event.get(key) == value for key, value in fields.items())
+            return given and (wanted is None or wanted(event))
+
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            looked_at = since
+            while True:
+                for event in self.events[looked_at:]:
+                    if accepts(event):
+                        return event
+                looked_at = max(since, len(self.events))
+                left = deadline - time.monotonic()
+                if self._ended or left <= 0:
+                    why = "ended" if self._ended else f"{timeout:.0f} s passed"
+                    raise AssertionError(f"no such event ({fields or wanted}): {why}\n{self.story()}")
+                self._changed.wait(left)
+
+    def wait_for_text(self, text: str, *, timeout: float = LIMIT, since: int = 0) -> str:
+        """The first line of plain output that contains `text`."""
+        line = self.wait_for(lambda event: text in event.get("text", ""), timeout=timeout, since=since)
+        return str(line["text"])
+
+    def wait_for_count(self, count: int, *, timeout: float = LIMIT, **fields: Any) -> list[Event]:
+        """The first `count` events that have these fields."""
+        position = 0
+        found: list[Event] = []
+        while len(found) < count:
+            event = self.wait_for(timeout=timeout, since=position, **fields)
+            with self._changed:
+                position = next(i for i in range(position, len(self.events)) if self.events[i] is event) + 1
+            found.append(event)
+        return found
+
+    def mark(self) -> int:
+        """A position in the events: pass it as `since` to look only at what comes after it."""
+        with self._changed:
+            return len(self.events)
+
+    def seen(self, **fields: Any) -> list[Event]:
+        """All events so far that have these fields."""
+        with self._changed:
+            return [event for event in self.events if all(event.get(k) == v for k, v in fields.items())]
+
+    def send(self, line: str) -> None:
+        """Write one line to the program's standard input."""
+        assert self.popen.stdin is not None
+        self.popen.stdin.write(line + "\n")
+        self.popen.stdin.flush()
+
+    def wait(self, *, timeout: float = LIMIT) -> int:
+        """The exit status, once the process has ended by itself and all its output is read."""
+        try:
+            status = self.popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {timeout:.0f} s\n{self.story()}") from None
+        for reader in self._readers:
+            reader.join(timeout)
+        return int(status)
+
+    def output(self) -> str:
+        """The plain text the program printed so far."""
+        with self._changed:
+            return "\n".join(
+                event["text"] if set(event) == {"text"} else json.dumps(event) for event in self.events
+            )
+
+    def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 10) -> int:
+        """End the process: by the signal, and when it does not listen, by SIGKILL to its own session."""
+        if self.popen.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self.popen.stdin.close()  # a program that waits for its next order ends by this
+        if self.running:
+            self.popen.send_signal(with_signal)
+            try:
+                self.popen.wait(timeout)
+            except subprocess.TimeoutExpired:
+                self.kill()
+        status = int(self.popen.wait(timeout))
+        for reader in self._readers:
+            reader.join(timeout)
+        for stream in (self.popen.stdout, self.popen.stderr):
+            if stream is not None and not stream.closed:
+                stream.close()
+        return status
+
+    def kill(self) -> None:
+        """End the process and whatever it started, at once and without a word (as a crash does)."""
+        if self.running:
+            os.killpg(self.popen.pid, signal.SIGKILL)
+        self.popen.wait(LIMIT)
+
+    def story(self) -> str:
+        """What the process said, for the message of a failure."""
+        with self._changed:
+            events = [json.dumps(event) for event in self.events[-40:]]
+            errors = self.errors[-40:]
+        state = "running" if self.running else f"ended with {self.popen.returncode}"
+        lines = [f"--- {self.label} on {self.host.address} ({state}): {' '.join(self.command)}", *events]
+        return "\n".join([*lines, *(f"stderr: {line}" for line in errors)])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def _read_events(self) -> None:
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
+            with self._changed:
+                self.events.append(_event(line.rstrip("\n")))
+                self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _read_errors(self) -> None:
+        assert self.popen.stderr is not None
+        for line in self.popen.stderr:
+            self.errors.append(line.rstrip("\n"))
+
+
+def _event(line: str) -> Event:
+    if line.startswith("{"):
+        try:
+            parsed = json.loads(line)
+        except ValueError:
+            return {"text": line}
+        if isinstance(parsed, dict):
+            return parsed
+    return {"text": line}

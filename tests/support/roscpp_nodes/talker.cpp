@@ -1,0 +1,45 @@
+// A roscpp publisher of std_msgs/String: talker TOPIC [--latch] [--text T] [--rate HZ] [--count N].
+#include <ros/ros.h>
+#include <std_msgs/String.h>
+
+#include <climits>
+#include <cstring>
+
+#include "report.hpp"
+
+int main(int argc, char** argv) {
+  ros::init(argc, argv, "talker");
+  bool latch = false;
+  std::string text = "hello";
+  double hertz = 10;
+  int count = INT_MAX;
+  for (int i = 2; i < argc; ++i) {
+    if (!std::strcmp(argv[i], "--latch")) latch = true;
+    if (!std::strcmp(argv[i], "--text") && i + 1 < argc) text = argv[++i];
+    if (!std::strcmp(argv[i], "--rate") && i + 1 < argc) hertz = std::stod(argv[++i]);
+    if (!std::strcmp(argv[i], "--count") && i + 1 < argc) count = std::stoi(argv[++i]);
+  }
+  ros::NodeHandle node;
+  const auto joined = [](const ros::SingleSubscriberPublisher& peer) {
+    report("connected", ", \"topic\": " + json_string(peer.getTopic()));
+  };
+  const auto left = [](const ros::SingleSubscriberPublisher& peer) {
+    report("disconnected", ", \"topic\": " + json_string(peer.getTopic()));
+  };
+  ros::Publisher publisher = node.advertise<std_msgs::String>(argv[1], 100, joined, left, ros::VoidConstPtr(), latch);
+  report_ready();
+  ros::Rate rate(hertz);
+  int number = 0;
+  while (ros::ok()) {
+    if (number < (latch ? 1 : count)) {
+      std_msgs::String message;
+      message.data = text + " " + std::to_string(++number);
+      publisher.publish(message);
+      report("sent", ", \"number\": " + std::to_string(number));
+    }
+    ros::spinOnce();
+    rate.sleep();
+  }
+  report("ended");
+  return 0;
+}

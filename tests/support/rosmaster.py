@@ -1,0 +1,102 @@
+"""The plain ROSMaster, as `roscore` would start it: what the appliance is compared with."""
+
+import socket
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT, Host, Process, ThisMachine
+
+PORT = 11311
+
+
+class PlainMaster:
+    """`rosmaster --core` and `rosout` on a host: on the usual port in a lab, on a free one otherwise."""
+
+    def __init__(self, home: Path, host: Host | None = None) -> None:
+        self.host: Host = host or ThisMachine()
+        self.home = home
+        self.processes: list[Process] = []
+        self.master_uri = ""
+
+    def start(self) -> Self:
+        """Start; returns when the master answers and `/rosout` is there, as after `roscore`."""
+        port = free_port() if isinstance(self.host, ThisMachine) else PORT
+        self.master_uri = f"http://{self.host.address}:{port}"
+        session = RosSession(self.master_uri, self.home, self.host)
+        self.processes = session.processes
+        master = session.start(["/usr/bin/rosmaster", "--core", "-p", str(port)], label="rosmaster")
+        await_master(self.master_uri, self.host, master)
+        session.run("rosparam", "set", "/run_id", "plain")
+        session.start(["/usr/lib/rosout/rosout", "__name:=rosout"], label="rosout")
+        await_node(self.master_uri, self.host, "/rosout")
+        return self
+
+    def stop(self) -> None:
+        """End both programs."""
+        for process in reversed(self.processes):
+            process.stop()
+
+    def story(self) -> str:
+        """What both said, for the message of a failure."""
+        return "\n".join(process.story() for process in self.processes)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+
+def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
+    """One XML-RPC call, made from that host: the answer as it came."""
+    run = getattr(host, "run", None)
+
+    def call() -> Any:
+        with xmlrpc.client.ServerProxy(uri, allow_none=True) as server:
+            return getattr(server, method)(*parameters)
+
+    return run(call) if run is not None else call()
+
+
+def await_master(uri: str, host: Host, process: Process) -> None:
+    """Return once the master takes connections."""
+    _await(lambda: call_on(host, uri, "getPid", "/test"), f"no master answers at {uri}", process)
+
+
+def await_node(uri: str, host: Host, name: str) -> None:
+    """Return once a node of this name is registered."""
+
+    def lookup() -> None:
+        status, message, _ = call_on(host, uri, "lookupNode", "/test", name)
+        if status != 1:
+            raise OSError(message)
+
+    _await(lookup, f"no node {name} at {uri}", None)
+
+
+def _await(attempt: Callable[[], object], complaint: str, process: Process | None) -> None:
+    """Try until it works: nobody tells when a foreign program is ready, so it is asked again and again."""
+    deadline = time.monotonic() + LIMIT
+    pause = threading.Event()
+    while True:
+        try:
+            attempt()
+        except OSError as error:
+            gone = process is not None and not process.running
+            if gone or time.monotonic() > deadline:
+                raise AssertionError(f"{complaint}: {error}\n{process.story() if process else ''}") from error
+        else:
+            return
+        pause.wait(0.05)
+
+
+def free_port() -> int:
+    """A port nobody listens on at this moment (the kernel does not give it out again soon)."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

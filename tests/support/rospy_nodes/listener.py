@@ -1,0 +1,28 @@
+"""A rospy subscriber of std_msgs/String: listener.py TOPIC."""
+
+import argparse
+
+import rospy
+from report import report
+from std_msgs.msg import String
+
+
+def heard(message):
+    """Report one message with the node it says it is from."""
+    report("received", data=message.data, publisher=message._connection_header["callerid"])
+
+
+def main():
+    """Listen until told to end."""
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("topic")
+    options = arguments.parse_args(rospy.myargv()[1:])
+    rospy.init_node("listener")
+    rospy.Subscriber(options.topic, String, heard)
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    rospy.spin()
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""A rospy publisher of std_msgs/String: talker.py TOPIC [--latch] [--text T] [--rate HZ] [--count N]."""
+
+import argparse
+import sys
+
+import rospy
+from report import report
+from std_msgs.msg import String
+
+
+class Watch(rospy.SubscribeListener):
+    """Reports who connects and who leaves."""
+
+    def peer_subscribe(self, topic_name, topic_publish, peer_publish):
+        """A subscriber has connected."""
+        report("connected", topic=topic_name)
+
+    def peer_unsubscribe(self, topic_name, num_peers):
+        """A subscriber has gone."""
+        report("disconnected", topic=topic_name, left=num_peers)
+
+
+def main():
+    """Publish until told to end."""
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("topic")
+    arguments.add_argument("--latch", action="store_true")
+    arguments.add_argument("--text", default="hello")
+    arguments.add_argument("--rate", type=float, default=10)
+    arguments.add_argument("--count", type=int, default=0)
+    options = arguments.parse_args(rospy.myargv()[1:])
+    rospy.init_node("talker")
+    publisher = rospy.Publisher(options.topic, String, Watch(), latch=options.latch, queue_size=100)
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    rate = rospy.Rate(options.rate)
+    number = 0
+    while not rospy.is_shutdown():
+        if number < (1 if options.latch else options.count or sys.maxsize):
+            number += 1
+            publisher.publish(f"{options.text} {number}")
+            report("sent", number=number)
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            break
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()

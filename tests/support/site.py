@@ -1,0 +1,39 @@
+"""The same robot twice: behind a plain ROSMaster and behind the appliance.
+
+What a test promises of unmodified nodes it promises in both modes: the plain one shows that the test is good,
+the other one that the robot does not notice.
+"""
+
+from pathlib import Path
+from typing import Self
+
+from appliance.network.lab import Lab
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.rosmaster import PlainMaster
+
+
+class Site:
+    """A master of one mode on 10.77.0.2, and hosts for nodes: `robot` (10.77.0.10), `ocu` (10.77.0.20)."""
+
+    def __init__(self, lab: Lab, mode: str, home: Path, policy: str = OPEN_POLICY) -> None:
+        self.mode = mode
+        self.robot = lab.host("robot", "10.77.0.10/24")
+        self.ocu = lab.host("ocu", "10.77.0.20/24")
+        middle = lab.host("master", "10.77.0.2/24")
+        self.master = PlainMaster(home, middle) if mode == "plain" else Appliance(middle, policy=policy)
+
+    @property
+    def master_uri(self) -> str:
+        """What ROS_MASTER_URI says."""
+        return self.master.master_uri
+
+    def story(self) -> str:
+        """What the master said, for the message of a failure."""
+        return self.master.story()
+
+    def __enter__(self) -> Self:
+        self.master.__enter__()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.master.__exit__(*exc)
