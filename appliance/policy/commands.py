@@ -50,6 +50,7 @@ NODE_RULE_COMMANDS = frozenset({"subscribeParam", "unsubscribeParam"})
 
 STARTING_COMMANDS = {
     "getParam": "rospy and roscpp read /use_sim_time with it when they start",
+    "hasParam": "roscpp looks for /use_sim_time with it when it starts",
 }
 """What an unmodified rospy or roscpp node calls while it starts, and for what."""
 

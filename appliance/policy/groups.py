@@ -29,7 +29,7 @@ class Group:
 
 
 class Groups:
-    """The groups of one file; `atoms(words)` is what a value means, with every mistake in it noted."""
+    """The groups of one file; `read(words)` is what a value means, with every mistake in it noted."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Groups:
         for entry in section.entries:
             self._declare(entry)
         for group in self.groups.values():
-            self._table.put(self.atoms(group.values), group.atom)
+            self._table.put((atom for _, atom in self.read(group.values)), group.atom)
         self._find_cycles()
 
     def _declare(self, entry: Entry) -> None:
@@ -75,21 +75,18 @@ class Groups:
         else:
             self.groups[word.text] = Group(self._table.group(), word, entry.values)
 
-    def atoms(self, words: Iterable[Word]) -> frozenset[Atom]:
-        """The atoms of a value; words that mean nothing are errors, words said twice are warnings."""
-        atoms: set[Atom] = set()
+    def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
+        """The words of a value with their atoms; what means nothing is an error, what comes twice a warning."""
+        atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:
                 break
             atom = self._atom(word)
-            if atom is None:
-                continue
             if atom in atoms:
-                self._findings.warn(
-                    word.line, word.column, f"{quoted(word.text)} is said twice in this value"
-                )
-            atoms.add(atom)
-        return frozenset(atoms)
+                self._findings.warn(word.line, word.column, f"{quoted(word.text)} is said twice")
+            elif atom is not None:
+                atoms[atom] = word.text
+        return tuple((text, atom) for atom, text in atoms.items())
 
     def _atom(self, word: Word) -> Atom | None:
         text = word.text

@@ -1,8 +1,8 @@
 """Which hosts a rule means: networks, groups, and a prefix tree that knows which of them hold an address.
 
 Every network and every group is a number (an *atom*). A rule keeps the atoms of its value; a host has the
-atoms of all networks that contain it and of all groups that contain those. A rule means a host when they share
-an atom, so neither memory nor time multiplies rules by group sizes.
+atoms of all networks that contain it and of all groups that contain those. A rule means a host when they
+share an atom, so neither memory nor time multiplies rules by group sizes.
 
 Invariants:
 1. An IPv4 address that arrives mapped into IPv6 (::ffff:a.b.c.d) is the IPv4 address.

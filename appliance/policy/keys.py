@@ -19,7 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from appliance.policy.names import is_resolved_name
+from appliance.ros.errors import InvalidNameError
+from appliance.ros.names import is_global_name, resolve_parameter
 
 Value = TypeVar("Value")
 
@@ -58,21 +59,21 @@ class Key:
         return (self.form is Form.EXACT, len(self.literal), self.form)
 
 
-def parse_key(text: str) -> Key:
-    """The key that `text` is; raises `BadKeyError`."""
+def parse_key(text: str, *, parameter: bool = False) -> Key:
+    """The key that `text` is; raises `BadKeyError`. Parameters have a wider grammar than topics."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     literal, star, rest = text.partition("*")
     if not star:
-        return Key(Form.EXACT, _checked(text, literal))
+        return Key(Form.EXACT, _checked(text, literal, parameter))
     if rest == "*" and literal.endswith("/"):
-        return Key(Form.SUBTREE, _checked(text, literal))
+        return Key(Form.SUBTREE, _checked(text, literal, parameter))
     if rest:
         raise BadKeyError("a star may stand at the end only: /arm/* (one level), /arm/** (any depth), /arm*")
-    return Key(Form.LEVEL, _checked(text, literal))
+    return Key(Form.LEVEL, _checked(text, literal, parameter))
 
 
-def _checked(text: str, literal: str) -> str:
+def _checked(text: str, literal: str, parameter: bool) -> str:
     """The literal beginning, once it is known that a resolved name can begin so."""
     name = literal.removesuffix("/") if text.endswith("*") else literal
     if "//" in literal:
@@ -80,9 +81,17 @@ def _checked(text: str, literal: str) -> str:
     if literal.endswith("/") and text == literal:
         meant = f"{name.rstrip('/')} or {name.rstrip('/')}/**"
         raise BadKeyError(f"can never match: no name ends with a slash; write {meant.strip()}")
-    if name and not is_resolved_name(name):
+    if name and not (is_parameter_key(name) if parameter else is_global_name(name)):
         raise BadKeyError("is not a ROS name: letters, digits and _ between single slashes")
     return literal
+
+
+def is_parameter_key(text: str) -> bool:
+    """Whether `text` is the key of a parameter, or `/`, in its one canonical spelling."""
+    try:
+        return text.startswith("/") and resolve_parameter(text, "") == text
+    except InvalidNameError:
+        return False
 
 
 def _single_slashes(text: str) -> str:

@@ -17,10 +17,10 @@ from dataclasses import dataclass, field, replace
 from appliance.policy import commands
 from appliance.policy.findings import Finding, quoted
 from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
-from appliance.policy.keys import Key, KeyTree
+from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.names import is_resolved_name
 from appliance.policy.sections import BY_CATEGORY, PHRASES
+from appliance.ros.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 21001)
 
@@ -31,17 +31,26 @@ _PARAMETERS = frozenset({Category.READ, Category.WRITE})
 
 @dataclass(frozen=True, slots=True)
 class CompiledRule:
-    """One line of a deciding section; `key` is None for `default`, `shown` names its hosts for a person."""
+    """One line of a deciding section.
+
+    `key` is None for `default`; `atoms` and `words` are the value, the words as they were written; `shown`
+    names its hosts for a person; `column` is where the key begins.
+    """
 
     rule: Rule
     key: Key | None
     atoms: frozenset[Atom]
+    words: tuple[tuple[str, Atom], ...]
     shown: str
     column: int
 
     def grants(self, atoms: frozenset[Atom]) -> bool:
         """Whether a host with these atoms is among the hosts of the rule."""
         return not self.atoms.isdisjoint(atoms)
+
+    def granted_through(self, atoms: frozenset[Atom]) -> tuple[str, ...]:
+        """The words of the value that mean a host with these atoms."""
+        return tuple(word for word, atom in self.words if atom in atoms)
 
 
 @dataclass(slots=True)
@@ -77,8 +86,8 @@ class Policy:
     """A policy in force (or about to be); made by `compile_policy` only.
 
     `text` and `file` are what it was compiled from; `warnings` the lint; `ports` the ports for node proxies
-    and relay; `monitored_topics` and `monitored_services` the names in `[Monitor]`; `takeover` is `same-host` or
-    `granted`; `enrolled` and `robot` are the addresses that were given for `host:NAME` and `robot`.
+    and relay; `monitored_topics` and `monitored_services` the names in `[Monitor]`; `takeover` is `same-host`
+    or `granted`; `enrolled` and `robot` are the addresses that were given for `host:NAME` and `robot`.
     """
 
     def __init__(self, parts: PolicyParts) -> None:
@@ -117,16 +126,17 @@ class Policy:
         return decision
 
     def decide_with_node(self, request: Request) -> Decision:
-        """The decision on the whole call: `[Nodes]` first where the call makes a node part of the graph."""
-        if needs_node_rule(request):
-            node = self.decide(replace(request, category=Category.NODE, resource=request.caller_id))
-            if not node.allowed:
-                return node
-            decision = self.decide(request)
-            if decision.allowed and not decision.would_deny and node.would_deny:
-                return node
+        """The decision on the whole call: its category, then `[Nodes]` where `needs_node_rule` says so.
+
+        For parameters, also what is below the key (`decide_parameter`).
+        """
+        if request.category in _PARAMETERS:
+            return self.decide_parameter(request)
+        decision = self.decide(request)
+        if not decision.allowed or not needs_node_rule(request):
             return decision
-        return self.decide(request)
+        node = self.decide(node_request(request))
+        return node if not node.allowed or (node.would_deny and not decision.would_deny) else decision
 
     def decide_parameter(
         self, request: Request, *, subtree: bool = True, namespace: bool = False
@@ -194,6 +204,10 @@ class Policy:
         """Whether requests of this category pass although the rules deny them."""
         return self._tables[category].audit_only
 
+    def atoms_of(self, address: Address) -> frozenset[Atom]:
+        """The networks and groups of this policy that hold an address (for `explain`)."""
+        return self._hosts.atoms_of(address)
+
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
         """The rules of a category in the order of the file, `default` included."""
         return tuple(self._tables[category].rules)
@@ -206,7 +220,7 @@ class Policy:
         name = request.resource
         if category is Category.COMMAND:
             return self._decide_command(request, table)
-        if not is_resolved_name(name) and not (name == "/" and category in _PARAMETERS):
+        if not (is_parameter_key(name) if category in _PARAMETERS else is_global_name(name)):
             return _decided(False, None, f"{quoted(name)} is not a resolved ROS name", False)
         return self._apply(request, table, table.tree.find(name) or table.default)
 
@@ -254,6 +268,11 @@ def needs_node_rule(request: Request) -> bool:
     if request.category is Category.COMMAND:
         return request.resource in commands.NODE_RULE_COMMANDS
     return request.category in {Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER}
+
+
+def node_request(request: Request) -> Request:
+    """The question whether `[Nodes]` lets the host of a request use its `caller_id`."""
+    return replace(request, category=Category.NODE, resource=request.caller_id)
 
 
 def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) -> Decision:

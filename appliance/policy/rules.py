@@ -28,7 +28,7 @@ class RuleCompiler:
         for entry in section.entries:
             if self._findings.full:
                 return
-            atoms = self._groups.atoms(entry.values)
+            words = self._groups.read(entry.values)
             split = self._category_and_name(decider, entry)
             if split is None:
                 continue
@@ -45,7 +45,8 @@ class RuleCompiler:
                 continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
             shown = self._groups.shown(entry.values)
-            self._add(category, CompiledRule(rule, key, atoms, shown, entry.key.column))
+            atoms = frozenset(atom for _, atom in words)
+            self._add(category, CompiledRule(rule, key, atoms, words, shown, entry.key.column))
 
     def _add(self, category: Category, rule: CompiledRule) -> None:
         table = self.tables[category]
@@ -74,7 +75,7 @@ class RuleCompiler:
         if category is Category.COMMAND:
             return self._command(name)
         try:
-            return parse_key(name.text)
+            return parse_key(name.text, parameter=category in (Category.READ, Category.WRITE))
         except BadKeyError as fault:
             if meant(name.text, [DEFAULT]) and not name.text.startswith("/"):
                 self._error(name, f"{quoted(name.text)}: did you mean default?")

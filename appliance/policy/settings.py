@@ -5,10 +5,10 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 from appliance.policy.findings import Findings, meant, quoted
-from appliance.policy.names import is_resolved_name
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.reader import Entry, SectionText
 from appliance.policy.sections import DECIDERS
+from appliance.ros.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 _MASTER_PORT = 11311
@@ -62,7 +62,7 @@ def read_monitor(section: SectionText | None, findings: Findings) -> Monitor:
     names: dict[str, set[str]] = {"topic": set(), "service": set()}
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:
-            if not is_resolved_name(word.text):
+            if not is_global_name(word.text):
                 text = f"{quoted(word.text)} is not a resolved name, as /landshark/gps (no patterns here)"
                 findings.error(word.line, word.column, text)
             elif word.text in names[entry.key.text]:
