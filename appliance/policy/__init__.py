@@ -3,15 +3,21 @@
 No I/O and no clock: that is what makes a decision testable, explainable and provable.
 """
 
+from appliance.policy.cases import CaseResult, run_cases
 from appliance.policy.compiler import compile_policy
+from appliance.policy.diff import Difference, diff
+from appliance.policy.explain import Explanation, explain
 from appliance.policy.findings import Finding, PolicyError, Severity
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.policy import Policy, needs_node_rule
 
 __all__ = [
     "Address",
+    "CaseResult",
     "Category",
     "Decision",
+    "Difference",
+    "Explanation",
     "Finding",
     "Policy",
     "PolicyError",
@@ -19,5 +25,8 @@ __all__ = [
     "Rule",
     "Severity",
     "compile_policy",
+    "diff",
+    "explain",
     "needs_node_rule",
+    "run_cases",
 ]

@@ -76,7 +76,7 @@ class Groups:
             self.groups[word.text] = Group(self._table.group(), word, entry.values)
 
     def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
-        """The words of a value with their atoms; what means nothing is an error, what comes twice a warning."""
+        """The words of a value with their atoms; nonsense is an error, a repetition a warning."""
         atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:

@@ -19,14 +19,13 @@ from appliance.policy.findings import Finding, quoted
 from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
 from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.sections import BY_CATEGORY, PHRASES
+from appliance.policy.sections import BY_CATEGORY, PARAMETERS, PHRASES
 from appliance.ros.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 21001)
 
 _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
-_PARAMETERS = frozenset({Category.READ, Category.WRITE})
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,7 @@ class Policy:
 
         For parameters, also what is below the key (`decide_parameter`).
         """
-        if request.category in _PARAMETERS:
+        if request.category in PARAMETERS:
             return self.decide_parameter(request)
         decision = self.decide(request)
         if not decision.allowed or not needs_node_rule(request):
@@ -220,7 +219,7 @@ class Policy:
         name = request.resource
         if category is Category.COMMAND:
             return self._decide_command(request, table)
-        if not (is_parameter_key(name) if category in _PARAMETERS else is_global_name(name)):
+        if not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
             return _decided(False, None, f"{quoted(name)} is not a resolved ROS name", False)
         return self._apply(request, table, table.tree.find(name) or table.default)
 

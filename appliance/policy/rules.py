@@ -7,7 +7,7 @@ from appliance.policy.keys import BadKeyError, Form, Key, parse_key
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable
 from appliance.policy.reader import Entry, SectionText, Word
-from appliance.policy.sections import Decider
+from appliance.policy.sections import PARAMETERS, Decider
 
 DEFAULT = "default"
 _VERBS = {"read": Category.READ, "write": Category.WRITE}
@@ -75,7 +75,7 @@ class RuleCompiler:
         if category is Category.COMMAND:
             return self._command(name)
         try:
-            return parse_key(name.text, parameter=category in (Category.READ, Category.WRITE))
+            return parse_key(name.text, parameter=category in PARAMETERS)
         except BadKeyError as fault:
             if meant(name.text, [DEFAULT]) and not name.text.startswith("/"):
                 self._error(name, f"{quoted(name.text)}: did you mean default?")

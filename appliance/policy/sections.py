@@ -30,6 +30,9 @@ DECIDERS = (
 
 BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider.categories}
 
+PARAMETERS = frozenset({Category.READ, Category.WRITE})
+"""The categories whose resources are keys of parameters."""
+
 GROUPS, PORTS, MONITOR, OPTIONS = "Groups", "Ports", "Monitor", "Options"
 
 NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), OPTIONS)

@@ -1,0 +1,72 @@
+"""The words for what somebody does: `publish /scan`, `call /reset`; in tests and on the CLI."""
+
+import ipaddress
+
+from appliance.policy.commands import ALIASES, COMMANDS, DECIDED_ELSEWHERE
+from appliance.policy.findings import meant, quoted
+from appliance.policy.hosts import Network, canonical_address
+from appliance.policy.keys import is_parameter_key
+from appliance.policy.model import Address, Category
+from appliance.policy.policy import Policy
+from appliance.policy.sections import PARAMETERS
+from appliance.ros.names import is_global_name
+
+VERBS = {
+    "use-node": Category.NODE,
+    "publish": Category.PUBLISH,
+    "subscribe": Category.SUBSCRIBE,
+    "command": Category.COMMAND,
+    "offer": Category.OFFER,
+    "call": Category.CALL,
+    "read": Category.READ,
+    "write": Category.WRITE,
+}
+
+
+class BadWordError(ValueError):
+    """A host or an action that means nothing; the message says why and what to write."""
+
+
+def parse_action(text: str) -> tuple[Category, str]:
+    """The category and resource of `VERB NAME`; raises `BadWordError`."""
+    verb, _, name = text.strip().partition(" ")
+    category = VERBS.get(verb)
+    if category is None:
+        guess = meant(verb, VERBS) or f"; one of {', '.join(VERBS)}"
+        raise BadWordError(f"{quoted(text)} begins with no known verb{guess}")
+    return category, check_resource(category, name.strip())
+
+
+def check_resource(category: Category, name: str) -> str:
+    """The resource unchanged; raises `BadWordError` unless a request of the category can have it."""
+    if category is Category.COMMAND:
+        if ALIASES.get(name, name) not in COMMANDS:
+            elsewhere = DECIDED_ELSEWHERE.get(name)
+            guess = f": it is decided by {elsewhere}" if elsewhere else meant(name, COMMANDS)
+            raise BadWordError(f"{quoted(name)} is not a command{guess}")
+    elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
+        raise BadWordError(f"{quoted(name)} is not a resolved ROS name, as /landshark/gps")
+    return name
+
+
+def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
+    """The addresses that an address, `robot` or `host:NAME` is under this policy; raises `BadWordError`."""
+    if text == "robot":
+        if not policy.robot:
+            raise BadWordError("it is not said which address robot is")
+        return tuple(_first(network) for network in policy.robot)
+    if text.startswith("host:"):
+        name = text.removeprefix("host:")
+        address = policy.enrolled.get(name)
+        if address is None:
+            raise BadWordError(f"no host {quoted(name)} is enrolled{meant(name, policy.enrolled)}")
+        return (canonical_address(address),)
+    try:
+        return (canonical_address(ipaddress.ip_address(text)),)
+    except ValueError:
+        raise BadWordError(f"{quoted(text)} is not an address, robot or host:NAME") from None
+
+
+def _first(network: Network) -> Address:
+    """An address of the network that a machine can have."""
+    return network[1] if network.num_addresses > 2 else network[0]

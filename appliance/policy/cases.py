@@ -1,0 +1,209 @@
+"""The cases beside a policy, `FILE.tests.yaml`: who, does what, allow or deny. docs/policy.md has the format.
+
+    given:
+      robot: 192.168.1.10
+      hosts: {ocu-1: 10.77.0.11}
+    cases:
+      - host: host:ocu-1
+        node: /joystick
+        allow: [publish /landshark_control/trigger]
+        deny: [command shutdown]
+
+The cases are judged by the policy compiled with what is `given`, so that they hold wherever it is deployed.
+"""
+
+import ipaddress
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import yaml
+
+from appliance.policy.actions import BadWordError, find_hosts, parse_action
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.hosts import canonical_address
+from appliance.policy.model import Address, Decision, Request
+from appliance.policy.policy import Policy, needs_node_rule
+from appliance.ros.names import is_global_name
+
+MAXIMUM_CHARACTERS = 1024 * 1024
+MAXIMUM_CHECKS = 100_000
+
+_Node = yaml.nodes.Node
+_Pairs = dict[str, tuple[_Node, _Node]]
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """One check: `request` was to be allowed (`expected`) or denied; `line` and `column` count from 1."""
+
+    file: str
+    line: int
+    column: int
+    request: Request
+    expected: bool
+    decision: Decision
+
+    @property
+    def passed(self) -> bool:
+        """Whether the rules say what the case expects; audit-only mode counts as the denial it stands for."""
+        return (self.decision.allowed and not self.decision.would_deny) == self.expected
+
+    def __str__(self) -> str:
+        """`landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
+        expected = "allow" if self.expected else "deny"
+        return f"{self.file}:{self.line}:{self.column}: expected {expected}: {self.decision.reason}"
+
+
+def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
+    """Judge every case in `text` (named `file` in results); `PolicyError` with all mistakes in it.
+
+    A file without a single case is a mistake: it would pass whatever the policy says.
+    """
+    findings = Findings(file)
+    reader = _CaseReader(policy, findings)
+    results = list(reader.results(_compose(text, findings)))
+    if not results:
+        findings.error(1, 1, "there is no case in this file: add one below cases:")
+    findings.raise_errors()
+    return results
+
+
+def _compose(text: str, findings: Findings) -> _Node | None:
+    if len(text) > MAXIMUM_CHARACTERS:
+        findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
+        return None
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except RecursionError:
+        findings.error(1, 1, "the file is nested too deep")
+    except yaml.MarkedYAMLError as fault:
+        mark = fault.problem_mark or fault.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        findings.error(line, column, f"not YAML: {fault.problem or fault.context}")
+    except yaml.YAMLError as fault:
+        findings.error(1, 1, f"not YAML: {quoted(str(fault), 120)}")
+    return None
+
+
+class _CaseReader:
+    """Walks the composed YAML and keeps the place of everything in it."""
+
+    def __init__(self, policy: Policy, findings: Findings) -> None:
+        self._policy = policy
+        self._findings = findings
+        self._checks = 0
+
+    def results(self, root: _Node | None) -> Iterator[CaseResult]:
+        if root is None:
+            return
+        top = self._mapping(root, "the file", ("given", "cases"))
+        if "given" in top:
+            self._give(top["given"][1])
+        for case in self._sequence(top["cases"][1], "cases") if "cases" in top else ():
+            yield from self._case(case)
+
+    def _give(self, node: _Node) -> None:
+        """Compile the policy again with the addresses that are given."""
+        given = self._mapping(node, "given", ("robot", "hosts"))
+        robot: list[Address] = list(self._addresses(given["robot"][1])) if "robot" in given else []
+        hosts: dict[str, Address] = {}
+        if "hosts" in given:
+            for name, (_, value) in self._mapping(given["hosts"][1], "hosts", None).items():
+                hosts.update((name, address) for address in self._addresses(value))
+        self._policy = compile_policy(self._policy.text, file=self._policy.file, hosts=hosts, robot=robot)
+
+    def _addresses(self, node: _Node) -> Iterator[Address]:
+        for scalar in node.value if isinstance(node, yaml.SequenceNode) else [node]:
+            text = self._text(scalar, "an address")
+            try:
+                yield canonical_address(ipaddress.ip_address(text))
+            except ValueError:
+                if text:
+                    self._error(scalar, f"{quoted(text)} is not an IP address")
+
+    def _case(self, node: _Node) -> Iterator[CaseResult]:
+        case = self._mapping(node, "a case", ("host", "node", "allow", "deny"))
+        if not case:
+            return
+        hosts = list(self._hosts(node, case))
+        caller_id = ""
+        if "node" in case:
+            caller_id = self._text(case["node"][1], "node")
+            if not is_global_name(caller_id):
+                self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, as /joystick")
+        if not ("allow" in case or "deny" in case):
+            self._error(node, "a case needs allow: or deny: with what the host does")
+        for word, expected in (("allow", True), ("deny", False)):
+            for action in self._sequence(case[word][1], word) if word in case else ():
+                yield from self._check(action, hosts, caller_id, expected)
+
+    def _hosts(self, node: _Node, case: _Pairs) -> Iterator[Address]:
+        if "host" not in case:
+            self._error(node, "a case needs host: an address, robot or host:NAME")
+            return
+        value = case["host"][1]
+        for scalar in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+            text = self._text(scalar, "host")
+            try:
+                yield from find_hosts(text, self._policy)
+            except BadWordError as fault:
+                self._error(scalar, f"{fault}; addresses can be given below given:")
+
+    def _check(
+        self, node: _Node, hosts: list[Address], caller_id: str, expected: bool
+    ) -> Iterator[CaseResult]:
+        text = self._text(node, "what the host does")
+        try:
+            category, resource = parse_action(text)
+        except BadWordError as fault:
+            self._error(node, str(fault))
+            return
+        for host in hosts:
+            self._checks += 1
+            if self._checks > MAXIMUM_CHECKS:
+                self._error(node, f"more than {MAXIMUM_CHECKS} checks in one file")
+                return
+            request = Request(host, caller_id, category, resource)
+            if needs_node_rule(request) and not caller_id:
+                self._error(node, f"{quoted(text)} makes a node part of the graph: the case needs node:")
+                return
+            decision = self._policy.decide_with_node(request)
+            line, column = node.start_mark.line + 1, node.start_mark.column + 1
+            yield CaseResult(self._findings.file, line, column, request, expected, decision)
+
+    # --- YAML with places ---
+
+    def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
+        """The pairs of a mapping by key; unknown and repeated keys are errors. `keys` None: any."""
+        pairs: _Pairs = {}
+        if not isinstance(node, yaml.MappingNode):
+            expected = f" with {', '.join(keys)}" if keys else ""
+            self._error(node, f"{what} is a mapping{expected}")
+            return pairs
+        for key, value in node.value:
+            text = self._text(key, "a key")
+            if keys is not None and text not in keys:
+                guess = meant(text, keys) or f"; {what} has {', '.join(keys)}"
+                self._error(key, f"unknown key {quoted(text)}{guess}")
+            elif text in pairs:
+                self._error(key, f"the key {quoted(text)} is repeated")
+            else:
+                pairs[text] = (key, value)
+        return pairs
+
+    def _sequence(self, node: _Node, what: str) -> list[_Node]:
+        if isinstance(node, yaml.SequenceNode):
+            items: list[_Node] = node.value
+            return items
+        self._error(node, f"{what} is a list")
+        return []
+
+    def _text(self, node: _Node, what: str) -> str:
+        if isinstance(node, yaml.ScalarNode):
+            return str(node.value)
+        self._error(node, f"{what} is one word or line here")
+        return ""
+
+    def _error(self, node: _Node, text: str) -> None:
+        self._findings.error(node.start_mark.line + 1, node.start_mark.column + 1, text)
