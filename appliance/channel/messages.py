@@ -153,6 +153,13 @@ class SignatureMade(Message):
     public_key: bytes
 
 
+class SignatureRefused(Message):
+    """The signer will not sign this checkpoint (it does not follow what was signed before) and says why."""
+
+    number: int
+    reason: str
+
+
 # --- link: control <-> relay ------------------------------------------------------------------------------
 # `key` is the key of an incarnation. Control states what is wanted; the relay reports what it sees.
 
@@ -343,4 +350,4 @@ RelayLink = (
     | ConnectionRefused | TrafficReported
 )  # fmt: skip
 
-SignerLink = SignatureWanted | SignatureMade
+SignerLink = SignatureWanted | SignatureMade | SignatureRefused
