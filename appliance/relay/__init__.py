@@ -1,0 +1,1 @@
+"""The data plane: TCPROS connections between publishers and subscribers, clients and services."""

@@ -1,0 +1,20 @@
+"""What every part of one relay shares."""
+
+from dataclasses import dataclass
+
+from appliance.relay.frames import MemoryBudget
+from appliance.relay.limits import Limits
+from appliance.relay.loop import Loop
+from appliance.relay.report import Reporter
+
+
+@dataclass(frozen=True, slots=True)
+class RelayContext:
+    """The loop, the bounds, the voice to control, the memory in use, and the area small frames are received
+    into."""
+
+    loop: Loop
+    limits: Limits
+    reporter: Reporter
+    budget: MemoryBudget
+    scratch: memoryview

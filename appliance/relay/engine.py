@@ -1,0 +1,248 @@
+"""The relay: carries out what control states, and puts peers, topics and services together.
+
+It decides nothing. Control's messages change the `StatedTable` and what hangs on it; a peer is served when
+the table has a grant for the address it comes from, the `callerid` it claims and the topic (or service) it
+asks for.
+
+Invariants:
+- A connection that is served stands on a statement in the table; the withdrawal of that statement cuts it.
+- Without a link to control everything goes on as stated before; nothing new is granted.
+"""
+
+import socket
+from collections.abc import Mapping
+
+from appliance.channel.messages import (
+    GrantRevoked,
+    Message,
+    NodePlaced,
+    NodeWithdrawn,
+    PublicationPlaced,
+    PublicationWithdrawn,
+    StateBegan,
+    StateEnded,
+    TopicTraffic,
+    UpstreamFound,
+    UpstreamRefused,
+)
+from appliance.relay.context import RelayContext
+from appliance.relay.frames import SCRATCH, MemoryBudget
+from appliance.relay.grants import StatedTable, is_statement
+from appliance.relay.limits import Limits
+from appliance.relay.links import Link
+from appliance.relay.loop import Loop
+from appliance.relay.ports import Ports
+from appliance.relay.report import Reporter
+from appliance.relay.sockets import tune
+from appliance.relay.subscriber import Subscriber
+from appliance.relay.topic import RelayedTopic
+from appliance.relay.upstream import Publisher
+from appliance.relay.visitor import Farewell, Visitor
+
+
+class Engine:
+    """One relay, without the process around it."""
+
+    def __init__(self, loop: Loop, limits: Limits) -> None:
+        self._loop = loop
+        self._limits = limits
+        self._reporter = Reporter(limits)
+        scratch = memoryview(bytearray(SCRATCH))
+        self._context = RelayContext(loop, limits, self._reporter, MemoryBudget(limits.memory_bytes), scratch)
+        self._table = StatedTable()
+        self._ports = Ports(loop, limits, self._arrived, self._turned_away)
+        self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher]] = {}
+        self._visitors: set[Visitor] = set()
+        self._farewells: set[Farewell] = set()
+        self._link: Link | None = None
+        self._last_rows: list[TopicTraffic] = []
+        loop.after(limits.report_every, self._tick)
+
+    def attach(self, link: Link | None) -> None:
+        """Speak to this control from now on; what is stated stays until it restates."""
+        self._link = link
+        self._reporter.attach(link)
+
+    def take(self, message: Message, descriptors: tuple[int, ...]) -> None:
+        """Carry out one message of control."""
+        if isinstance(message, StateBegan):
+            self._table.begin(message.epoch)
+        elif isinstance(message, StateEnded):
+            self._restated(message.epoch)
+        elif is_statement(message):
+            self._state(message, descriptors)
+        elif isinstance(message, UpstreamFound):
+            self._upstream_found(message)
+        elif isinstance(message, UpstreamRefused):
+            self._upstream_refused(message)
+        else:
+            self._table.withdraw(message)
+            self._withdrawn(message)
+
+    def close(self) -> None:
+        """Cut everything."""
+        self._ports.close_all()
+        for topic, publisher in self._topics.values():
+            topic.cut_all("the relay ends")
+            publisher.close()
+        for visitor in self._visitors:
+            visitor.close()
+        for farewell in list(self._farewells):
+            farewell.close()
+
+    # --- what control states ------------------------------------------------------------------------------
+
+    def _state(self, message: Message, descriptors: tuple[int, ...]) -> None:
+        self._table.state(message)
+        if isinstance(message, NodePlaced):
+            self._ports.open(message.key, descriptors[0])
+        elif isinstance(message, PublicationPlaced):
+            self._place_topic(message.key, message.topic)
+
+    def _restated(self, epoch: int) -> None:
+        for message in self._table.end(epoch):
+            self._withdrawn(message)
+        self._reporter.repeat_connections()
+        for _topic, publisher in self._topics.values():
+            publisher.ask_again()
+
+    def _withdrawn(self, message: Message) -> None:
+        if isinstance(message, NodeWithdrawn):
+            self._ports.close(message.key)
+            for key, topic in [one for one in self._topics if one[0] == message.key]:
+                self._remove_topic(key, topic, "the publisher's node is gone")
+            for visitor in [one for one in self._visitors if one.key == message.key]:
+                self._visitor_failed(visitor, "")
+        elif isinstance(message, PublicationWithdrawn):
+            self._remove_topic(message.key, message.topic, "the topic is published no longer")
+        elif isinstance(message, GrantRevoked):
+            self._revoke_grant(message)
+
+    def _place_topic(self, key: str, topic: str) -> None:
+        if (key, topic) in self._topics:
+            return
+        node = self._table.node(key)
+        name = key if node is None else node.name
+        relayed = RelayedTopic(key, topic, name, self._limits.queue_grace, self._loop.clock)
+        publisher = Publisher(self._context, relayed)
+        relayed.upstream = publisher
+        self._topics[key, topic] = (relayed, publisher)
+
+    def _remove_topic(self, key: str, topic: str, reason: str) -> None:
+        if (key, topic) not in self._topics:
+            return
+        relayed, publisher = self._topics.pop((key, topic))
+        relayed.cut_all(reason)
+        publisher.close()
+        row = relayed.traffic()
+        if row is not None:
+            self._last_rows.append(row)
+
+    def _revoke_grant(self, message: GrantRevoked) -> None:
+        placed = self._topics.get((message.key, message.topic))
+        if placed is None:
+            return
+        for member in placed[0].members:
+            if isinstance(member, Subscriber) and (member.host, member.caller_id) == (
+                message.host,
+                message.caller_id,
+            ):
+                member.cut("its grant is revoked")
+
+    def _upstream_found(self, message: UpstreamFound) -> None:
+        placed = self._topics.get((message.key, message.topic))
+        if placed is not None:
+            placed[1].found(message.host, message.port)
+
+    def _upstream_refused(self, message: UpstreamRefused) -> None:
+        placed = self._topics.get((message.key, message.topic))
+        if placed is not None:
+            placed[1].refused()
+
+    # --- peers --------------------------------------------------------------------------------------------
+
+    def _arrived(self, key: str, sock: socket.socket, host: str) -> None:
+        tune(sock)
+        visitor = Visitor(
+            self._context, sock, key, host, introduced=self._introduced, failed=self._visitor_failed
+        )
+        self._visitors.add(visitor)
+
+    def _turned_away(self, key: str, host: str, reason: str) -> None:
+        self._reporter.refused(key, "", host, "", reason)
+
+    def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
+        visitor.close()
+        self._visitors.discard(visitor)
+        self._ports.left(visitor.host)
+        if reason:
+            self._reporter.refused(visitor.key, "", visitor.host, "", reason)
+
+    def _introduced(self, visitor: Visitor, fields: Mapping[str, str], rest: bytes) -> None:
+        if self._link is not None:
+            self._link.catch_up()
+        if visitor not in self._visitors:
+            return
+        self._visitors.discard(visitor)
+        sock = visitor.take()
+        if "topic" in fields:
+            reason = self._objection_to_subscriber(visitor, fields, rest)
+            if not reason:
+                self._subscribe(visitor, sock, fields)
+                return
+            resource = fields["topic"]
+        else:
+            reason, resource = "its header names neither a topic nor a service", ""
+        self._refuse(visitor, resource, fields.get("callerid", ""), sock, reason)
+
+    def _objection_to_subscriber(self, visitor: Visitor, fields: Mapping[str, str], rest: bytes) -> str:
+        for required in ("topic", "md5sum", "callerid"):
+            if required not in fields:
+                return f"Missing required '{required}' field"
+        topic, caller_id = fields["topic"], fields["callerid"]
+        if "service" in fields:
+            return "its header names a topic and a service; a connection is for one of them"
+        if rest:
+            return "sent data after its header; a connection is for one topic"
+        if self._table.publication(visitor.key, topic) is None:
+            node = self._table.node(visitor.key)
+            return f"[{node.name if node else visitor.key}] is not a publisher of [{topic}]"
+        if not self._table.may_subscribe(visitor.key, topic, visitor.host, caller_id):
+            return (
+                f"no grant for [{caller_id}] at {visitor.host} to subscribe to [{topic}];"
+                " a subscriber asks with requestTopic first"
+            )
+        return ""
+
+    def _subscribe(self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str]) -> None:
+        relayed, _publisher = self._topics[visitor.key, fields["topic"]]
+
+        def refuse(sock: socket.socket, reason: str) -> None:
+            self._refuse(visitor, relayed.topic, fields["callerid"], sock, reason)
+
+        def ended() -> None:
+            self._ports.left(visitor.host)
+
+        relayed.join(
+            Subscriber(self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended)
+        )
+
+    def _refuse(
+        self, visitor: Visitor, resource: str, caller_id: str, sock: socket.socket, reason: str
+    ) -> None:
+        """Tell the peer why and close; it counts for its host until then."""
+        self._reporter.refused(visitor.key, resource, visitor.host, caller_id, reason)
+
+        def ended(farewell: Farewell) -> None:
+            self._farewells.discard(farewell)
+            self._ports.left(visitor.host)
+
+        farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended)
+        if farewell.live:
+            self._farewells.add(farewell)
+
+    def _tick(self) -> None:
+        rows = [row for topic, _publisher in self._topics.values() if (row := topic.traffic()) is not None]
+        rows, self._last_rows = self._last_rows + rows, []
+        self._reporter.tick(rows)
+        self._loop.after(self._limits.report_every, self._tick)

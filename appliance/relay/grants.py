@@ -1,0 +1,160 @@
+"""What control has stated: which incarnations, publications and services there are, and who may have them.
+
+The relay decides nothing. This table answers two questions, "is there a grant for this peer?" and "what is at
+this port?", and turns a restatement into withdrawals.
+
+Invariants:
+- Nothing is served that is not in the table.
+- Between `StateBegan` and `StateEnded` everything stated before still holds, so a restarted control
+  interrupts nobody; at `StateEnded` whatever was not said again is withdrawn. A `StateBegan` that is followed
+  by another (control died in the middle) withdraws nothing.
+- An incarnation that is withdrawn takes its publications, services and grants with it.
+"""
+
+from dataclasses import dataclass
+
+from appliance.channel.messages import (
+    ClientGranted,
+    ClientRevoked,
+    GrantInstalled,
+    GrantRevoked,
+    Message,
+    NodePlaced,
+    NodeWithdrawn,
+    PublicationPlaced,
+    PublicationWithdrawn,
+    ServicePlaced,
+    ServiceWithdrawn,
+)
+
+_STATED = (NodePlaced, PublicationPlaced, ServicePlaced, GrantInstalled, ClientGranted)
+_Fact = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Service:
+    """Where a service really is."""
+
+    key: str
+    service: str
+    host: str
+    port: int
+
+
+class StatedTable:
+    """Control's statements, as one table that can be restated."""
+
+    def __init__(self) -> None:
+        self._facts: dict[_Fact, Message] = {}
+        self._restated: set[_Fact] | None = None
+        self._epoch = 0
+
+    def begin(self, epoch: int) -> None:
+        """A restatement starts."""
+        self._restated = set()
+        self._epoch = epoch
+
+    def end(self, epoch: int) -> list[Message]:
+        """The restatement is over: the withdrawals of what was not said again, already taken from the
+        table."""
+        if self._restated is None or epoch != self._epoch:
+            return []
+        gone = [fact for fact in self._facts if fact not in self._restated]
+        self._restated = None
+        withdrawals = [_withdrawal(fact) for fact in gone]
+        for message in withdrawals:
+            self.withdraw(message)
+        return withdrawals
+
+    def state(self, message: Message) -> None:
+        """Control says that something is so."""
+        fact = _fact(message)
+        self._facts[fact] = message
+        if self._restated is not None:
+            self._restated.add(fact)
+
+    def withdraw(self, message: Message) -> None:
+        """Control says that something is so no longer; unknown things are fine."""
+        if isinstance(message, NodeWithdrawn):
+            for fact in [fact for fact in self._facts if fact[1] == message.key]:
+                self._forget(fact)
+        else:
+            self._forget(_withdrawn_fact(message))
+
+    def node(self, key: str) -> NodePlaced | None:
+        """The incarnation behind a key."""
+        node = self._facts.get(("node", key))
+        return node if isinstance(node, NodePlaced) else None
+
+    def publication(self, key: str, topic: str) -> PublicationPlaced | None:
+        """The publication of a topic by an incarnation."""
+        publication = self._facts.get(("publication", key, topic))
+        return publication if isinstance(publication, PublicationPlaced) else None
+
+    def service(self, key: str, service: str) -> Service | None:
+        """Where an incarnation's service is."""
+        placed = self._facts.get(("service", key, service))
+        if not isinstance(placed, ServicePlaced):
+            return None
+        return Service(key, service, placed.host, placed.port)
+
+    def may_subscribe(self, key: str, topic: str, host: str, caller_id: str) -> bool:
+        """Whether this subscriber may have this topic of that incarnation."""
+        return ("grant", key, topic, host, caller_id) in self._facts
+
+    def may_call(self, key: str, service: str, host: str) -> bool:
+        """Whether this host may call this service of that incarnation."""
+        return ("client", key, service, host) in self._facts
+
+    def _forget(self, fact: _Fact) -> None:
+        self._facts.pop(fact, None)
+        if self._restated is not None:
+            self._restated.discard(fact)
+
+
+def is_statement(message: Message) -> bool:
+    """Whether the message states something that holds until it is withdrawn."""
+    return isinstance(message, _STATED)
+
+
+def _fact(message: Message) -> _Fact:
+    match message:
+        case NodePlaced(key=key):
+            return ("node", key)
+        case PublicationPlaced(key=key, topic=topic):
+            return ("publication", key, topic)
+        case ServicePlaced(key=key, service=service):
+            return ("service", key, service)
+        case GrantInstalled(key=key, topic=topic, host=host, caller_id=caller_id):
+            return ("grant", key, topic, host, caller_id)
+        case ClientGranted(key=key, service=service, host=host):
+            return ("client", key, service, host)
+    raise TypeError(f"{type(message).__name__} states nothing")
+
+
+def _withdrawn_fact(message: Message) -> _Fact:
+    match message:
+        case PublicationWithdrawn(key=key, topic=topic):
+            return ("publication", key, topic)
+        case ServiceWithdrawn(key=key, service=service):
+            return ("service", key, service)
+        case GrantRevoked(key=key, topic=topic, host=host, caller_id=caller_id):
+            return ("grant", key, topic, host, caller_id)
+        case ClientRevoked(key=key, service=service, host=host):
+            return ("client", key, service, host)
+    raise TypeError(f"{type(message).__name__} withdraws nothing")
+
+
+def _withdrawal(fact: _Fact) -> Message:
+    match fact:
+        case ("node", key):
+            return NodeWithdrawn(key)
+        case ("publication", key, topic):
+            return PublicationWithdrawn(key, topic)
+        case ("service", key, service):
+            return ServiceWithdrawn(key, service)
+        case ("grant", key, topic, host, caller_id):
+            return GrantRevoked(key, topic, host, caller_id)
+        case ("client", key, service, host):
+            return ClientRevoked(key, service, host)
+    raise TypeError(f"no withdrawal for {fact}")

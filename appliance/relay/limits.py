@@ -1,0 +1,68 @@
+"""Every bound of the data plane, named, in one place.
+
+The defaults are beyond a large robot (100 nodes, 1,000 topics).
+"""
+
+from dataclasses import dataclass
+
+MIB = 1 << 20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of one relay process; lengths in bytes, times in seconds."""
+
+    connections: int = 4096
+    """Subscribers and clients connected at once, those that have not sent their header yet included."""
+
+    connections_per_host: int = 512
+    """The same, of one host."""
+
+    header_bytes: int = 64 << 10
+    """A TCPROS connection header, its length field not counted."""
+
+    header_seconds: float = 10.0
+    """From accepting a connection to its whole header."""
+
+    message_bytes: int = 256 * MIB
+    """One message, request or response; a peer that declares more is cut. At least 1 MiB."""
+
+    queue_messages: int = 1000
+    """Messages that wait for one slow subscriber; the oldest are dropped beyond."""
+
+    queue_bytes: int = 64 * MIB
+    """The same in bytes. A message in the middle of being sent does not count: it is never dropped."""
+
+    queue_grace: float = 0.05
+    """While *every* subscriber of a topic is full, and for no longer, its publisher is not read."""
+
+    memory_bytes: int = 1024 * MIB
+    """Queues and unfinished messages of the whole process."""
+
+    connect_seconds: float = 3.0
+    """To connect to a publisher or a service, and from there to its header."""
+
+    answer_seconds: float = 10.0
+    """For control's answer to `UpstreamWanted`; then it is asked again."""
+
+    retry_first: float = 0.1
+    """Wait before a lost publisher is asked for again; doubled with each failure."""
+
+    retry_longest: float = 5.0
+    """The longest wait between two tries."""
+
+    linger: float = 2.0
+    """A publisher's connection is kept so long after its last subscriber left."""
+
+    farewell: float = 2.0
+    """A refused peer has so long to read the reason before its connection is closed."""
+
+    report_every: float = 1.0
+    """Between two `TrafficReported`, and the time over which equal refusals are folded."""
+
+    refusals: int = 100
+    """Different refusals reported one by one in that time; the rest are counted together."""
+
+    def __post_init__(self) -> None:
+        if self.message_bytes < MIB:
+            raise ValueError(f"message_bytes is {self.message_bytes}; it must be at least {MIB}")

@@ -1,0 +1,189 @@
+"""How the relay sets up its sockets, and a byte stream over one that never blocks."""
+
+import contextlib
+import errno
+import socket
+from collections.abc import Callable
+
+from appliance.relay.loop import HANGUP, READ, WRITE, Loop
+
+_CONGESTION = b"cubic"
+_KEEPALIVE = ((socket.TCP_KEEPIDLE, 60), (socket.TCP_KEEPINTVL, 10), (socket.TCP_KEEPCNT, 9))
+_READ_SIZE = 64 << 10
+
+
+def tune(sock: socket.socket) -> bool:
+    """Non-blocking, no Nagle delay, keepalive, cubic; whether the kernel let us choose cubic.
+
+    Where bbr is the default, large messages over loopback and a bridge go at about half the rate of cubic.
+    """
+    sock.setblocking(False)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEPALIVE:
+        sock.setsockopt(socket.IPPROTO_TCP, option, value)
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, _CONGESTION)
+    except OSError:
+        return False
+    return True
+
+
+def congestion_control() -> str:
+    """What the relay's sockets will use, for the status: `cubic`, or the system's default and why."""
+    with socket.socket() as sock:
+        if tune(sock):
+            return _CONGESTION.decode()
+        default = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0").decode()
+    return f"{default} (the kernel does not let this process choose cubic)"
+
+
+def begin_connect(host: str, port: int) -> socket.socket:
+    """A socket that is connecting to `host` (an address, never a name); raises `OSError` when it cannot
+    start."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        socket.inet_pton(family, host)
+    except OSError:
+        raise OSError(errno.EINVAL, f"{host!r} is not an IP address") from None
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        tune(sock)
+        error = sock.connect_ex((host, port))
+        if error not in {0, errno.EINPROGRESS}:
+            raise OSError(error, f"cannot connect to {host}:{port}: {errno.errorcode.get(error, error)}")
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+class Stream:
+    """A connected (or connecting) socket with what is still to be written, for everything but the fast path.
+
+    `received(data)` is called with what arrives and with b"" once at the end; `opened()` when a connecting
+    socket is connected; `drained()` whenever the last byte waiting has been taken by the kernel;
+    `broken(reason)` once, when the socket fails. After `close` or `take` nothing is called.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        sock: socket.socket,
+        received: Callable[[bytes], None],
+        broken: Callable[[str], None],
+        *,
+        opened: Callable[[], None] | None = None,
+        drained: Callable[[], None] | None = None,
+    ) -> None:
+        self._loop = loop
+        self._socket = sock
+        self._received = received
+        self._broken = broken
+        self._opened = opened
+        self._drained = drained
+        self._outgoing = bytearray()
+        self._reading = True
+        self._live = True
+        loop.watch(sock.fileno(), WRITE if opened else READ, self._ready)
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that the kernel has not taken yet."""
+        return len(self._outgoing)
+
+    def send(self, data: bytes) -> None:
+        """Write, now or when the socket takes it."""
+        if not self._live:
+            return
+        if not self._outgoing and self._opened is None:
+            try:
+                sent = self._socket.send(data)
+            except BlockingIOError:
+                sent = 0
+            except OSError as error:
+                self._fail(error)
+                return
+            data = data[sent:]
+        if data:
+            self._outgoing += data
+            self._watch()
+
+    def read(self, wanted: bool) -> None:
+        """Go on or stop reading; the end of the connection is noticed either way."""
+        if self._live and wanted != self._reading:
+            self._reading = wanted
+            self._watch()
+
+    def finish(self) -> None:
+        """No more will be written: the peer sees the end after what is waiting."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_WR)
+
+    def take(self) -> socket.socket:
+        """Give the socket away; what was written must have drained."""
+        self._live = False
+        self._loop.unwatch(self._socket.fileno())
+        return self._socket
+
+    def close(self) -> None:
+        """Close the socket; what is waiting is lost."""
+        if self._live:
+            self._live = False
+            self._loop.discard(self._socket)
+
+    def _watch(self) -> None:
+        events = READ if self._reading else HANGUP
+        if self._outgoing or self._opened is not None:
+            events |= WRITE
+        self._loop.change(self._socket.fileno(), events)
+
+    def _ready(self, events: int) -> None:
+        if self._opened is not None:
+            self._connected()
+            return
+        if events & WRITE:
+            self._flush()
+        if self._live and events & ~WRITE:
+            if self._reading:
+                self._receive()
+            else:
+                self._fail(None)
+
+    def _connected(self) -> None:
+        error = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if error:
+            self._fail(OSError(error, errno.errorcode.get(error, str(error))))
+            return
+        opened, self._opened = self._opened, None
+        self._watch()
+        if opened is not None:
+            opened()
+
+    def _flush(self) -> None:
+        try:
+            sent = self._socket.send(self._outgoing)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._fail(error)
+            return
+        del self._outgoing[:sent]
+        if not self._outgoing:
+            self._watch()
+            if self._drained is not None:
+                self._drained()
+
+    def _receive(self) -> None:
+        try:
+            data = self._socket.recv(_READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._fail(error)
+            return
+        self._received(data)
+
+    def _fail(self, error: OSError | None) -> None:
+        self.close()
+        self._broken("closed by the peer" if error is None else error.strerror or str(error))

@@ -1,0 +1,179 @@
+"""A subscriber's connection: the publisher's header, then frames; nothing is expected from the subscriber.
+
+Invariants:
+- No send ever blocks. What the socket does not take waits in the subscriber's own `Outbox`.
+- A subscriber that sends anything after its header is cut: its connection is for the one topic it was
+  granted.
+"""
+
+import socket
+from collections.abc import Callable, Mapping
+
+from appliance.relay.context import RelayContext
+from appliance.relay.frames import Batch
+from appliance.relay.loop import READ, WRITE
+from appliance.relay.outbox import Outbox
+from appliance.relay.topic import RelayedTopic
+from appliance.ros.tcpros import encode_header
+
+_ANY = "*"
+
+
+class Subscriber:
+    """One subscriber of one relayed topic.
+
+    Either `ended()` is called once, when its connection is closed, or `refuse(sock, reason)`, which takes the
+    socket over, when the types differ.
+    """
+
+    def __init__(
+        self,
+        context: RelayContext,
+        sock: socket.socket,
+        topic: RelayedTopic,
+        host: str,
+        fields: Mapping[str, str],
+        *,
+        refuse: Callable[[socket.socket, str], None],
+        ended: Callable[[], None],
+    ) -> None:
+        self.topic = topic
+        self.host = host
+        self.caller_id = fields["callerid"]
+        self.full_since: float | None = None
+        self._loop = context.loop
+        self._socket = sock
+        self._send = sock.send
+        self._fields = fields
+        self._reporter = context.reporter
+        self._refuse = refuse
+        self._ended = ended
+        self._outbox = Outbox(context.limits, context.budget)
+        self._number = 0
+        self._live = True
+        self._loop.watch(sock.fileno(), READ, self._ready)
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Answer with the publisher's header, or with an error header where type and md5sum do not fit."""
+        mismatch = describe_mismatch(self._fields, header)
+        if mismatch:
+            self._live = False
+            self._loop.unwatch(self._socket.fileno())
+            self.topic.leave(self)
+            self._refuse(self._socket, mismatch)
+            return False
+        self._number = self._reporter.opened(
+            self.topic.key, self.topic.topic, "topic", self.host, self.caller_id
+        )
+        data = encode_header(header)
+        try:
+            sent = self._send(data)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
+            self._close(f"cannot be written to: {error.strerror}")
+            return False
+        if sent < len(data):
+            self._outbox.begin(memoryview(data)[sent:])
+            self._loop.change(self._socket.fileno(), READ | WRITE)
+        return True
+
+    def deliver(self, batch: Batch) -> None:
+        """Send the frames, or queue what the socket does not take."""
+        outbox = self._outbox
+        if outbox:
+            outbox.append(batch.keep(), batch.messages)
+        else:
+            view = batch.view
+            try:
+                sent = self._send(view)
+            except BlockingIOError:
+                sent = 0
+            except OSError as error:
+                self._close(f"cannot be written to: {error.strerror}")
+                return
+            if sent == len(view):
+                return
+            outbox.append(batch.keep(), batch.messages, sent)
+            self._loop.change(self._socket.fileno(), READ | WRITE)
+        if self.full_since is None and outbox.full:
+            self.full_since = self._loop.clock()
+
+    @property
+    def full(self) -> bool:
+        """Whether the queue has reached its bounds."""
+        return self._outbox.full
+
+    def trim(self) -> int:
+        """Drop the oldest messages beyond the bounds; how many."""
+        return self._outbox.trim()
+
+    def cut(self, reason: str) -> None:
+        """Close the connection: what it stands on is gone."""
+        self._close(reason)
+
+    def _ready(self, events: int) -> None:
+        if events & WRITE:
+            self._flush()
+        if self._live and events & ~WRITE:
+            self._listen()
+
+    def _flush(self) -> None:
+        outbox = self._outbox
+        try:
+            sent = self._socket.sendmsg(outbox.vectors())
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._close(f"cannot be written to: {error.strerror}")
+            return
+        outbox.advance(sent)
+        if not outbox:
+            self.full_since = None
+            self._loop.change(self._socket.fileno(), READ)
+        if not outbox.full:
+            self.topic.relieve()
+
+    def _listen(self) -> None:
+        try:
+            data = self._socket.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._close(f"broke: {error.strerror}")
+            return
+        if not data:
+            self._close("")
+            return
+        reason = (
+            "sent data after its header; a connection is for one topic, ask for another on another connection"
+        )
+        self._reporter.refused(self.topic.key, self.topic.topic, self.host, self.caller_id, reason)
+        self._close(reason)
+
+    def _close(self, reason: str) -> None:
+        if self._live:
+            self._live = False
+            self._loop.discard(self._socket)
+            self._outbox.clear()
+            self.topic.leave(self)
+            self._reporter.closed(self._number, reason)
+            self._ended()
+
+
+def describe_mismatch(wanted: Mapping[str, str], offered: Mapping[str, str]) -> str:
+    """Why a subscriber's header does not fit a publisher's; empty when it does.
+
+    As in ROS, the md5sum decides.
+    """
+    md5sum, real_md5sum = wanted.get("md5sum", _ANY), offered.get("md5sum", _ANY)
+    if _ANY in {md5sum, real_md5sum} or md5sum == real_md5sum:
+        return ""
+    name, real_name = wanted.get("type", _ANY), offered.get("type", _ANY)
+    if _ANY not in {name, real_name} and name != real_name:
+        return f"topic types do not match: [{name}] vs. [{real_name}]"
+    return (
+        f"Client [{wanted.get('callerid', '')}] wants topic [{wanted.get('topic', '')}] to have"
+        f" datatype/md5sum [{name}/{md5sum}], but our version has [{real_name}/{real_md5sum}]."
+        " Dropping connection."
+    )

@@ -1,0 +1,194 @@
+"""One relayed topic of one publisher: who gets its messages, without sockets.
+
+A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header,
+and subscribers that are served. The upstream exists while there is a subscriber, and a short linger beyond.
+
+When the upstream is lost, the subscribers stay: the publication still stands, so its node lives or control
+will withdraw it, and then they are cut. Keeping them is what keeps traffic flowing: rospy never connects
+again to an address that closed on it (only a `publisherUpdate` makes it), roscpp waits up to 20 s between two
+tries; but when the publisher is reached again, messages go on at once for both. Frames are passed on whole
+(`frames`), so nobody has been left with a torn one. Only when the publisher comes back with another type or
+md5sum are they cut: they must read the new header. A publisher that is killed and restarted is another
+incarnation with another key and port; its subscribers are told by control, and the old connections end with
+the withdrawal.
+
+When *all* subscribers are full at the same moment, the publisher is not read for at most `queue_grace`: a
+subscriber process that was descheduled for some milliseconds under a flood loses nothing, while one that is
+stuck is treated as stuck (its oldest messages are dropped) until it has caught up completely, and never
+delays the others: as soon as one has room, the publisher is read.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from appliance.channel.messages import TopicTraffic
+from appliance.relay.frames import Batch
+
+
+class Member(Protocol):
+    """A subscriber, as its topic sees it."""
+
+    full_since: float | None
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Answer with the publisher's header, or refuse if the types differ; whether it is served now."""
+
+    def deliver(self, batch: Batch) -> None:
+        """Send the batch or queue it."""
+
+    @property
+    def full(self) -> bool:
+        """Whether its queue has reached its bounds."""
+
+    def trim(self) -> int:
+        """Drop what is beyond the bounds, oldest first; how many messages."""
+
+    def cut(self, reason: str) -> None:
+        """Close its connection."""
+
+
+class Upstream(Protocol):
+    """The connection to the publisher, as its topic sees it."""
+
+    def want(self) -> None:
+        """There is somebody to serve."""
+
+    def spare(self) -> None:
+        """There is nobody to serve any more."""
+
+    def pause(self, seconds: float) -> None:
+        """Do not read until `resume`, or for so long."""
+
+    def resume(self) -> None:
+        """Read on."""
+
+
+class RelayedTopic:
+    """A topic of an incarnation with its subscribers."""
+
+    def __init__(self, key: str, topic: str, name: str, grace: float, clock: Callable[[], float]) -> None:
+        self.key = key
+        self.topic = topic
+        self.upstream: Upstream | None = None
+        self._name = name
+        self._grace = grace
+        self._clock = clock
+        self._header: dict[str, str] | None = None
+        self._waiting: tuple[Member, ...] = ()
+        self._served: tuple[Member, ...] = ()
+        self._latched: Batch | None = None
+        self._latching = False
+        self._paused = False
+        self._reported = True
+        self._messages = self._bytes = self._dropped = 0
+
+    @property
+    def members(self) -> tuple[Member, ...]:
+        """Everybody who is connected for this topic."""
+        return self._waiting + self._served
+
+    def join(self, member: Member) -> None:
+        """A subscriber with a grant: served at once when the publisher's header is known, else when it is."""
+        if self._header is None:
+            self._waiting += (member,)
+        else:
+            self._serve(member, self._header)
+        if self.upstream is not None:
+            self.upstream.want()
+
+    def leave(self, member: Member) -> None:
+        """A subscriber's connection is closed."""
+        self._waiting = tuple(one for one in self._waiting if one is not member)
+        self._served = tuple(one for one in self._served if one is not member)
+        self._reported = False
+        self.relieve()
+        if not self.members and self.upstream is not None:
+            self.upstream.spare()
+
+    def upstream_opened(self, header: Mapping[str, str]) -> None:
+        """The publisher has answered with its header."""
+        header = {**header, "callerid": self._name, "topic": self.topic}
+        before, self._header = self._header, header
+        self._latching = header.get("latching", "0") == "1"
+        if before is not None and _identity(before) != _identity(header):
+            for member in self._served:
+                member.cut("the publisher has come back with another type")
+        waiting, self._waiting = self._waiting, ()
+        for member in waiting:
+            self._serve(member, header)
+        if self.members and self.upstream is not None:
+            self.upstream.want()
+
+    def upstream_closed(self) -> None:
+        """The connection to the publisher is gone; its subscribers stay (see above)."""
+        self._latched = None
+        self._paused = False
+        if not self._served:
+            self._header = None
+
+    def received(self, batch: Batch) -> None:
+        """Frames have come from the publisher: through the middle, to the subscribers."""
+        self._messages += batch.messages
+        self._bytes += len(batch.view)
+        self._reported = False
+        self._pass_on(batch)
+
+    def _pass_on(self, batch: Batch) -> None:
+        if self._latching:
+            self._latched = batch.keep_last()
+        congested = False
+        for member in self._served:
+            member.deliver(batch)
+            congested = congested or member.full_since is not None
+        if congested:
+            self._relieve_or_pause()
+
+    def relieve(self) -> None:
+        """A subscriber has room again, or is gone: the publisher may be read."""
+        if self._paused:
+            self._paused = False
+            if self.upstream is not None:
+                self.upstream.resume()
+
+    def cut_all(self, reason: str) -> None:
+        """The topic is withdrawn: every subscriber's connection is closed."""
+        for member in self.members:
+            member.cut(reason)
+
+    def traffic(self) -> TopicTraffic | None:
+        """The counters since the last call; None when nothing has changed."""
+        if self._reported:
+            return None
+        row = TopicTraffic(
+            self.key, self.topic, self._messages, self._bytes, self._dropped, len(self._served)
+        )
+        self._messages = self._bytes = self._dropped = 0
+        self._reported = True
+        return row
+
+    def _serve(self, member: Member, header: Mapping[str, str]) -> None:
+        if not member.greet(header):
+            return
+        self._served += (member,)
+        self._reported = False
+        if self._latched is not None:
+            member.deliver(self._latched)
+        self.relieve()
+
+    def _relieve_or_pause(self) -> None:
+        full = [member for member in self._served if member.full]
+        if not full:
+            return
+        if len(full) == len(self._served):
+            deadlines = [member.full_since + self._grace for member in full if member.full_since is not None]
+            left = max(deadlines) - self._clock()
+            if left > 0 and self.upstream is not None:
+                self._paused = True
+                self.upstream.pause(left)
+                return
+        for member in full:
+            self._dropped += member.trim()
+
+
+def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
+    return tuple(header.get(field) for field in ("type", "md5sum", "message_definition", "latching"))

@@ -1,0 +1,389 @@
+"""Plays control for a real relay process: a master that real ROS nodes use, in front of a real rosmaster.
+
+Every node that registers gets a face (an XML-RPC server that stands for its API) and a relay port. The face
+answers `requestTopic` with the relay port after installing the grant, and hands everything else to the node
+itself. This is the least that puts a relay between unmodified nodes; it decides nothing and protects nothing.
+Run as a program it serves until its standard input ends, for measurements:
+
+    python3 -m tests.support.relay_driver --master-port 11611 --rosmaster-port 11612
+"""
+
+import argparse
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable
+from pathlib import Path
+from socketserver import ThreadingMixIn
+from types import TracebackType
+from typing import Any
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import (
+    ClientGranted,
+    GrantInstalled,
+    Lifeline,
+    LinkOpened,
+    Message,
+    NodePlaced,
+    Ping,
+    Pong,
+    PublicationPlaced,
+    PublicationWithdrawn,
+    Ready,
+    RelayLink,
+    ServicePlaced,
+    ServiceWithdrawn,
+    Stop,
+    UpstreamFound,
+    UpstreamRefused,
+    UpstreamWanted,
+)
+
+LOOPBACK = "127.0.0.1"
+_URI = re.compile(r"^\w+://([^:/]+):(\d+)")
+
+
+class _Server(ThreadingMixIn, SimpleXMLRPCServer):
+    daemon_threads = True
+    allow_reuse_address = True
+
+
+class _Handler(SimpleXMLRPCRequestHandler):
+    rpc_paths = ()
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+
+class ChannelPeer:
+    """One end of a channel, served by a thread; remembers what came and lets tests wait for it."""
+
+    def __init__(
+        self, sock: socket.socket, union: Any, received: Callable[[Any], None] | None = None
+    ) -> None:
+        self._channel = Channel(sock, union)
+        self._received = received
+        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self.messages: list[Any] = []
+        self.ended = threading.Event()
+        self._wake, self._woken = socket.socketpair()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
+        """Send to the relay."""
+        with self._lock:
+            self._channel.send(message, descriptors)
+        self._wake.send(b"x")
+
+    def wait_for(self, wanted: Callable[[Any], bool], seconds: float = 20.0, after: int = 0) -> Any:
+        """The first message (from index `after` on) that fits; fails loudly when none comes."""
+        deadline = time.monotonic() + seconds
+        with self._changed:
+            while True:
+                for message in self.messages[after:]:
+                    if wanted(message):
+                        return message
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    raise AssertionError(
+                        f"no such message within {seconds} s; there were {self.messages[-20:]}"
+                    )
+                self._changed.wait(left)
+
+    def close(self) -> None:
+        """End the channel as the death of a process would."""
+        self.ended.set()
+        self._wake.send(b"x")
+        self._thread.join(5)
+        self._wake.close()
+        self._woken.close()
+
+    def _serve(self) -> None:
+        import select  # noqa: PLC0415 - used by this thread only
+
+        while not self.ended.is_set():
+            writing = [self._channel] if self._channel.pending else []
+            select.select([self._channel, self._woken], writing, [])
+            if self.ended.is_set():
+                break
+            if select.select([self._woken], [], [], 0)[0]:
+                self._woken.recv(4096)
+            try:
+                with self._lock:
+                    self._channel.flush()
+                    messages = self._channel.receive()
+            except ChannelClosedError:
+                break
+            for message, _descriptors in messages:
+                if self._received is not None:
+                    self._received(message)
+                with self._changed:
+                    self.messages.append(message)
+                    self._changed.notify_all()
+        self.ended.set()
+        with self._changed:
+            self._changed.notify_all()
+        with self._lock:
+            self._channel.close()
+
+
+class RelayProcess:
+    """A real relay process with its lifeline, and the links to the controls a test plays."""
+
+    def __init__(self, limits: str = "None") -> None:
+        ours, theirs = socket.socketpair()
+        code = (
+            "import sys; from appliance.relay.process import main; from appliance.relay.limits import Limits;"
+            f" main(int(sys.argv[1]), 0, {limits})"
+        )
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            cwd=Path(__file__).parents[2],
+        )
+        theirs.close()
+        self.lifeline = ChannelPeer(ours, Lifeline)
+        self.ready: Ready = self.lifeline.wait_for(lambda message: isinstance(message, Ready))
+
+    def open_link(self, received: Callable[[Any], None] | None = None) -> ChannelPeer:
+        """Be the control from now on."""
+        ours, theirs = socket.socketpair()
+        link = ChannelPeer(ours, RelayLink, received)
+        self.lifeline.send(LinkOpened("control", 0), (theirs.fileno(),))
+        theirs.close()
+        return link
+
+    def ping(self, number: int) -> None:
+        """Wait for the answer of the relay's main loop: everything sent to it before has been carried out."""
+        after = len(self.lifeline.messages)
+        self.lifeline.send(Ping(number))
+        self.lifeline.wait_for(lambda message: message == Pong(number), after=after)
+
+    def stop(self) -> int:
+        """End it as the supervisor does; its exit status."""
+        if self.process.poll() is None:
+            self.lifeline.send(Stop())
+        status = self.process.wait(10)
+        self.lifeline.close()
+        return status
+
+    def kill(self) -> None:
+        """End it as a crash does."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(10)
+        self.lifeline.close()
+
+
+class Face:
+    """What stands for one node: its API, and the relay's port for its topics and services."""
+
+    def __init__(self, driver: "RelayDriver", name: str, uri: str) -> None:
+        self.driver = driver
+        self.name = name
+        self.real_uri = uri
+        self.key = f"{name}-{len(driver.faces)}"
+        self.publications: dict[str, str] = {}
+        self.services: dict[str, int] = {}
+        self.grants: set[tuple[str, str]] = set()
+        self.listening = socket.create_server((LOOPBACK, 0), backlog=128)
+        self.port: int = self.listening.getsockname()[1]
+        self._server = _Server((LOOPBACK, 0), _Handler, logRequests=False, allow_none=True)
+        self._server.register_instance(self)
+        self.uri = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> Any:
+        if method == "requestTopic":
+            caller_id, topic, _protocols = parameters
+            if topic not in self.publications:
+                return [0, f"not a publisher of {topic}", 0]
+            if self.driver.granting:
+                self.grants.add((topic, caller_id))
+                self.driver.link.send(GrantInstalled(self.key, topic, LOOPBACK, caller_id))
+            return [1, "ready", ["TCPROS", LOOPBACK, self.port]]
+        return getattr(xmlrpc.client.ServerProxy(self.real_uri), method)(*parameters)
+
+    def statements(self) -> list[tuple[Message, tuple[int, ...]]]:
+        """Everything control says about this incarnation."""
+        return [
+            (NodePlaced(self.key, self.name, LOOPBACK), (self.listening.fileno(),)),
+            *((PublicationPlaced(self.key, topic, kind), ()) for topic, kind in self.publications.items()),
+            *((ServicePlaced(self.key, name, LOOPBACK, port), ()) for name, port in self.services.items()),
+            *((ClientGranted(self.key, name, LOOPBACK), ()) for name in self.services),
+            *((GrantInstalled(self.key, topic, LOOPBACK, caller), ()) for topic, caller in self.grants),
+        ]
+
+    def close(self) -> None:
+        """End the face."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(5)
+        self.listening.close()
+
+
+class RelayDriver:
+    """rosmaster, relay, and the master in front; a context manager."""
+
+    def __init__(self, port: int = 0, rosmaster_port: int = 0, limits: str = "None") -> None:
+        self.granting = True
+        self.faces: dict[str, Face] = {}
+        self._lock = threading.RLock()
+        self._rosmaster_port = rosmaster_port or free_port()
+        self.rosmaster = subprocess.Popen(
+            ["rosmaster", "--core", "-p", str(self._rosmaster_port)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "ROS_IP": LOOPBACK, "PYTHONWARNINGS": "ignore"},
+        )
+        self._master_uri = f"http://{LOOPBACK}:{self._rosmaster_port}/"
+        self.relay = RelayProcess(limits)
+        self.link = self.relay.open_link(self._received)
+        self._server = _Server((LOOPBACK, port), _Handler, logRequests=False, allow_none=True)
+        self._server.register_instance(self)
+        self.uri = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    def __enter__(self) -> "RelayDriver":
+        wait_until(lambda: _answers(self._rosmaster_port), "rosmaster answers")
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.relay.stop()
+        self.link.close()
+        self._server.shutdown()
+        self._server.server_close()
+        for face in self.faces.values():
+            face.close()
+        self.rosmaster.terminate()
+        self.rosmaster.wait(10)
+
+    def restart_control(self, *, leave_out: Callable[[Message], bool] = lambda _message: False) -> None:
+        """A new control restates everything, except what `leave_out` picks."""
+        self.link.close()
+        self.link = self.relay.open_link(self._received)
+        from appliance.channel.messages import StateBegan, StateEnded  # noqa: PLC0415
+
+        self.link.send(StateBegan(7))
+        for face in self.faces.values():
+            for message, descriptors in face.statements():
+                if not leave_out(message):
+                    self.link.send(message, descriptors)
+        self.link.send(StateEnded(7))
+        self.relay.ping(7)
+
+    def environment(self) -> dict[str, str]:
+        """What a node needs to find this master."""
+        return {**os.environ, "ROS_MASTER_URI": self.uri, "ROS_IP": LOOPBACK, "PYTHONWARNINGS": "ignore"}
+
+    def _face(self, name: str, uri: str) -> Face:
+        with self._lock:
+            face = self.faces.get(name)
+            if face is None or face.real_uri != uri:
+                face = Face(self, name, uri)
+                self.faces[name] = face
+                self.link.send(*face.statements()[0])
+            return face
+
+    def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> Any:
+        """The Master API: registrations carry the face's URI, services the relay's port."""
+        arguments = list(parameters)
+        if method in {
+            "registerPublisher",
+            "registerSubscriber",
+            "unregisterPublisher",
+            "unregisterSubscriber",
+        }:
+            face = self._face(arguments[0], arguments[-1])
+            arguments[-1] = face.uri
+            if method == "registerPublisher":
+                face.publications[arguments[1]] = arguments[2]
+                self.link.send(PublicationPlaced(face.key, arguments[1], arguments[2]))
+            elif method == "unregisterPublisher":
+                face.publications.pop(arguments[1], None)
+                self.link.send(PublicationWithdrawn(face.key, arguments[1]))
+        elif method == "registerService":
+            face = self._face(arguments[0], arguments[3])
+            port = _port(arguments[2])
+            face.services[arguments[1]] = port
+            self.link.send(ServicePlaced(face.key, arguments[1], LOOPBACK, port))
+            self.link.send(ClientGranted(face.key, arguments[1], LOOPBACK))
+            arguments[2:] = [f"rosrpc://{LOOPBACK}:{face.port}", face.uri]
+        elif method == "unregisterService":
+            face = self.faces[arguments[0]]
+            face.services.pop(arguments[1], None)
+            self.link.send(ServiceWithdrawn(face.key, arguments[1]))
+            arguments[2] = f"rosrpc://{LOOPBACK}:{face.port}"
+        elif method == "subscribeParam":
+            arguments[1] = self._face(arguments[0], arguments[1]).uri
+        return getattr(xmlrpc.client.ServerProxy(self._master_uri, allow_none=True), method)(*arguments)
+
+    def _received(self, message: Any) -> None:
+        if isinstance(message, UpstreamWanted):
+            threading.Thread(target=self._find_upstream, args=(message,), daemon=True).start()
+
+    def _find_upstream(self, message: UpstreamWanted) -> None:
+        face = next(face for face in self.faces.values() if face.key == message.key)
+        try:
+            node = xmlrpc.client.ServerProxy(face.real_uri)
+            _code, text, where = node.requestTopic("/rosrv", message.topic, [["TCPROS"]])  # type: ignore[misc]
+        except OSError as error:
+            self.link.send(UpstreamRefused(message.key, message.topic, str(error)))
+            return
+        if isinstance(where, list) and len(where) == 3:
+            self.link.send(UpstreamFound(message.key, message.topic, LOOPBACK, int(where[2])))
+        else:
+            self.link.send(UpstreamRefused(message.key, message.topic, str(text)))
+
+
+def free_port() -> int:
+    """A port that is free now; only for programs that cannot be given port 0 (rosmaster)."""
+    with socket.create_server((LOOPBACK, 0)) as sock:
+        return int(sock.getsockname()[1])
+
+
+def wait_until(condition: Callable[[], bool], what: str, seconds: float = 30.0) -> None:
+    """Wait for something that has no event of its own; fails loudly."""
+    deadline = time.monotonic() + seconds
+    pause = threading.Event()
+    while not condition():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {seconds} s: {what}")
+        pause.wait(0.02)
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as sock:
+        return sock.connect_ex((LOOPBACK, port)) == 0
+
+
+def _port(uri: str) -> int:
+    match = _URI.match(uri)
+    assert match is not None, uri
+    return int(match[2])
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(description="A relay between ROS nodes, for measurements.")
+    parser.add_argument("--master-port", type=int, default=0)
+    parser.add_argument("--rosmaster-port", type=int, default=0)
+    arguments = parser.parse_args()
+    with RelayDriver(arguments.master_port, arguments.rosmaster_port) as driver:
+        print(driver.uri, driver.relay.process.pid, flush=True)  # noqa: T201 - the caller reads them
+        sys.stdin.read()
+
+
+if __name__ == "__main__":
+    _main()
