@@ -74,7 +74,10 @@ class Channel:
             raise ChannelFullError(f"{self._backlog} bytes wait for the other end of the link")
         self._outgoing.append((_LENGTH.pack(len(body)) + body, [os.dup(one) for one in descriptors]))
         self._backlog += len(body) + _LENGTH.size
-        self.flush()
+        if self._loop is None:
+            self.flush()
+        else:
+            self._flush_attached()
 
     def flush(self) -> None:
         """Write what the socket takes now. Raises `ChannelClosedError` when the other end is gone."""
@@ -156,6 +159,7 @@ class Channel:
     ) -> None:
         """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once.
 
+        From now on `send` never raises because the other end is gone: `closed()` tells it, in order.
         What is not of this link closes it: `refused(reason)` is called then, or `closed()` where none is given.
         """
         self._loop = loop
@@ -178,6 +182,7 @@ class Channel:
                 received(message, descriptors)
 
         loop.add_reader(self.fileno(), readable)
+        self._watch_writable()
 
     def _watch_writable(self) -> None:
         if self._loop is None or self._writing == self.pending:
@@ -193,8 +198,16 @@ class Channel:
             self.flush()
         except ChannelClosedError:
             # The reader sees the end of the stream as well and reports it, after what is still to be read.
-            self._outgoing.clear()
-            self._watch_writable()
+            self._discard_outgoing()
+            if self._socket.fileno() >= 0:
+                self._watch_writable()
+
+    def _discard_outgoing(self) -> None:
+        for _data, descriptors in self._outgoing:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        self._outgoing.clear()
+        self._backlog = 0
 
     def close(self) -> None:
         """Close this end; descriptors that nobody took are closed with it."""
@@ -204,10 +217,7 @@ class Channel:
             self._loop.remove_reader(self.fileno())
             self._loop.remove_writer(self.fileno())
         self._socket.close()
-        for _data, descriptors in self._outgoing:
-            for descriptor in descriptors:
-                os.close(descriptor)
         for descriptor in self._descriptors:
             os.close(descriptor)
-        self._outgoing.clear()
+        self._discard_outgoing()
         self._descriptors.clear()
