@@ -1,25 +1,22 @@
 """`rosrv up`: start the appliance and stay until it is told to stop."""
 
-import asyncio
 import json
 import os
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import setproctitle
 import structlog
 import typer
 
-from appliance.config import Settings
 from appliance.config_sources import resolve
-from appliance.supervisor.errors import StartError
 from appliance.supervisor.logs import configure_logs
-from appliance.supervisor.ports import free_port, require_free
-from appliance.supervisor.privileges import raise_file_limit
-from appliance.supervisor.roles import Facts, roles_of
-from appliance.supervisor.state import StateDirectory
-from appliance.supervisor.supervisor import ControlReady, Supervisor
+from appliance.supervisor.roles import roles_of
+from appliance.supervisor.run import run_appliance
+from appliance.supervisor.supervisor import ControlReady
 
 log = structlog.get_logger()
 
@@ -53,49 +50,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         "isolation": isolation,
     }
     settings = resolve(config, os.environ, flags)
+    setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
-    run(settings, as_json=as_json)
-
-
-def run(settings: Settings, *, as_json: bool) -> None:
-    """Run the appliance with these settings until it is told to stop. Raises `StartError`."""
-    if settings.isolation == "none":
-        log.warning(
-            "isolation none: NO FIREWALL. Every user of this machine can reach the real ROSMaster; "
-            "for development only, use --isolation netns or container"
-        )
-    elif os.geteuid() != 0:
-        raise StartError(
-            f"isolation {settings.isolation} needs root (or use --isolation none, without a firewall)"
-        )
-    roles = roles_of()
-    require_free(*settings.listen_address)
-    port = settings.rosmaster_port or free_port()
-    require_free("127.0.0.1", port)
-    settings = settings.model_copy(update={"rosmaster_port": port})
-    raise_file_limit(16_384)
-    state = StateDirectory(settings.state)
-    try:
-        state.prepare(roles)
-        state.write_config(settings.model_dump_json())
-        facts = Facts(state=state.path, config=state.config, rosmaster_port=port)
-
-        def ready(said: ControlReady) -> None:
-            _announce(said, state.path, as_json=as_json)
-
-        async def supervise() -> None:
-            await Supervisor(
-                roles,
-                facts,
-                admin=state.open_admin_socket(),
-                ready=ready,
-                relays=settings.relays,
-                isolation=settings.isolation,
-            ).run()
-
-        asyncio.run(supervise())
-    finally:
-        state.close()
+    run_appliance(settings, roles_of(), partial(_announce, as_json=as_json))
 
 
 def _announce(said: ControlReady, state: Path, *, as_json: bool) -> None:
@@ -109,5 +66,8 @@ def _announce(said: ControlReady, state: Path, *, as_json: bool) -> None:
         line = json.dumps(event)
     else:
         line = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {state})"
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        log.warning("nobody reads standard output", line=line)

@@ -164,7 +164,6 @@ def _environment(home: str) -> dict[str, str]:
         "HOME": home,
         "PATH": _PROGRAM_PATH,
         "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
-        "PYTHONUNBUFFERED": "1",
     }
 
 

@@ -114,12 +114,13 @@ class Supervisor:
         self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
-        """Start everything, keep it running, and end it on SIGTERM or SIGINT.
+        """Start everything, keep it running, and end it on SIGTERM, SIGINT or SIGHUP.
 
         Raises `StartError` when the appliance cannot start or go on; by then everything is stopped.
         """
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
+        loop.set_exception_handler(_log_fault)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, self.stop)
         watch = asyncio.create_task(self._watch())
         try:
@@ -158,6 +159,7 @@ class Supervisor:
                 return
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._stopping.wait(), 0.05)
+        self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; the log may say why")
 
     def _check_started(self) -> None:
         if not self._is_ready:
@@ -396,6 +398,12 @@ class Supervisor:
                     self._someone_died.clear()
                     await self._someone_died.wait()
         return all(post.life is None for post in posts)
+
+
+def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    # A defect of ours in one callback must not take the robot's master away: it is shown, and the loop
+    # goes on.
+    log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
 
 
 def _title(post: Post) -> str:

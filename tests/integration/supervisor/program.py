@@ -1,0 +1,56 @@
+"""The supervisor with stand-ins for our processes and the real rosmaster and rosout: `program.py STATE
+[ROLE=ENTRY…]`.
+
+Everything that any process says comes on standard output, one JSON object per line.
+"""
+
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import setproctitle
+
+from appliance.config import Settings
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.logs import configure_logs
+from appliance.supervisor.roles import Role, roles_of
+from appliance.supervisor.run import run_appliance
+from appliance.supervisor.supervisor import ControlReady
+
+
+def main() -> None:
+    """Run until told to stop."""
+    os.dup2(1, 2)
+    setproctitle.setproctitle("rosrv: supervisor")
+    configure_logs("supervisor")
+    state = Path(sys.argv[1])
+    actors = {role: role for role in ("control", "relay", "signer")}
+    for one in sys.argv[2:]:
+        role, _, entry = one.partition("=")
+        actors[role] = entry
+    settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0)
+    try:
+        run_appliance(settings, tuple(_played(role, actors) for role in roles_of()), _ready)
+    except StartError as error:
+        _say(event="refused", reason=str(error))
+        sys.exit(1)
+
+
+def _played(role: Role, actors: dict[str, str]) -> Role:
+    if role.name not in actors:
+        return role
+    return replace(role, entry=f"tests.integration.supervisor.actors:{actors[role.name]}")
+
+
+def _ready(said: ControlReady, state: Path) -> None:
+    _say(event="ready", master=said.master, state=str(state))
+
+
+def _say(**fields: str) -> None:
+    os.write(1, (json.dumps(fields) + "\n").encode())  # in one piece: the children write there, too
+
+
+if __name__ == "__main__":
+    main()
