@@ -10,8 +10,7 @@ from appliance.relay.report import Reporter
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """The loop, the bounds, the voice to control, the memory in use, and the area small frames are received
-    into."""
+    """Loop, bounds, the voice to control, the memory in use, and the area small frames are received into."""
 
     loop: Loop
     limits: Limits

@@ -13,18 +13,21 @@ import socket
 from collections.abc import Mapping
 
 from appliance.channel.messages import (
+    ClientRevoked,
     GrantRevoked,
     Message,
     NodePlaced,
     NodeWithdrawn,
     PublicationPlaced,
     PublicationWithdrawn,
+    ServiceWithdrawn,
     StateBegan,
     StateEnded,
     TopicTraffic,
     UpstreamFound,
     UpstreamRefused,
 )
+from appliance.relay.client import ServiceClient, ServiceTraffic
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import SCRATCH, MemoryBudget
 from appliance.relay.grants import StatedTable, is_statement
@@ -52,6 +55,8 @@ class Engine:
         self._table = StatedTable()
         self._ports = Ports(loop, limits, self._arrived, self._turned_away)
         self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher]] = {}
+        self._clients: set[ServiceClient] = set()
+        self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self._visitors: set[Visitor] = set()
         self._farewells: set[Farewell] = set()
         self._link: Link | None = None
@@ -85,6 +90,8 @@ class Engine:
         for topic, publisher in self._topics.values():
             topic.cut_all("the relay ends")
             publisher.close()
+        for client in list(self._clients):
+            client.cut("the relay ends")
         for visitor in self._visitors:
             visitor.close()
         for farewell in list(self._farewells):
@@ -113,10 +120,31 @@ class Engine:
                 self._remove_topic(key, topic, "the publisher's node is gone")
             for visitor in [one for one in self._visitors if one.key == message.key]:
                 self._visitor_failed(visitor, "")
+            self._cut_clients("the service's node is gone", message.key)
+            self._forget_services(message.key)
         elif isinstance(message, PublicationWithdrawn):
             self._remove_topic(message.key, message.topic, "the topic is published no longer")
         elif isinstance(message, GrantRevoked):
             self._revoke_grant(message)
+        elif isinstance(message, ServiceWithdrawn):
+            self._cut_clients("the service is offered no longer", message.key, message.service)
+            self._forget_services(message.key, message.service)
+        elif isinstance(message, ClientRevoked):
+            self._cut_clients("its grant is revoked", message.key, message.service, message.host)
+
+    def _cut_clients(
+        self, reason: str, key: str, service: str | None = None, host: str | None = None
+    ) -> None:
+        for client in list(self._clients):
+            placed = client.service
+            if placed.key == key and service in {None, placed.service} and host in {None, client.host}:
+                client.cut(reason)
+
+    def _forget_services(self, key: str, service: str | None = None) -> None:
+        for one in [one for one in self._services if one[0] == key and service in {None, one[1]}]:
+            row = self._services.pop(one).row(*one)
+            if row is not None:
+                self._last_rows.append(row)
 
     def _place_topic(self, key: str, topic: str) -> None:
         if (key, topic) in self._topics:
@@ -191,6 +219,12 @@ class Engine:
                 self._subscribe(visitor, sock, fields)
                 return
             resource = fields["topic"]
+        elif "service" in fields:
+            reason = self._objection_to_client(visitor, fields)
+            if not reason:
+                self._serve_client(visitor, sock, fields, rest)
+                return
+            resource = fields["service"]
         else:
             reason, resource = "its header names neither a topic nor a service", ""
         self._refuse(visitor, resource, fields.get("callerid", ""), sock, reason)
@@ -213,6 +247,40 @@ class Engine:
                 " a subscriber asks with requestTopic first"
             )
         return ""
+
+    def _objection_to_client(self, visitor: Visitor, fields: Mapping[str, str]) -> str:
+        for required in ("service", "md5sum", "callerid"):
+            if required not in fields:
+                return f"Missing required '{required}' field"
+        service = fields["service"]
+        if self._table.service(visitor.key, service) is None:
+            node = self._table.node(visitor.key)
+            return f"[{node.name if node else visitor.key}] is not a provider of [{service}]"
+        if not self._table.may_call(visitor.key, service, visitor.host):
+            return f"no grant for {visitor.host} to call [{service}]; a client asks with lookupService first"
+        return ""
+
+    def _serve_client(
+        self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str], rest: bytes
+    ) -> None:
+        service = self._table.service(visitor.key, fields["service"])
+        if service is None:
+            return
+        traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
+
+        def refuse(sock: socket.socket, reason: str) -> None:
+            self._clients.discard(client)
+            self._refuse(visitor, service.service, fields["callerid"], sock, reason)
+
+        def ended() -> None:
+            self._clients.discard(client)
+            self._ports.left(visitor.host)
+
+        client = ServiceClient(
+            self._context, sock, service, visitor.host, fields, traffic=traffic, refuse=refuse, ended=ended
+        )
+        self._clients.add(client)
+        client.start(rest)
 
     def _subscribe(self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str]) -> None:
         relayed, _publisher = self._topics[visitor.key, fields["topic"]]
@@ -243,6 +311,9 @@ class Engine:
 
     def _tick(self) -> None:
         rows = [row for topic, _publisher in self._topics.values() if (row := topic.traffic()) is not None]
+        rows += [
+            row for (key, name), one in self._services.items() if (row := one.row(key, name)) is not None
+        ]
         rows, self._last_rows = self._last_rows + rows, []
         self._reporter.tick(rows)
         self._loop.after(self._limits.report_every, self._tick)

@@ -19,8 +19,7 @@ _NO_DESCRIPTOR_PAUSE = 0.2
 
 
 class Ports:
-    """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` where there is no
-    room."""
+    """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room."""
 
     def __init__(
         self,

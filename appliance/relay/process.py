@@ -81,8 +81,7 @@ class RelayProcess:
 
 
 def _raise_descriptor_limit(wanted: int) -> int:
-    """Allow this process as many descriptors as its limits need, as far as the system lets it; how many it
-    has."""
+    """Allow this process the descriptors its limits need, as far as the system lets it; how many it has."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         reachable = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)

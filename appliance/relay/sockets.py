@@ -39,8 +39,7 @@ def congestion_control() -> str:
 
 
 def begin_connect(host: str, port: int) -> socket.socket:
-    """A socket that is connecting to `host` (an address, never a name); raises `OSError` when it cannot
-    start."""
+    """A socket that is connecting to `host`, an address, never a name; raises `OSError` when it cannot."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.inet_pton(family, host)
@@ -186,4 +185,4 @@ class Stream:
 
     def _fail(self, error: OSError | None) -> None:
         self.close()
-        self._broken("closed by the peer" if error is None else error.strerror or str(error))
+        self._broken("" if error is None else error.strerror or str(error))

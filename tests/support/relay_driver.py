@@ -11,6 +11,7 @@ Run as a program it serves until its standard input ends, for measurements:
 import argparse
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -41,6 +42,8 @@ from appliance.channel.messages import (
     RelayLink,
     ServicePlaced,
     ServiceWithdrawn,
+    StateBegan,
+    StateEnded,
     Stop,
     UpstreamFound,
     UpstreamRefused,
@@ -108,11 +111,9 @@ class ChannelPeer:
         self._woken.close()
 
     def _serve(self) -> None:
-        import select  # noqa: PLC0415 - used by this thread only
-
         while not self.ended.is_set():
-            writing = [self._channel] if self._channel.pending else []
-            select.select([self._channel, self._woken], writing, [])
+            writing = [self._channel.fileno()] if self._channel.pending else []
+            select.select([self._channel.fileno(), self._woken.fileno()], writing, [])
             if self.ended.is_set():
                 break
             if select.select([self._woken], [], [], 0)[0]:
@@ -274,8 +275,6 @@ class RelayDriver:
         """A new control restates everything, except what `leave_out` picks."""
         self.link.close()
         self.link = self.relay.open_link(self._received)
-        from appliance.channel.messages import StateBegan, StateEnded  # noqa: PLC0415
-
         self.link.send(StateBegan(7))
         for face in self.faces.values():
             for message, descriptors in face.statements():
@@ -338,7 +337,8 @@ class RelayDriver:
         face = next(face for face in self.faces.values() if face.key == message.key)
         try:
             node = xmlrpc.client.ServerProxy(face.real_uri)
-            _code, text, where = node.requestTopic("/rosrv", message.topic, [["TCPROS"]])  # type: ignore[misc]
+            answer: Any = node.requestTopic("/rosrv", message.topic, [["TCPROS"]])
+            _code, text, where = answer
         except OSError as error:
             self.link.send(UpstreamRefused(message.key, message.topic, str(error)))
             return
