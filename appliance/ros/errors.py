@@ -31,3 +31,16 @@ class ProtocolError(PeerError):
 
 class LimitExceededError(ProtocolError):
     """Well-formed as far as it was read, but larger, deeper or longer than the limits allow."""
+
+
+class DefinitionError(PeerError):
+    """A message or service definition that cannot be used.
+
+    `source` names the file or the type it stands in, `line` counts from 1 (0: no line of its own).
+    """
+
+    def __init__(self, text: str, source: str, line: int = 0) -> None:
+        super().__init__(f"{source}:{line}: {text}" if line else f"{source}: {text}")
+        self.text = text
+        self.source = source
+        self.line = line
