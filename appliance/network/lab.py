@@ -101,7 +101,7 @@ class Lab:
         self.close()
 
     def host(self, name: str, *addresses: str, gateway: str | None = None) -> Host:
-        """Add a host with its addresses (`10.77.0.10/24`, `fd77::10/64`), and a default route by `gateway`."""
+        """Add a host with addresses (`10.77.0.10/24`, `fd77::10/64`) and a default route by `gateway`."""
         if name in self.hosts:
             raise ValueError(f"the lab has a host {name} already")
         if not addresses:

@@ -1,0 +1,157 @@
+"""The firewall of the appliance's namespace: chooses a back end that works, installs the rules, says how
+they stand.
+
+Order of use: `install` before ROSMaster starts, `update` when a port becomes known or a host is enrolled,
+`remove` when the appliance stops. Installing replaces whatever an earlier life left, of either back end.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Literal
+
+from appliance.network.firewall.backend import Backend, FirewallError, RuleCounter
+from appliance.network.firewall.iptables import IptablesBackend
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.firewall.proof import prove
+from appliance.network.firewall.rules import FirewallSettings, Rule, appliance_rules
+from appliance.network.namespaces import Namespace, require_privileges
+
+BackendChoice = Literal["auto", "nft", "iptables"]
+
+
+@dataclass(frozen=True)
+class RuleStatus:
+    """A rule with what it has matched so far; `in_force` is false when the kernel has it no more."""
+
+    chain: str
+    purpose: str
+    rule: str
+    packets: int
+    octets: int
+    in_force: bool
+
+
+@dataclass(frozen=True)
+class FirewallReport:
+    """How the firewall stands."""
+
+    backend: str | None  # None: not installed
+    rules: tuple[RuleStatus, ...]
+    not_used: tuple[str, ...]  # why a back end that was tried was not taken
+
+    @property
+    def intact(self) -> bool:
+        """Every rule is in the kernel."""
+        return self.backend is not None and all(rule.in_force for rule in self.rules)
+
+
+class Firewall:
+    """The rules of one namespace, by a given back end or the first proven to work (nft, then iptables)."""
+
+    def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
+        self._namespace = namespace
+        self._choice = backend
+        self._backend: Backend | None = None
+        self._rules: tuple[Rule, ...] = ()
+        self._not_used: list[str] = []
+
+    def install(self, settings: FirewallSettings) -> str:
+        """Choose a back end, clear what an earlier life left, install the rules; return the back end's name.
+
+        Raises: PrivilegeError; FirewallError when no back end works, with the reason of each.
+        """
+        require_privileges("the firewall")
+        rules = appliance_rules(settings)
+        backend = self._backend or self._choose()
+        backend.install(rules)
+        self._backend, self._rules = backend, rules
+        return backend.name
+
+    def update(self, settings: FirewallSettings) -> None:
+        """Replace the rules by those of new settings; if that fails, the old ones stay in force.
+
+        Raises: FirewallError, also when `install` was not called before.
+        """
+        backend = self._installed()
+        rules = appliance_rules(settings)
+        backend.install(rules)
+        self._rules = rules
+
+    def remove(self) -> None:
+        """Take every rule of the appliance away, of either back end; none there is fine."""
+        for backend in self._all():
+            if self._backend is not None and backend.name == self._backend.name:
+                backend.remove()
+            else:
+                self._clear(backend)
+        self._backend, self._rules = None, ()
+
+    def report(self) -> FirewallReport:
+        """Say which rules are in force, with their counters."""
+        counters = self._backend.counters() if self._backend is not None else ()
+        return FirewallReport(
+            backend=self._backend.name if self._backend is not None else None,
+            rules=statuses(self._rules, counters),
+            not_used=tuple(self._not_used),
+        )
+
+    def _installed(self) -> Backend:
+        if self._backend is None:
+            raise FirewallError("the firewall is not installed yet: call install first")
+        return self._backend
+
+    def _all(self) -> tuple[Backend, ...]:
+        return (NftBackend(self._namespace), IptablesBackend(self._namespace))
+
+    def _choose(self) -> Backend:
+        """Return the first candidate that is proven to work; leave nothing of the others behind."""
+        backends = self._all()
+        for backend in backends:
+            self._clear(backend)  # first, for a rule of either that is left over would spoil the proof
+        self._not_used = []
+        for backend in backends:
+            if self._choice in ("auto", backend.name):
+                try:
+                    prove(backend, self._namespace)
+                except FirewallError as error:
+                    self._not_used.append(f"{backend.name}: {error}")
+                    self._clear(backend)
+                else:
+                    return backend
+        raise FirewallError(
+            f"no firewall can be had in {self._namespace.name}: {'; '.join(self._not_used)}. "
+            "Give the container CAP_NET_ADMIN (iptables: CAP_NET_RAW too), or choose `isolation: none`"
+        )
+
+    def _clear(self, backend: Backend) -> None:
+        """Take away what an earlier life left with a back end. One that cannot be used here left nothing."""
+        try:
+            backend.remove()
+        except FirewallError as error:
+            self._not_used.append(f"{backend.name}: {error}")
+
+
+def statuses(rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...]) -> tuple[RuleStatus, ...]:
+    """Join the rules with what the kernel says of them; the counts of both families are added up.
+
+    A rule is in force when the kernel has it at least once for each family it is for (or once for both).
+    """
+    present: Counter[tuple[str, str]] = Counter()
+    packets: Counter[tuple[str, str]] = Counter()
+    octets: Counter[tuple[str, str]] = Counter()
+    for counter in counters:
+        key = (counter.chain, counter.purpose)
+        present[key] += 2 if counter.family is None else 1
+        packets[key] += counter.packets
+        octets[key] += counter.octets
+    return tuple(
+        RuleStatus(
+            chain=rule.chain.value,
+            purpose=rule.purpose,
+            rule=rule.describe(),
+            packets=packets[(rule.chain.value, rule.purpose)],
+            octets=octets[(rule.chain.value, rule.purpose)],
+            in_force=present[(rule.chain.value, rule.purpose)] >= len(rule.families()),
+        )
+        for rule in rules
+    )

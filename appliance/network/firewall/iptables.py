@@ -1,0 +1,289 @@
+"""The iptables back end: legacy xtables through python-iptables (libiptc), IPv4 and IPv6.
+
+The chains are in the table `filter`; address translation is left to nft (the library cannot build the NAT
+targets of current xtables). What stands in the kernel is changed by one commit for each family. The library
+has a cache of tables for the whole process, which keeps the namespace it was opened in; so each piece of
+work opens its tables anew, in a thread inside the namespace, one at a time (`_ONE_AT_A_TIME`), and under
+the lock that the `iptables` programs use. Rules are appended below `Chain.append_rule`, which would send
+the standard output of the whole process through a pipe for a moment to check them.
+"""
+
+import contextlib
+import fcntl
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
+from appliance.network.firewall.rules import HOOKS, NAT_CHAINS, Chain, Family, Interface, Rule, Verdict
+from appliance.network.namespaces import Namespace
+
+LOCK = Path("/run/xtables.lock")  # the one of the `iptables-legacy` programs
+_ONE_AT_A_TIME = threading.Lock()  # guards state of the library, which is global
+_EXPIRE_MILLISECONDS = 10_000
+_MATCH_HEADER = 32  # bytes of struct xt_entry_match before its content
+
+Extension = tuple[str, tuple[tuple[str, str | tuple[str, ...]], ...]]
+
+
+@dataclass(frozen=True)
+class RenderedRule:
+    """A rule in the words of xtables: what `iptables -A CHAIN …` would be given."""
+
+    chain: str
+    family: Family
+    attributes: tuple[tuple[str, str], ...]  # protocol, in_interface, …
+    matches: tuple[Extension, ...]
+    target: Extension
+
+
+class IptablesBackend:
+    """The rules of one namespace in iptables."""
+
+    name = "iptables"
+
+    def __init__(self, namespace: Namespace) -> None:
+        self._namespace = namespace
+
+    def install(self, rules: tuple[Rule, ...]) -> None:
+        """Replace the appliance's chains, one family after the other."""
+        translating = [rule.purpose for rule in rules if rule.chain in NAT_CHAINS]
+        if translating:
+            raise BackendMissingError(
+                f"address translation is done with nft, not iptables: {'; '.join(translating)}"
+            )
+        rendered = [one for rule in rules for one in render_rule(rule)]
+        self._in_tables(lambda table: table.replace(rendered))
+
+    def remove(self) -> None:
+        """Unhook and delete the appliance's chains."""
+        self._in_tables(lambda table: table.replace([]))
+
+    def counters(self) -> tuple[RuleCounter, ...]:
+        """Read the rules of the appliance's chains back from the kernel."""
+        found: list[RuleCounter] = []
+        self._in_tables(lambda table: found.extend(table.counters()))
+        return tuple(found)
+
+    def _in_tables(self, work: "Callable[[_Table], None]") -> None:
+        """Do `work` with the table of each family, inside the namespace."""
+
+        def inside() -> None:
+            with _ONE_AT_A_TIME, _xtables_lock():
+                for family in _families():
+                    with _opened(family) as table:
+                        work(table)
+
+        self._namespace.run(inside)
+
+
+def render_rule(rule: Rule) -> list[RenderedRule]:
+    """Return the rule for each of its families."""
+    return [
+        RenderedRule(rule.chain.value, family, _attributes(rule), _matches(rule), _target(rule))
+        for family in rule.families()
+    ]
+
+
+def _attributes(rule: Rule) -> tuple[tuple[str, str], ...]:
+    given = {
+        "protocol": "tcp" if rule.tcp_ports is not None or rule.opening else None,
+        "in_interface": _interface(rule.arrives_on),
+        "out_interface": _interface(rule.leaves_on),
+        "src": rule.source,
+        "dst": rule.destination,
+    }
+    return tuple((name, value) for name, value in given.items() if value is not None)
+
+
+def _matches(rule: Rule) -> tuple[Extension, ...]:
+    tcp: list[tuple[str, str | tuple[str, ...]]] = []
+    if rule.tcp_ports is not None:
+        tcp.append(("dport", str(rule.tcp_ports).replace("-", ":")))
+    if rule.opening:
+        tcp.append(("tcp-flags", ("SYN,ACK", "SYN")))
+    matches: list[Extension] = [("tcp", tuple(tcp))] if tcp else []
+    if rule.uid is not None:
+        matches.append(("owner", (("uid-owner", str(rule.uid)),)))
+    if rule.clear_text:
+        direction = "out" if rule.chain is Chain.OUT else "in"
+        matches.append(("policy", (("dir", direction), ("pol", "none"))))
+    if rule.local_destination:
+        matches.append(("addrtype", (("dst-type", "LOCAL"),)))
+    if rule.new_connection:
+        matches.append(("conntrack", (("ctstate", "NEW"),)))
+    if rule.translated:
+        matches.append(("conntrack", (("ctstate", "DNAT"),)))
+    if rule.above is not None:
+        matches.append(("hashlimit", _hashlimit(rule.above.per_second, rule.above.burst)))
+    return (*matches, ("comment", (("comment", rule.purpose),)))
+
+
+def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
+    """Give each source address one bucket; rules with the same limit share it, whatever their ports."""
+    return (
+        ("hashlimit-above", f"{per_second}/sec"),
+        ("hashlimit-burst", str(burst)),
+        ("hashlimit-mode", "srcip"),
+        ("hashlimit-name", f"rosrv-{per_second}-{burst}"),
+        ("hashlimit-htable-expire", str(_EXPIRE_MILLISECONDS)),
+    )
+
+
+def _target(rule: Rule) -> Extension:
+    if rule.verdict is Verdict.RESET:
+        return ("REJECT", (("reject-with", "tcp-reset"),))
+    return (rule.verdict.value, ())
+
+
+def _interface(interface: Interface | None) -> str | None:
+    if interface is None:
+        return None
+    return f"!{interface.name}" if interface.other else interface.name
+
+
+_TABLE = "filter"
+_CHAINS = tuple(chain for chain in Chain if chain not in NAT_CHAINS)
+
+
+class _Table:
+    """The table of one family, open in the namespace of the thread."""
+
+    def __init__(self, library: Any, table: Any, family: Family) -> None:
+        self._library = library
+        self._table = table
+        self._family = family
+
+    def replace(self, all_rules: list[RenderedRule]) -> None:
+        """Put the rules of this family in the place of all that the appliance has here, in one commit."""
+        rules = [rule for rule in all_rules if rule.family == self._family]
+        present = {chain for chain in _CHAINS if self._table.is_chain(chain.value)}
+        wanted = {chain for chain in _CHAINS if any(rule.chain == chain for rule in rules)}
+        for chain in present:
+            self._unhook(chain)
+            self._table.flush_entries(chain.value)
+        for chain in present - wanted:
+            self._table.delete_chain(chain.value)
+        for chain in wanted - present:
+            self._table.create_chain(chain.value)
+        for rule in rules:
+            self._table.append_entry(rule.chain, self._build(rule).rule)
+        for chain in wanted:
+            for hook in HOOKS[chain]:
+                self._table.insert_entry(hook, self._jump(chain).rule, 0)
+        if present or wanted:
+            self._table.commit()
+
+    def counters(self) -> list[RuleCounter]:
+        """Return the rules of the chains that are hooked in everywhere they should be."""
+        return [
+            self._counter(chain, rule)
+            for chain in _CHAINS
+            if self._table.is_chain(chain.value) and all(self._hooks(chain, hook) for hook in HOOKS[chain])
+            for rule in self._library.Chain(self._table, chain.value).rules
+        ]
+
+    def _counter(self, chain: Chain, rule: Any) -> RuleCounter:
+        packets, octets = rule.get_counters()
+        return RuleCounter(chain.value, self._family, _comment(rule), packets, octets)
+
+    def _unhook(self, chain: Chain) -> None:
+        for hook in HOOKS[chain]:
+            for _ in range(self._hooks(chain, hook)):
+                jump = self._jump(chain)
+                self._table.delete_entry(hook, jump.rule, jump.mask)
+
+    def _hooks(self, chain: Chain, hook: str) -> int:
+        """Count the jumps to a chain; of foreign rules nothing but the target is looked at."""
+        count, entry = 0, self._table.first_rule(hook)
+        while entry:
+            count += self._table.get_target(entry) == chain.value.encode()
+            entry = self._table.next_rule(entry)
+        return count
+
+    def _jump(self, chain: Chain) -> Any:
+        return self._build(RenderedRule("", self._family, (), (), (chain.value, ())))
+
+    def _build(self, rendered: RenderedRule) -> Any:
+        rule = self._library.Rule6() if rendered.family == 6 else self._library.Rule()
+        for attribute, text in rendered.attributes:
+            setattr(rule, attribute, text)
+        for make, (name, parameters) in (
+            *((rule.create_match, match) for match in rendered.matches),
+            (rule.create_target, rendered.target),
+        ):
+            try:
+                extension = make(name)
+                for parameter, value in parameters:
+                    extension.set_parameter(parameter, list(value) if isinstance(value, tuple) else value)
+            except self._library.XTablesError as error:
+                raise BackendMissingError(f"iptables lacks the extension {name!r}: {error}") from error
+        return rule
+
+
+def _comment(rule: Any) -> str:
+    """Read a rule's comment out of its match: asking the library would borrow our standard output."""
+    for match in rule.matches:
+        if match.name == "comment":
+            content = bytes(match.match_buf)[_MATCH_HEADER:]
+            return content.partition(b"\0")[0].decode(errors="replace")
+    return ""
+
+
+@contextlib.contextmanager
+def _opened(family: Family) -> Iterator[_Table]:
+    """Open the table in the namespace of the calling thread, and close it for the next one."""
+    library = _library()
+    program = "ip6tables" if family == 6 else "iptables"
+    table = None
+    try:
+        table = (library.Table6 if family == 6 else library.Table)(_TABLE, autocommit=False)
+        table.refresh()
+        yield _Table(library, table, family)
+    except library.IPTCError as error:
+        message = str(error)
+        if table is None or "initialize" in message:
+            raise BackendMissingError(
+                f"the kernel has no {program} table {_TABLE} ({message}): modprobe {program[:-1]}_{_TABLE}, "
+                "CAP_NET_ADMIN and CAP_NET_RAW are needed; or choose the back end nft"
+            ) from error
+        raise FirewallError(f"{program} refused the rules in table {_TABLE}: {message}") from error
+    finally:
+        if table is not None:
+            table.close()
+            type(table)._cache.pop(_TABLE, None)  # the cached table is of this namespace
+
+
+def _library() -> Any:
+    try:
+        with warnings.catch_warnings(action="ignore"):  # its sources are of an older Python
+            import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
+    except Exception as error:  # the library raises bare exceptions when a C library is not there
+        raise BackendMissingError(
+            f"the firewall back end iptables needs libiptc and xtables: sudo apt install iptables ({error})"
+        ) from error
+    return iptc
+
+
+def _families() -> tuple[Family, ...]:
+    """IPv6 is left out where the kernel was started without it."""
+    return (4, 6) if Path("/proc/sys/net/ipv6").exists() else (4,)
+
+
+@contextlib.contextmanager
+def _xtables_lock() -> Iterator[None]:
+    try:
+        lock = os.open(LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise BackendMissingError(
+            f"{LOCK}: {error.strerror}: the lock of iptables (a tmpfs on /run?)"
+        ) from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)

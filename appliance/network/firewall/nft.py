@@ -1,0 +1,238 @@
+"""The nftables back end: libnftables' JSON through `nft -j -f -`, one transaction for everything.
+
+The appliance has a table of its own, `inet rosrv`, for IPv4 and IPv6. In it a base chain for each hook
+jumps to the chain with the rules, so that the chains have the same names and shape as with iptables. A
+verdict of another table can only add refusals to ours, never undo them.
+"""
+
+import json
+import subprocess
+from typing import Any
+
+from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
+from appliance.network.firewall.rules import HOOKS, NAT_CHAINS, Chain, Interface, PortRange, Rule, Verdict
+from appliance.network.namespaces import Namespace
+
+TABLE = "rosrv"
+_FAMILY = "inet"
+_SECONDS = 20.0
+_FILTER_PRIORITY, _DNAT_PRIORITY, _SNAT_PRIORITY = 0, -100, 100
+_METER_SIZE = 65535  # hosts
+_METER_SECONDS = 60
+
+Json = dict[str, Any]
+
+
+class NftBackend:
+    """The rules of one namespace in nftables."""
+
+    name = "nft"
+
+    def __init__(self, namespace: Namespace) -> None:
+        self._namespace = namespace
+
+    def install(self, rules: tuple[Rule, ...]) -> None:
+        """Replace the table in one transaction."""
+        self._nft(["-f", "-"], json.dumps({"nftables": [*_delete_table(), _table("add"), *render(rules)]}))
+
+    def remove(self) -> None:
+        """Delete the table."""
+        self._nft(["-f", "-"], json.dumps({"nftables": _delete_table()}))
+
+    def counters(self) -> tuple[RuleCounter, ...]:
+        """Read the rules of the table back from the kernel."""
+        tables = json.loads(self._nft(["list", "tables"], ""))["nftables"]
+        if not any(_is_ours(entry.get("table", {})) for entry in tables):
+            return ()
+        listed = json.loads(self._nft(["list", "table", _FAMILY, TABLE], ""))["nftables"]
+        rules = [entry["rule"] for entry in listed if "rule" in entry]
+        hooked = {jump for rule in rules for jump in _jumps(rule)}
+        return tuple(_counter(rule) for rule in rules if rule["chain"] in hooked)
+
+    def _nft(self, arguments: list[str], text: str) -> str:
+        try:
+            process = self._namespace.popen(
+                ["nft", "-j", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        except FileNotFoundError:
+            raise BackendMissingError(
+                "the firewall back end nft needs the program `nft`: sudo apt install nftables"
+            ) from None
+        with process:
+            try:
+                out, err = process.communicate(text, timeout=_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise FirewallError(f"nft did not answer within {_SECONDS:.0f} seconds") from None
+        if process.returncode != 0:
+            reason = _first_lines(err or out)
+            raise FirewallError(f"nft refused the rules in {self._namespace.name}: {reason}")
+        return str(out)
+
+
+def render(rules: tuple[Rule, ...]) -> list[Json]:
+    """Return the commands of libnftables' JSON schema that make the table with these rules."""
+    chains = [chain for chain in Chain if any(rule.chain is chain for rule in rules)]
+    limits = sorted({_meter(rule, family) for rule in rules if rule.above for family in rule.families()})
+    return [
+        *(_add("set", _meter_set(name)) for name in limits),
+        *(_add("chain", {"name": chain.value}) for chain in chains),
+        *(command for chain in chains for hook in HOOKS[chain] for command in _hook(chain, hook)),
+        *(_add("rule", body) for rule in rules for body in render_rule(rule)),
+    ]
+
+
+def render_rule(rule: Rule) -> list[Json]:
+    """Return the rule as libnftables wants it: once, or once per family where the rule differs by it."""
+    both = len(rule.families()) == 2 and rule.above is None
+    if both:
+        return [_body(rule, [], None)]
+    return [_body(rule, [_match(_meta("nfproto"), f"ipv{family}")], family) for family in rule.families()]
+
+
+def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
+    protocol = "ip6" if family == 6 else "ip"
+    expressions = list(head)
+    for key, interface in (("iifname", rule.arrives_on), ("oifname", rule.leaves_on)):
+        if interface is not None:
+            expressions.append(_interface(key, interface))
+    for field, network in (("saddr", rule.source), ("daddr", rule.destination)):
+        if network is not None:
+            expressions.append(_match(_payload(protocol, field), _network(network)))
+    if rule.tcp_ports is not None:
+        expressions.append(_match(_payload("tcp", "dport"), _ports(rule.tcp_ports)))
+    if rule.opening:
+        flags = {"&": [_payload("tcp", "flags"), {"|": ["syn", "ack"]}]}
+        expressions.append(_match(flags, "syn"))
+    if rule.uid is not None:
+        expressions.append(_match(_meta("skuid"), rule.uid))
+    if rule.clear_text:
+        through: Json = {"rt": {"key": "ipsec"}} if rule.chain is Chain.OUT else _meta("ipsec")
+        expressions.append(_match(through, False))
+    if rule.local_destination:
+        expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
+    if rule.new_connection:
+        expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))
+    if rule.translated:
+        expressions.append(_match({"ct": {"key": "status"}}, "dnat", "in"))
+    if rule.above is not None:
+        expressions.append(_over_limit(rule, protocol))
+    expressions += [{"counter": None}, _verdict(rule, protocol)]
+    return {"chain": rule.chain.value, "expr": expressions, "comment": rule.purpose}
+
+
+def _verdict(rule: Rule, protocol: str) -> Json:
+    if rule.verdict is Verdict.RESET:
+        return {"reject": {"type": "tcp reset"}}
+    if rule.verdict is Verdict.DNAT:
+        return {"dnat": {"family": protocol, "addr": rule.to}}
+    return {rule.verdict.value.lower(): None}
+
+
+def _over_limit(rule: Rule, protocol: str) -> Json:
+    assert rule.above is not None  # noqa: S101 - the caller asked
+    limit = {"rate": rule.above.per_second, "burst": rule.above.burst, "per": "second", "inv": True}
+    name = _meter(rule, 6 if protocol == "ip6" else 4)
+    element = _payload(protocol, "saddr")
+    return {"set": {"op": "add", "elem": element, "set": f"@{name}", "stmt": [{"limit": limit}]}}
+
+
+def _meter(rule: Rule, family: int) -> str:
+    """Name the set that holds the buckets: a host has one bucket for all its ports."""
+    assert rule.above is not None  # noqa: S101 - the caller asked
+    return f"new-ipv{family}-{rule.above.per_second}-{rule.above.burst}"
+
+
+def _meter_set(name: str) -> Json:
+    kind = "ipv6_addr" if name.startswith("new-ipv6") else "ipv4_addr"
+    return {
+        "name": name,
+        "type": kind,
+        "flags": ["timeout"],
+        "timeout": _METER_SECONDS,
+        "size": _METER_SIZE,
+    }
+
+
+def _hook(chain: Chain, hook: str) -> list[Json]:
+    """A base chain at a hook of the kernel, and its jump to the chain with the rules."""
+    kind, priority = "filter", _FILTER_PRIORITY
+    if chain in NAT_CHAINS:
+        kind, priority = "nat", _SNAT_PRIORITY if hook == "POSTROUTING" else _DNAT_PRIORITY
+    base = f"{kind}-{hook}"
+    return [
+        _add(
+            "chain", {"name": base, "type": kind, "hook": hook.lower(), "prio": priority, "policy": "accept"}
+        ),
+        _add("rule", {"chain": base, "expr": [{"jump": {"target": chain.value}}]}),
+    ]
+
+
+def _delete_table() -> list[Json]:
+    """Delete the table whether it is there or not: adding what exists is no error."""
+    return [_table("add"), _table("delete")]
+
+
+def _table(verb: str) -> Json:
+    return {verb: {"table": {"family": _FAMILY, "name": TABLE}}}
+
+
+def _add(kind: str, body: Json) -> Json:
+    return {"add": {kind: {"family": _FAMILY, "table": TABLE, **body}}}
+
+
+def _match(left: Json, right: object, operator: str = "==") -> Json:
+    return {"match": {"op": operator, "left": left, "right": right}}
+
+
+def _meta(key: str) -> Json:
+    return {"meta": {"key": key}}
+
+
+def _payload(protocol: str, field: str) -> Json:
+    return {"payload": {"protocol": protocol, "field": field}}
+
+
+def _interface(key: str, interface: Interface) -> Json:
+    return _match(_meta(key), interface.name, "!=" if interface.other else "==")
+
+
+def _network(network: str) -> object:
+    address, slash, length = network.partition("/")
+    return {"prefix": {"addr": address, "len": int(length)}} if slash else address
+
+
+def _ports(ports: PortRange) -> object:
+    return ports.first if ports.first == ports.last else {"range": [ports.first, ports.last]}
+
+
+def _is_ours(table: Json) -> bool:
+    return table.get("family") == _FAMILY and table.get("name") == TABLE
+
+
+def _jumps(rule: Json) -> list[str]:
+    return [part["jump"]["target"] for part in rule["expr"] if "jump" in part]
+
+
+def _counter(rule: Json) -> RuleCounter:
+    count: Json = next((part["counter"] for part in rule["expr"] if "counter" in part), {})
+    families = [
+        part["match"]["right"]
+        for part in rule["expr"]
+        if "match" in part and part["match"]["left"] == _meta("nfproto")
+    ]
+    return RuleCounter(
+        chain=rule["chain"],
+        family=None if not families else 6 if families[0] == "ipv6" else 4,
+        purpose=rule.get("comment", ""),
+        packets=count.get("packets", 0),
+        octets=count.get("bytes", 0),
+    )
+
+
+def _first_lines(text: str) -> str:
+    return " ".join(text.split())[:600] or "no reason given"

@@ -1,0 +1,412 @@
+"""Tests of the firewall against the kernel, with both back ends."""
+
+import contextlib
+import itertools
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.network.firewall.backend import BackendMissingError, FirewallError
+from appliance.network.firewall.firewall import BackendChoice, Firewall
+from appliance.network.firewall.iptables import IptablesBackend
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.firewall.proof import prove
+from appliance.network.firewall.rules import Chain, FirewallSettings, PortRange, RateLimit, Rule, Verdict
+from appliance.network.lab import INTERFACE, Host, Lab
+from appliance.network.probe import Outcome, probe_port
+from tests.support.requirements import need_program, need_root
+
+CONTROL, ROSMASTER, OTHER = 61011, 61012, 61055
+LOOPBACKS = ("127.0.0.1", "::1")
+BACKENDS: tuple[BackendChoice, ...] = ("nft", "iptables")
+
+CLIENT = """
+import socket, sys
+for target in sys.argv[1:]:
+    address, port = target.rsplit("/", 1)
+    try:
+        socket.create_connection((address, int(port)), timeout=3).close()
+        print("reached")
+    except TimeoutError:
+        print("timed out")
+    except ConnectionRefusedError:
+        print("refused")
+    except OSError as error:
+        print("error", error)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _machine() -> None:
+    need_root()
+    need_program("nft", "nftables")
+    need_program("iptables-legacy", "iptables")
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """A lab of the firewall's tests."""
+    with Lab("rosrv-fw") as one:
+        yield one
+
+
+@pytest.fixture
+def protected(lab: Lab) -> Host:
+    """The host that the firewall protects."""
+    return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
+
+
+@pytest.fixture
+def attacker(lab: Lab) -> Host:
+    """Another host of the network."""
+    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
+
+
+def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
+    """Try to connect from a host as a local user; return what each attempt came to."""
+    process = host.popen(
+        [sys.executable, "-I", "-S", "-c", CLIENT, *(f"{address}/{port}" for address, port in targets)],
+        user=uid,
+        group=uid,
+        extra_groups=[],
+        cwd="/",
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    out, _ = process.communicate(timeout=60)
+    return str(out).splitlines()
+
+
+@contextlib.contextmanager
+def listening(host: Host, address: str = "::", port: int = 0) -> Iterator[int]:
+    """Listen on a host, on all its addresses of both families by default; yield the port."""
+    with host.entered():
+        family = socket.AF_INET6 if ":" in address else socket.AF_INET
+        server = socket.create_server(
+            (address, port), family=family, dualstack_ipv6=address == "::", backlog=1000
+        )
+    with server:
+        yield server.getsockname()[1]
+
+
+def settings(port: int, **others: Any) -> FirewallSettings:
+    """Return settings that protect `port` as the ROSMaster port."""
+    return FirewallSettings(
+        control_uid=CONTROL,
+        rosmaster_uid=ROSMASTER,
+        rosmaster_port=port,
+        **others,
+    )
+
+
+def ruleset(host: Host) -> str:
+    """Return every rule of a host, of both kinds and both families, without counters."""
+    commands = ("nft -s list ruleset", "iptables-legacy-save -t filter", "ip6tables-legacy-save -t filter")
+    outputs = []
+    for command in commands:
+        process = host.popen(command.split(), stdout=subprocess.PIPE, text=True)
+        out, _ = process.communicate(timeout=30)
+        outputs.append("\n".join(line for line in out.splitlines() if not line.startswith(("#", ":"))))
+    return "\n".join(outputs)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_only_control_opens_connections_to_rosmaster(
+    protected: Host, attacker: Host, backend: BackendChoice
+) -> None:
+    """The ROSMaster port is refused to other users, root included, and to other hosts, on both families."""
+    firewall = Firewall(protected.namespace, backend)
+    own = (protected.address, protected.address6)
+    with listening(protected) as port:
+        everywhere = [(address, port) for address in (*LOOPBACKS, *own)]
+        assert connect(protected, OTHER, *everywhere) == ["reached"] * 4, "without rules"
+        assert firewall.install(settings(port)) == backend
+        assert connect(protected, CONTROL, *everywhere) == ["reached"] * 4
+        for uid in (0, OTHER, ROSMASTER):
+            assert connect(protected, uid, *everywhere) == ["refused"] * 4, f"uid {uid}"
+        assert connect(attacker, CONTROL, *((address, port) for address in own)) == ["refused"] * 2
+        firewall.remove()
+        assert connect(protected, OTHER, *everywhere) == ["reached"] * 4, "after removal"
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_inner_face_is_for_rosmaster_only(
+    protected: Host, attacker: Host, backend: BackendChoice
+) -> None:
+    """The inner node face, known only later, is added by an update; then rosmaster alone may connect."""
+    firewall = Firewall(protected.namespace, backend)
+    with listening(protected) as port, listening(protected) as inner:
+        firewall.install(settings(port))
+        firewall.update(settings(port, inner_port=inner))
+        local = [(address, inner) for address in LOOPBACKS]
+        assert connect(protected, ROSMASTER, *local) == ["reached"] * 2
+        assert connect(protected, CONTROL, *local) == ["refused"] * 2
+        assert connect(protected, 0, *local) == ["refused"] * 2
+        assert connect(attacker, 0, (protected.address, inner)) == ["refused"]
+        assert connect(protected, CONTROL, ("127.0.0.1", port)) == ["reached"]
+        assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_open_connections_and_other_ports_live_on(protected: Host, backend: BackendChoice) -> None:
+    """A connection from before the rules still carries data, and ports that nobody named stay reachable."""
+    firewall = Firewall(protected.namespace, backend)
+    with protected.entered():
+        server = socket.create_server(("127.0.0.1", 0))
+        port = server.getsockname()[1]
+        client = socket.create_connection(("127.0.0.1", port), timeout=10)
+    with server, client, listening(protected) as other:
+        peer, _ = server.accept()
+        with peer:
+            firewall.install(settings(port))
+            client.sendall(b"ping")
+            assert peer.recv(4) == b"ping"
+            assert connect(protected, OTHER, ("127.0.0.1", other)) == ["reached"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_port_opened_by_notrack_rules_stays_closed(protected: Host, backend: BackendChoice) -> None:
+    """A foreign rule that keeps loopback from the connection tracker does not open the ROSMaster port."""
+    run_in(protected, "iptables-legacy -t raw -A OUTPUT -o lo -j NOTRACK")
+    run_in(protected, "iptables-legacy -t raw -A PREROUTING -i lo -j NOTRACK")
+    firewall = Firewall(protected.namespace, backend)
+    with listening(protected) as port:
+        firewall.install(settings(port))
+        assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
+        assert connect(protected, CONTROL, ("127.0.0.1", port)) == ["reached"]
+
+
+def run_in(host: Host, command: str) -> None:
+    """Run a command on a host."""
+    process = host.popen(command.split())
+    assert process.wait(timeout=30) == 0, command
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_foreign_rules_are_not_touched(protected: Host, backend: BackendChoice) -> None:
+    """Installing twice leaves one set; removing leaves exactly the rules that were there before."""
+    run_in(protected, "iptables-legacy -A INPUT -p tcp --dport 9 -m comment --comment foreign -j DROP")
+    run_in(protected, "ip6tables-legacy -A OUTPUT -p udp --dport 9 -m length --length 1:50 -j DROP")
+    run_in(protected, "nft add table inet foreign")
+    run_in(protected, "nft add chain inet foreign ROSRV-IN { type filter hook input priority 5 ; }")
+    before = ruleset(protected)
+    firewall = Firewall(protected.namespace, backend)
+    firewall.install(settings(11312, api_port=8443))
+    once = ruleset(protected)
+    firewall.install(settings(11312, api_port=8443))
+    assert ruleset(protected) == once
+    Firewall(protected.namespace, backend).install(settings(11312, api_port=8443))
+    assert ruleset(protected) == once, "another life of the appliance"
+    assert all(line in once for line in before.splitlines())
+    firewall.remove()
+    assert ruleset(protected) == before
+    firewall.remove()
+
+
+@pytest.mark.parametrize(("earlier", "later"), list(itertools.permutations(BACKENDS)))
+def test_leftovers_of_the_other_back_end_are_replaced(
+    protected: Host, earlier: BackendChoice, later: BackendChoice
+) -> None:
+    """After a crash with one back end, a start with the other leaves no rule of the first."""
+    before = ruleset(protected)
+    Firewall(protected.namespace, earlier).install(settings(11312))
+    firewall = Firewall(protected.namespace, later)
+    firewall.install(settings(11313))
+    assert "11312" not in ruleset(protected)
+    firewall.remove()
+    assert ruleset(protected) == before
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_rest_port_is_for_the_networks_named(lab: Lab, protected: Host, backend: BackendChoice) -> None:
+    """Loopback and the management networks reach the REST port; every other host is refused."""
+    manager = lab.host("manager", "10.77.0.5/24", "fd77::5/64")
+    stranger = lab.host("stranger", "10.77.0.6/24", "fd77::6/64")
+    firewall = Firewall(protected.namespace, backend)
+    with listening(protected) as api:
+        firewall.install(settings(11312, api_port=api, api_networks=("10.77.0.5", "fd77::5/128")))
+        targets = [(address, api) for address in (protected.address, protected.address6)]
+        assert connect(manager, OTHER, *targets) == ["reached"] * 2
+        assert connect(stranger, OTHER, *targets) == ["refused"] * 2
+        assert connect(protected, OTHER, ("127.0.0.1", api)) == ["reached"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_tunnelled_host_in_clear_text_gets_nowhere(
+    lab: Lab, protected: Host, backend: BackendChoice
+) -> None:
+    """Packets from and to the virtual address of a host that must use its tunnel are dropped outside it."""
+    spoofer = lab.host("spoofer", "10.77.0.9/24", "fd77::9/64")
+    honest = lab.host("honest", "10.77.0.10/24")
+    firewall = Firewall(protected.namespace, backend)
+    with listening(protected) as port, listening(spoofer) as back:
+        targets = [(address, port) for address in (protected.address, protected.address6)]
+        firewall.install(settings(11312, tunnel_only=("10.77.0.9", "fd77::9")))
+        assert connect(spoofer, 0, *targets) == ["timed out"] * 2
+        assert connect(protected, 0, (spoofer.address, back))[0] != "reached"
+        assert connect(honest, 0, (protected.address, port)) == ["reached"]
+        firewall.update(settings(11312, tunnel_only=("10.77.0.9",), tunnel_interface=INTERFACE))
+        assert connect(spoofer, 0, *targets) == ["reached"] * 2, "arrived on the tunnel's interface"
+        firewall.update(settings(11312, tunnel_only=("10.77.0.9",), tunnel_interface="ipsec0"))
+        assert connect(spoofer, 0, *targets) == ["timed out", "reached"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_flood_of_one_host_is_slowed_and_others_are_not(
+    lab: Lab, protected: Host, attacker: Host, backend: BackendChoice
+) -> None:
+    """Above the limit new connections of a host are dropped on all ports together; another host connects."""
+    honest = lab.host("honest", "10.77.0.10/24", "fd77::10/64")
+    firewall = Firewall(protected.namespace, backend)
+    limit = RateLimit(per_second=1, burst=5)
+    with listening(protected) as master, listening(protected) as node:
+        firewall.install(
+            settings(11312, master_port=master, node_ports=PortRange(node, node), new_connections=limit)
+        )
+        for address, honest_to in ((protected.address, "IPv4"), (protected.address6, "IPv6")):
+            opened = flood(attacker, [(address, master), (address, node)] * 15)
+            assert 5 <= opened <= 12, f"{opened} of 30 came through over {honest_to}"
+            assert connect(honest, 0, (address, master), (address, node)) == ["reached"] * 2
+        dropped = [rule for rule in firewall.report().rules if "per host" in rule.purpose]
+        assert sum(rule.packets for rule in dropped) >= 30
+
+
+def flood(host: Host, targets: list[tuple[str, int]]) -> int:
+    """Open all connections at once; return how many were there at the first try (a SYN again takes 1 s)."""
+    with contextlib.ExitStack() as stack, host.entered():
+        clients = []
+        for address, port in targets:
+            family = socket.AF_INET6 if ":" in address else socket.AF_INET
+            client = stack.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            client.settimeout(0.02)
+            with contextlib.suppress(TimeoutError):
+                client.connect((address, port))
+                clients.append(client)
+        return len(clients)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_report_counts_and_misses_what_was_taken_away(protected: Host, backend: BackendChoice) -> None:
+    """The report names the rules with their packets, and is no longer intact once someone flushes them."""
+    firewall = Firewall(protected.namespace, backend)
+    assert firewall.report().backend is None
+    with listening(protected) as port:
+        firewall.install(settings(port))
+        connect(protected, OTHER, *((address, port) for address in LOOPBACKS))
+        report = firewall.report()
+        refused = next(rule for rule in report.rules if rule.purpose == "ROSMaster port: no other user")
+        assert (report.backend, report.intact, refused.packets) == (backend, True, 2)
+        if backend == "nft":
+            run_in(protected, "nft flush chain inet rosrv filter-OUTPUT")
+        else:
+            run_in(protected, "ip6tables-legacy -D OUTPUT 1")
+        report = firewall.report()
+        assert not report.intact
+        assert "ROSMaster port: no other user" in {rule.purpose for rule in report.rules if not rule.in_force}
+        firewall.update(settings(port))
+        assert firewall.report().intact
+
+
+def test_auto_takes_what_the_kernel_enforces(
+    protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A back end that accepts every rule and enforces none is not taken, and the report says why."""
+    assert Firewall(protected.namespace).install(settings(11312)) == "nft"
+    pretender = tmp_path / "nft"
+    pretender.write_text("#!/bin/sh\ncat >/dev/null\necho '{\"nftables\": []}'\n")
+    pretender.chmod(0o755)
+    Firewall(protected.namespace).remove()
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    firewall = Firewall(protected.namespace)
+    with listening(protected) as port:
+        assert firewall.install(settings(port)) == "iptables"
+        assert "nft: a port of our own on 127.0.0.1 was reached" in firewall.report().not_used[0]
+        assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
+    with pytest.raises(FirewallError, match=r"no firewall can be had .* nft: a port of our own"):
+        Firewall(protected.namespace, "nft").install(settings(11312))
+
+
+def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With no nft program and no libiptc, installing fails and says what to install."""
+    monkeypatch.setenv("PATH", "/nonexistent")
+    monkeypatch.setitem(sys.modules, "iptc", None)
+    with pytest.raises(FirewallError, match=r"apt install nftables.*apt install iptables"):
+        Firewall(protected.namespace).install(settings(11312))
+
+
+@pytest.mark.parametrize("kind", [NftBackend, IptablesBackend])
+def test_the_proof_leaves_nothing(protected: Host, kind: type[NftBackend] | type[IptablesBackend]) -> None:
+    """Proving a back end leaves the rules of the namespace as they were."""
+    before = ruleset(protected)
+    prove(kind(protected.namespace), protected.namespace)
+    assert ruleset(protected) == before
+
+
+def test_a_refused_transaction_keeps_the_old_rules(protected: Host) -> None:
+    """When nft refuses new rules, the ones before stay in force."""
+    backend = NftBackend(protected.namespace)
+    firewall = Firewall(protected.namespace, "nft")
+    firewall.install(settings(11312))
+    before = ruleset(protected)
+    with pytest.raises(FirewallError, match="nft refused the rules"):
+        backend.install((broken_rule(),))
+    assert ruleset(protected) == before
+
+
+def broken_rule() -> Rule:
+    """Return a rule whose comment is longer than nft takes."""
+    return Rule(chain=Chain.IN, purpose="x" * 500, verdict=Verdict.DROP)
+
+
+def test_the_probe_sees_a_closed_and_an_open_port(protected: Host) -> None:
+    """Another local user is refused while the rules stand and gets through without; the probe says so."""
+    firewall = Firewall(protected.namespace)
+    with listening(protected) as port:
+        firewall.install(settings(port))
+        result = probe_port(protected.namespace, port)
+        assert result.closed
+        assert result.proves
+        assert [one.outcome for one in result.attempts] == [Outcome.REFUSED] * 2
+        assert result.listening_outside == ("::",)
+        firewall.remove()
+        result = probe_port(protected.namespace, port)
+        assert not result.closed
+        assert [one.outcome for one in result.attempts] == [Outcome.REACHED] * 2
+    assert not probe_port(protected.namespace, port).proves
+    with listening(protected, "127.0.0.1") as port:
+        assert probe_port(protected.namespace, port).listening == ("127.0.0.1",)
+        assert probe_port(protected.namespace, port).listening_outside == ()
+
+
+def test_the_probe_refuses_to_be_root(protected: Host) -> None:
+    """A probe as root would prove nothing and is an error."""
+    with pytest.raises(ValueError, match="unprivileged"):
+        probe_port(protected.namespace, 11312, uid=0)
+
+
+def test_iptables_says_that_it_does_not_translate_addresses(protected: Host) -> None:
+    """A rule for address translation given to the iptables back end is an error, not a rule left out."""
+    rule = Rule(chain=Chain.NAT, purpose="forward", verdict=Verdict.DNAT, to="10.1.1.1")
+    with pytest.raises(BackendMissingError, match="forward"):
+        IptablesBackend(protected.namespace).install((rule,))
+
+
+def test_namespaces_do_not_share_rules(lab: Lab, protected: Host) -> None:
+    """Rules are in the namespace they were made for and in no other."""
+    other = lab.host("other", "10.77.0.20/24")
+    Firewall(protected.namespace, "iptables").install(settings(11312))
+    Firewall(other.namespace, "iptables").install(settings(11313))
+    assert "11313" not in ruleset(protected)
+    assert "11312" not in ruleset(other)
+    assert (
+        "ROSRV"
+        not in subprocess.run(
+            ["iptables-legacy-save", "-t", "filter"], capture_output=True, text=True, check=True
+        ).stdout
+    )
