@@ -100,13 +100,16 @@ class Liveness(_Section):
 
 
 class Relay(_Section):
-    """What the relay accepts and holds."""
+    """What the relay accepts and holds; each key is a field of `appliance.relay.limits.Limits`."""
 
+    connections: Count = Field(default=4096, description="of all hosts")
+    connections_per_host: Count = 512
     header_bytes: Size = Field(default=ByteSize(64 << 10), description="TCPROS connection header")
     header_seconds: Seconds = Field(default=10, description="until the connection header must be there")
-    message_bytes: Size = Field(default=ByteSize(256 << 20), description="one message")
+    message_bytes: Size = Field(default=ByteSize(256 << 20), ge=1 << 20, description="one message")
     queue_messages: Count = Field(default=1000, description="messages waiting for one subscriber")
     queue_bytes: Size = Field(default=ByteSize(64 << 20), description="bytes waiting for one subscriber")
+    memory_bytes: Size = Field(default=ByteSize(1 << 30), description="all that waits in the process")
 
 
 class Firewall(_Section):
@@ -124,7 +127,7 @@ class Settings(_Section):
         default=Path("policies/default.ini"), description="the access policy; read again on reload"
     )
     state: Path = Field(
-        Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
+        default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
     )
     listen: Annotated[str, AfterValidator(_checked_address)] = Field(
         default="0.0.0.0:11311",

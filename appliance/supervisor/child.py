@@ -19,7 +19,7 @@ import setproctitle
 import appliance
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Failed, Lifeline
-from appliance.supervisor import privileges
+from appliance.supervisor import offline, privileges
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.users import Account
 
@@ -65,9 +65,11 @@ def _prepare(plan: Plan) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
-    if not plan.network and os.geteuid() == 0:
-        privileges.leave_network()
+    if not plan.network:
+        offline.leave_network_if_allowed()
     privileges.drop(plan.account, parent=plan.parent)
+    if not plan.network:
+        offline.forbid_sockets()
     _require(plan.account, plan.home, os.R_OK | os.W_OK | os.X_OK)
     if plan.path is not None:
         _require(plan.account, plan.path, os.R_OK)

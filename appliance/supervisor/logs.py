@@ -1,5 +1,9 @@
-"""Logs of the supervisor and its children: on standard error, for people on a terminal, else as JSON."""
+"""Logs of the supervisor and its children: on standard error, for people on a terminal, else as JSON.
 
+What is logged with the standard library's `logging` looks the same.
+"""
+
+import logging
 import sys
 
 import structlog
@@ -18,6 +22,14 @@ def configure_logs(process: str) -> None:
         if human
         else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
     )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=shared,
+            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderer],
+        )
+    )
+    logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
     structlog.configure(
         processors=[*shared, *renderer],
         logger_factory=structlog.WriteLoggerFactory(sys.stderr),

@@ -4,12 +4,10 @@ Invariants, in the order in which they are made true by `drop`:
 
 1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), also when that was killed before the request
    was made.
-2. A role without network is alone in an empty network namespace, or, where the kernel does not let us
-   make one, the appliance does not start: `drop` raises.
-3. No supplementary groups, no capability in any of the five sets, no way to gain one (`no_new_privs`).
-4. Files it makes are its own (`umask 077`).
+2. No supplementary groups, no capability in any of the five sets, no way to gain one (`no_new_privs`).
+3. Files it makes are its own (`umask 077`).
 
-As a caller who is not root only 1 and 4 and `no_new_privs` apply; there is nothing else to give up.
+As a caller who is not root only 1 and 3 and `no_new_privs` apply; there is nothing else to give up.
 """
 
 import ctypes
@@ -35,7 +33,7 @@ def die_with_parent(parent: int) -> None:
     To be called after the change of user, which clears the request. Exits at once when the parent is
     gone already.
     """
-    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
@@ -70,7 +68,7 @@ def drop(account: Account, *, parent: int) -> None:
         os.setresgid(account.gid, account.gid, account.gid)
         os.setresuid(account.uid, account.uid, account.uid)
         _empty_capabilities()
-    _prctl(_PR_SET_NO_NEW_PRIVS, 1)
+    prctl(_PR_SET_NO_NEW_PRIVS, 1)
     die_with_parent(parent)
 
 
@@ -81,13 +79,13 @@ def _empty_bounding_set() -> None:
         last = int(file.read())
     for capability in range(last + 1):
         try:
-            _prctl(_PR_CAPBSET_DROP, capability)
+            prctl(_PR_CAPBSET_DROP, capability)
         except PermissionError:
             return
 
 
 def _empty_capabilities() -> None:
-    _prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
+    prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     libc = ctypes.CDLL(None, use_errno=True)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     nothing = (ctypes.c_uint32 * 6)()
@@ -95,10 +93,11 @@ def _empty_capabilities() -> None:
         raise _last_error("capset")
 
 
-def _prctl(option: int, argument: int) -> None:
+def prctl(option: int, first: int, second: int = 0) -> None:
+    """`prctl(2)`. Raises `OSError`."""
     libc = ctypes.CDLL(None, use_errno=True)
     zero = ctypes.c_ulong(0)
-    if libc.prctl(ctypes.c_int(option), ctypes.c_ulong(argument), zero, zero, zero) != 0:
+    if libc.prctl(ctypes.c_int(option), ctypes.c_ulong(first), ctypes.c_ulong(second), zero, zero) != 0:
         raise _last_error(f"prctl({option})")
 
 

@@ -41,7 +41,7 @@ def control(lifeline_fd: int, config: Path) -> None:
     asyncio.run(_Control(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
-def relay(lifeline_fd: int, index: int) -> None:
+def relay(lifeline_fd: int, index: int, config: Path) -> None:
     """Stand-in for the relay. SIGUSR1 makes it send what only control may send."""
     asyncio.run(_Actor("relay", lifeline_fd, RelayLink).run())
 
@@ -51,7 +51,7 @@ def signer(lifeline_fd: int, directory: Path) -> None:
     asyncio.run(_Actor("signer", lifeline_fd, SignerLink).run())
 
 
-def stubborn(lifeline_fd: int, index: int) -> None:
+def stubborn(lifeline_fd: int, index: int, config: Path) -> None:
     """A relay that does not end when it is asked to, nor by SIGTERM."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     asyncio.run(_Stubborn("relay", lifeline_fd, RelayLink).run())

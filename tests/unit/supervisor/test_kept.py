@@ -1,0 +1,82 @@
+"""Tests of `appliance.supervisor.kept`."""
+
+import os
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.supervisor.kept import KeptSockets, RefusedSocketError
+
+
+@pytest.fixture
+def kept() -> Iterator[KeptSockets]:
+    """Room for two sockets."""
+    sockets = KeptSockets(limit=2)
+    yield sockets
+    sockets.close()
+
+
+def _listening() -> int:
+    return socket.create_server(("127.0.0.1", 0)).detach()
+
+
+def _is_open(descriptor: int) -> bool:
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
+
+
+def test_a_kept_socket_is_there_until_it_is_dropped(kept: KeptSockets) -> None:
+    """What is kept is given back under its name; what is dropped is closed."""
+    descriptor = _listening()
+    kept.keep("outer:a1", descriptor)
+    assert list(kept) == [("outer:a1", descriptor)]
+    kept.drop("outer:a1")
+    assert list(kept) == []
+    assert not _is_open(descriptor)
+
+
+def test_a_name_stands_for_one_socket(kept: KeptSockets) -> None:
+    """Keeping another socket under the same name closes the first, also when there is no more room."""
+    first, second, other = _listening(), _listening(), _listening()
+    kept.keep("other", other)
+    kept.keep("rvmaster", first)
+    kept.keep("rvmaster", second)
+    assert dict(kept) == {"rvmaster": second, "other": other}
+    assert not _is_open(first)
+
+
+def test_there_is_a_bound(kept: KeptSockets) -> None:
+    """One socket too many is refused and closed; the others stay."""
+    kept.keep("one", _listening())
+    kept.keep("two", _listening())
+    third = _listening()
+    with pytest.raises(RefusedSocketError, match="one too many"):
+        kept.keep("three", third)
+    assert len(kept) == 2
+    assert not _is_open(third)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a\n", "-a", "x" * 201, "\u00e4", "a\0"])
+def test_only_plain_names_are_accepted(kept: KeptSockets, name: str) -> None:
+    """A name is a short word of letters, digits and a few marks."""
+    descriptor = _listening()
+    with pytest.raises(RefusedSocketError, match="not a name"):
+        kept.keep(name, descriptor)
+    assert not _is_open(descriptor)
+
+
+def test_only_listening_sockets_are_kept(kept: KeptSockets) -> None:
+    """Neither a file nor a socket that does not listen is worth keeping, and neither stays open."""
+    read_end, write_end = os.pipe()
+    os.close(write_end)
+    with pytest.raises(RefusedSocketError, match="not a socket"):
+        kept.keep("pipe", read_end)
+    idle = socket.socket().detach()
+    with pytest.raises(RefusedSocketError, match="does not listen"):
+        kept.keep("idle", idle)
+    assert not _is_open(read_end)
+    assert not _is_open(idle)

@@ -1,0 +1,46 @@
+"""Tests of `appliance.supervisor.roles`."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import Facts, roles_of
+from appliance.supervisor.users import NUMERIC_IDS
+
+FACTS = Facts(Path("/s"), Path("/s/run/config.json"), 12311, "http://127.0.0.1:5")
+HERE = Path("/bin/true")
+
+
+def test_rosmaster_is_told_to_hide() -> None:
+    """The real master is started so that it binds loopback only, on the port it was given."""
+    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosmaster")
+    assert role.program is not None
+    program = role.program(FACTS)
+    assert program.environment["ROS_IP"] == "127.0.0.1"
+    assert program.argv[-2:] == ("-p", "12311")
+
+
+def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
+    """The message has the command that installs it."""
+    with pytest.raises(StartError, match="apt install python3-rosmaster"):
+        roles_of(rosmaster=tmp_path / "rosmaster", rosout=HERE)
+    with pytest.raises(StartError, match="apt install rosout"):
+        roles_of(rosmaster=HERE, rosout=tmp_path / "rosout")
+
+
+def test_links_are_between_roles_and_go_both_ways() -> None:
+    """If one end of a link is new, the row of that end says so: a restart of either renews it."""
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE)}
+    for role in roles.values():
+        for other in role.links:
+            assert role.name in roles[other].links
+
+
+def test_rows_are_consistent() -> None:
+    """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
+    roles = roles_of(rosmaster=HERE, rosout=HERE)
+    assert all(role.user in NUMERIC_IDS for role in roles)
+    assert all((role.entry is None) != (role.program is None) for role in roles)
+    parts = [role.part for role in roles if role.entry]
+    assert len(parts) == len(set(parts))

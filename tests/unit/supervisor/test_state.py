@@ -1,0 +1,77 @@
+"""Tests of `appliance.supervisor.state`, as the user who runs them."""
+
+import os
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import Role
+from appliance.supervisor.state import StateDirectory
+
+ROLES = (
+    Role(name="control", user="rosrv", part="control"),
+    Role(name="rosmaster", user="rosmaster", part="rosmaster"),
+)
+
+
+def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
+    """Every role gets its folder, for its user only; the directory itself can be passed but not listed."""
+    state = StateDirectory(tmp_path / "deep" / "state")
+    state.prepare(ROLES)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in state.path.iterdir()}
+    assert modes == {"lock": 0o600, "run": 0o755, "control": 0o700, "rosmaster": 0o700}
+    assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
+    state.close()
+
+
+def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> None:
+    """The message says which process has the directory; when that one is gone the directory is free."""
+    first = StateDirectory(tmp_path)
+    with pytest.raises(StartError, match=f"process {os.getpid()}"):
+        StateDirectory(tmp_path)
+    first.close()
+    StateDirectory(tmp_path).close()
+
+
+def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
+    """What a crash left behind does not keep the next start from listening."""
+    state = StateDirectory(tmp_path)
+    state.open_admin_socket().close()  # as after a crash: the file is there, nobody listens
+    with state.open_admin_socket(), socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(tmp_path / "admin.sock"))
+    state.close()
+    assert not (tmp_path / "admin.sock").exists()
+
+
+def test_a_path_too_long_for_a_socket_is_an_error_in_words(tmp_path: Path) -> None:
+    """The kernel takes 107 bytes; the message says to name a shorter path."""
+    state = StateDirectory(tmp_path / ("x" * 120))
+    with pytest.raises(StartError, match="shorter path"):
+        state.open_admin_socket()
+    state.close()
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_a_part_that_is_no_folder_is_refused(tmp_path: Path, kind: str) -> None:
+    """Neither a file nor a symbolic link is taken for a role's folder, nor changed."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o755)
+    elsewhere.chmod(0o755)
+    part = tmp_path / "state" / "control"
+    part.parent.mkdir()
+    part.write_text("") if kind == "file" else part.symlink_to(elsewhere)
+    state = StateDirectory(tmp_path / "state")
+    with pytest.raises(StartError, match="control is not a folder of user id"):
+        state.prepare(ROLES)
+    assert stat.S_IMODE(elsewhere.stat().st_mode) == 0o755
+    state.close()
+
+
+def test_a_directory_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) -> None:
+    """The message names the directory and the flag."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StartError, match=r"file/state cannot be used: .*--state DIR"):
+        StateDirectory(tmp_path / "file" / "state")

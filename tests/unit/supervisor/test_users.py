@@ -1,0 +1,41 @@
+"""Tests of `appliance.supervisor.users`."""
+
+import os
+import pwd
+
+import pytest
+
+from appliance.supervisor.users import NUMERIC_IDS, account_of
+
+
+def test_without_a_user_of_that_name_the_numeric_id_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As root, on a machine where nobody made the users, each role still has an id of its own."""
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+
+    def unknown(name: str) -> pwd.struct_passwd:
+        raise KeyError(name)
+
+    monkeypatch.setattr(pwd, "getpwnam", unknown)
+    accounts = {user: account_of(user) for user in NUMERIC_IDS}
+    assert {user: (one.uid, one.gid) for user, one in accounts.items()} == {
+        "rosrv": (61011, 61011),
+        "rosmaster": (61012, 61012),
+        "rosrv-relay": (61013, 61013),
+        "rosrv-api": (61014, 61014),
+        "rosrv-signer": (61015, 61015),
+    }
+
+
+def test_a_user_of_that_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As root, the users that an administrator made are used."""
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    made = pwd.struct_passwd(("rosrv", "x", 123, 456, "", "/", "/bin/false"))
+    monkeypatch.setattr(pwd, "getpwnam", lambda _name: made)
+    assert (account_of("rosrv").uid, account_of("rosrv").gid) == (123, 456)
+
+
+def test_a_caller_who_is_not_root_runs_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without root nobody can become another: all roles are the caller's."""
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(os, "getegid", lambda: 1001)
+    assert {(account_of(user).uid, account_of(user).gid) for user in NUMERIC_IDS} == {(1000, 1001)}
