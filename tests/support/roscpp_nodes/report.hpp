@@ -34,4 +34,9 @@ inline void report(const std::string& event, const std::string& fields = "") {
   std::fflush(stdout);
 }
 
-inline void report_ready() { report("ready", ", \"name\": " + json_string(ros::this_node::getName())); }
+// The node also logs a line, as nodes do. With its first one roscpp subscribes a parameter, which registers the node; a
+// node whose first line is the one that it is being replaced would thereby throw out its successor, with any master.
+inline void report_ready() {
+  ROS_INFO("started");
+  report("ready", ", \"name\": " + json_string(ros::this_node::getName()));
+}

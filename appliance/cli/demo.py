@@ -1,0 +1,239 @@
+"""`rosrv demo`: the product at work, in about a minute.
+
+A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator,
+and an attacker. The operator drives and fires; the attacker tries what ROS 1 lets anybody do; for each
+the rule that decided is read from the audit log. The exit status says whether the robot did what its
+operator wanted and nothing else: scripts can rely on it.
+"""
+
+import signal
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from appliance.cli.landshark import (
+    APPLIANCE,
+    ATTACKER,
+    MASTER_URI,
+    NODE_PYTHON,
+    OPERATOR,
+    ROBOT,
+    Actor,
+    Attack,
+    DemoError,
+    Stage,
+)
+from appliance.network.lab import Lab
+from appliance.network.namespaces import NetworkError, has_privileges
+
+ATTACKS = (
+    "look around",
+    "take over the operator",
+    "forge the trigger",
+    "replace a driver",
+    "spy on the position",
+    "kill a node",
+    "try every port",
+    "stop the clock",
+    "wipe the parameters",
+    "stop the master",
+)
+GRANTED = (
+    ("/landshark_base", "/landshark/odom"),
+    ("/ocu", "/landshark/gps"),
+    ("/ocu", "/landshark_control/base_velocity"),
+    ("/ocu", "/landshark_control/trigger"),
+)
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One line of the table at the end."""
+
+    what: str
+    good: bool
+    remark: str
+
+
+class Show:
+    """The demonstration, act by act; `results` is what the summary tells."""
+
+    def __init__(self, stage: Stage, console: Console) -> None:
+        self.stage, self.console = stage, console
+        self.results: list[Result] = []
+        self.last_sequence = -1
+        self.robot: list[Actor] = []
+
+    def run(self) -> bool:
+        """All acts; whether everything was as it should be."""
+        self.open()
+        operator = self.mission()
+        self.explain_grants()
+        before = operator.newest("position")
+        self.headline(f"An attacker on the same network ({ATTACKER})")
+        for name in ATTACKS:
+            self.refuse(self.stage.attack(name))
+        self.aftermath(operator, before)
+        self.summary()
+        return all(result.good for result in self.results)
+
+    def open(self) -> None:
+        """The appliance, then the robot."""
+        self.headline("The appliance takes the place of the ROS Master")
+        ready = self.stage.start_appliance()
+        self.say(f"nodes may connect: ROS_MASTER_URI={ready['master']}  (the real one is hidden)")
+        if ready.get("api"):
+            self.say(f"console and REST:  {ready['api']}")
+        self.say(f"policy:            {self.stage.policy}")
+        self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
+        self.robot = self.stage.start_robot()
+        self.say(", ".join(actor.name for actor in self.robot))
+
+    def mission(self) -> Actor:
+        """The operator drives, aims and fires."""
+        self.headline(f"Its operator takes the controls ({OPERATOR})")
+        operator = self.stage.start_operator()
+        operator.expect("connected")
+        drove = operator.expect("drove")
+        self.results.append(Result("the robot drives", drove["metres"] >= 3, f"{drove['metres']} m"))
+        self.say(f"drove {drove['metres']} m")
+        aimed = operator.expect("aimed")
+        self.say(f"aimed the gun: tilt {aimed['tilt']:.2f} rad")
+        fired = operator.expect("fired")
+        self.results.append(Result("the gun fires for its operator", fired["shots"] == 1, "1 shot"))
+        self.say("fired one shot")
+        return operator
+
+    def explain_grants(self) -> None:
+        """Why that was possible: four decisions out of the audit log."""
+        granted = [record for record in self.stage.audit() if record.get("decision") == "allow"]
+        for caller, topic in GRANTED:
+            for record in granted:
+                if (record.get("caller_id"), record.get("resource")) == (caller, topic):
+                    self.decided("allowed", f"{record.get('category')} {topic} by {caller}", rule_of(record))
+                    break
+            else:
+                self.results.append(Result(f"audit record: {caller} {topic}", good=False, remark="missing"))
+
+    def refuse(self, attack: Attack) -> None:
+        """One attack and what became of it, with the rule from the audit log."""
+        denials = [
+            record
+            for record in self.stage.audit("--deny")
+            if record.get("host") == ATTACKER and record["sequence"] > self.last_sequence
+        ]
+        self.last_sequence = max([self.last_sequence, *(record["sequence"] for record in denials)])
+        if attack.succeeded:
+            self.decided("SUCCEEDED", f"{attack.name}: {attack.tried}", attack.answer)
+            self.results.append(Result(f"attack: {attack.name}", good=False, remark=attack.answer))
+            return
+        reason = denials[-1].get("reason", "") if denials else attack.answer
+        rule = rule_of(denials[-1]) if denials else ""
+        self.decided("refused", f"{attack.name}: {attack.tried}", rule or reason)
+        self.results.append(
+            Result(f"attack: {attack.name}", good=bool(denials), remark=rule or reason or "no audit record")
+        )
+
+    def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
+        """The robot is as it was: every node lives, it still drives, and nobody else fired."""
+        self.headline("The robot did not notice")
+        after = operator.newest("position")
+        dead = [actor.name for actor in [*self.robot, operator] if not actor.running]
+        moved = after["x"] != before["x"]
+        self.results += [
+            Result("every node lives", not dead, ", ".join(dead) or f"{len(self.robot) + 1} nodes"),
+            Result(
+                "the robot still drives", moved, f"now at {after['latitude']:.6f} {after['longitude']:.6f}"
+            ),
+            Result("nobody else fired", after["shots"] == 1, f"{after['shots']} shot in all"),
+        ]
+
+    def summary(self) -> None:
+        """The table at the end."""
+        table = Table(box=None, pad_edge=False)
+        for column in ("", "what", "how"):
+            table.add_column(column, overflow="fold")
+        for result in self.results:
+            mark = "[green]ok[/]" if result.good else "[red]NOT OK[/]"
+            table.add_row(mark, escape(result.what), escape(result.remark))
+        self.console.print()
+        self.console.print(table)
+
+    def headline(self, text: str) -> None:
+        """Begin an act."""
+        self.console.print(f"\n[bold]{escape(text)}[/]")
+
+    def say(self, text: str) -> None:
+        """One line of an act."""
+        self.console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
+
+    def decided(self, outcome: str, what: str, why: str) -> None:
+        """One decision: the outcome, what was asked, and the rule."""
+        colour = {"allowed": "green", "refused": "yellow"}.get(outcome, "bold red")
+        line = f"  [{colour}]{outcome:9}[/] {escape(what)}\n            [dim]{escape(why)}[/]"
+        self.console.print(line, highlight=False, soft_wrap=True)
+
+
+def rule_of(record: Record) -> str:
+    """The rule that decided, as the policy file has it; else the reason."""
+    rule = record.get("rule")
+    if not rule:
+        return str(record.get("reason", ""))
+    return f"[{rule['section']}] {rule['key']} ({Path(rule['file']).name}:{rule['line']})"
+
+
+def require_everything() -> None:
+    """Say what this machine lacks before anything is started."""
+    if not has_privileges():
+        raise DemoError(
+            "the demonstration makes four hosts as network namespaces, which needs root: "
+            "run it as root or with sudo, in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
+        )
+    if not (EXAMPLES / "landshark").is_dir():
+        raise DemoError(f"the simulated robot is not at {EXAMPLES}: run `rosrv demo` from a checkout")
+    for program in ("/usr/bin/rosmaster", NODE_PYTHON):
+        if not Path(program).exists():
+            raise DemoError(f"{program} is missing: `make setup` installs what the demonstration needs")
+
+
+def demo(
+    hold: Annotated[bool, typer.Option(help="Keep everything running at the end, until Ctrl-C")] = False,
+) -> None:
+    """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
+
+    Example: rosrv demo --hold
+    """
+    console, errors = Console(), Console(stderr=True)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        require_everything()
+        with ExitStack() as stack:
+            lab = stack.enter_context(Lab("rosrv-demo"))
+            stage = stack.enter_context(Stage(lab, EXAMPLES))
+            good = Show(stage, console).run()
+            if hold:
+                console.print(
+                    f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} at {APPLIANCE}."
+                )
+                console.print(f"Look at it:  rosrv status --state {stage.state}", soft_wrap=True)
+                signal.pause()
+    except KeyboardInterrupt:
+        errors.print("\nEnded; everything is cleared away.")
+        raise typer.Exit(130) from None
+    except (DemoError, NetworkError) as error:
+        errors.print(f"[red]rosrv demo:[/] {escape(str(error))}", soft_wrap=True)
+        raise typer.Exit(1) from None
+    raise typer.Exit(0 if good else 1)
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

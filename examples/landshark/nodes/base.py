@@ -1,0 +1,65 @@
+"""/landshark_base: the motors. Velocity commands in, odometry out; stops when commands cease."""
+
+import math
+import threading
+
+import physics
+import rospy
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+
+HERTZ = 20.0
+
+
+class Base:
+    """The moving robot."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.pose = physics.Pose()
+        self.velocity = physics.Velocity()
+        self.told = rospy.Time(0)
+        self.odometry = rospy.Publisher("/landshark/odom", Odometry, queue_size=10)
+        rospy.Subscriber("/landshark_control/base_velocity", TwistStamped, self.command)
+
+    def command(self, message):
+        """Take over a velocity."""
+        with self.lock:
+            self.velocity = physics.possible(
+                physics.Velocity(message.twist.linear.x, message.twist.angular.z)
+            )
+            self.told = rospy.Time.now()
+
+    def step(self, seconds):
+        """Move on by so long and tell where the robot is."""
+        now = rospy.Time.now()
+        with self.lock:
+            if (now - self.told).to_sec() > physics.COMMAND_LIFETIME:
+                self.velocity = physics.Velocity()
+            self.pose = physics.drive(self.pose, self.velocity, seconds)
+            pose, velocity = self.pose, self.velocity
+        message = Odometry()
+        message.header.stamp = now
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.pose.pose.position.x, message.pose.pose.position.y = pose.x, pose.y
+        message.pose.pose.orientation.z = math.sin(pose.heading / 2)
+        message.pose.pose.orientation.w = math.cos(pose.heading / 2)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = velocity.forward, velocity.turn
+        self.odometry.publish(message)
+
+
+def main():
+    """Run until told to end."""
+    rospy.init_node("landshark_base")
+    base = Base()
+    rate = rospy.Rate(HERTZ)
+    while not rospy.is_shutdown():
+        base.step(1 / HERTZ)
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            return
+
+
+if __name__ == "__main__":
+    main()

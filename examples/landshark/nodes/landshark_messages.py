@@ -1,0 +1,25 @@
+"""The LandShark's own message type, made from its .msg file at run time as `catkin_make` would at build time.
+
+LANDSHARK_MESSAGES names the folder with `landshark_msgs/PaintballTrigger.msg`; the default is the folder
+`monitors/msg` of this checkout, where the appliance finds it, too. The md5sum is that of the definition,
+so that it fits any other node that was built from the same file.
+"""
+
+import os
+from pathlib import Path
+
+import genpy.dynamic
+from std_msgs.msg import Header
+
+DEFAULT_FOLDER = Path(__file__).resolve().parents[3] / "monitors" / "msg"
+
+
+def paintball_trigger():
+    """The class landshark_msgs/PaintballTrigger."""
+    folder = Path(os.environ.get("LANDSHARK_MESSAGES", DEFAULT_FOLDER))
+    text = (folder / "landshark_msgs" / "PaintballTrigger.msg").read_text()
+    divider = "=" * 80
+    full = f"{text}\n{divider}\nMSG: std_msgs/Header\n{Header._full_text}\n"
+    return genpy.dynamic.generate_dynamic("landshark_msgs/PaintballTrigger", full)[
+        "landshark_msgs/PaintballTrigger"
+    ]

@@ -1,0 +1,105 @@
+"""The LandShark's sensors, one node each: `sensors.py gps`, `sensors.py laser`, `sensors.py battery`.
+
+Each hears the odometry (that is the simulation: a real one would look at the world) and tells what it
+measures: /landshark_gps on /landshark/gps, /landshark_laser on /landshark/scan, /landshark_battery on
+/landshark/battery.
+"""
+
+import math
+import sys
+
+import physics
+import rospy
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState, LaserScan, NavSatFix, NavSatStatus
+
+BEAMS = 61
+FIELD_OF_VIEW = math.radians(120)
+
+
+def pose_of(odometry):
+    """The pose in an odometry message."""
+    position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
+    return physics.Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
+
+
+class Gps:
+    """Satellite navigation: latitude and longitude."""
+
+    topic, kind = "/landshark/gps", NavSatFix
+
+    def measure(self, odometry):
+        """One fix."""
+        message = NavSatFix()
+        message.header.stamp, message.header.frame_id = odometry.header.stamp, "gps"
+        message.status.status, message.status.service = NavSatStatus.STATUS_FIX, NavSatStatus.SERVICE_GPS
+        message.latitude, message.longitude = physics.position_on_earth(pose_of(odometry))
+        return message
+
+
+class Laser:
+    """A range finder that looks ahead."""
+
+    topic, kind = "/landshark/scan", LaserScan
+
+    def measure(self, odometry):
+        """One sweep."""
+        step = FIELD_OF_VIEW / (BEAMS - 1)
+        directions = [-FIELD_OF_VIEW / 2 + step * beam for beam in range(BEAMS)]
+        message = LaserScan()
+        message.header.stamp, message.header.frame_id = odometry.header.stamp, "laser"
+        message.angle_min, message.angle_max, message.angle_increment = directions[0], directions[-1], step
+        message.range_min, message.range_max = 0.05, 30.0
+        message.ranges = physics.scan(pose_of(odometry), directions)
+        return message
+
+
+class Battery:
+    """The charge that is left."""
+
+    topic, kind = "/landshark/battery", BatteryState
+
+    def __init__(self):
+        self.charge = 1.0
+        self.last = None
+
+    def measure(self, odometry):
+        """One reading."""
+        now = odometry.header.stamp
+        seconds = (now - self.last).to_sec() if self.last else 0.0
+        self.last = now
+        self.charge = physics.drained(self.charge, odometry.twist.twist.linear.x, max(seconds, 0.0))
+        message = BatteryState()
+        message.header.stamp = now
+        message.percentage, message.voltage, message.present = self.charge, 22.0 + 4.0 * self.charge, True
+        message.current = message.capacity = message.design_capacity = float("nan")  # not measured
+        return message
+
+
+SENSORS = {"gps": (Gps, 5.0), "laser": (Laser, 10.0), "battery": (Battery, 1.0)}
+
+
+def main():
+    """Measure until told to end."""
+    arguments = rospy.myargv()[1:]
+    if len(arguments) != 1 or arguments[0] not in SENSORS:
+        sys.exit(f"usage: sensors.py {'|'.join(SENSORS)}")
+    name = arguments[0]
+    make, hertz = SENSORS[name]
+    rospy.init_node(f"landshark_{name}")
+    sensor = make()
+    publisher = rospy.Publisher(sensor.topic, sensor.kind, queue_size=10)
+    latest = []
+    rospy.Subscriber("/landshark/odom", Odometry, lambda message: latest.__setitem__(slice(None), [message]))
+    rate = rospy.Rate(hertz)
+    while not rospy.is_shutdown():
+        if latest:
+            publisher.publish(sensor.measure(latest[0]))
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            return
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""/landshark_turret: the gun. Joint commands and triggers in; joint states and the count of shots out.
+
+The driver fires whatever way the gun points, at the robot itself, too: that it must not is for a monitor.
+"""
+
+import threading
+
+import physics
+import rospy
+from landshark_messages import paintball_trigger
+from sensor_msgs.msg import JointState
+from std_msgs.msg import UInt32
+
+HERTZ = 20.0
+PaintballTrigger = paintball_trigger()
+SHOTS = {
+    PaintballTrigger.SINGLE_SHOT: 1,
+    PaintballTrigger.TRIPLE_SHOT: 3,
+    PaintballTrigger.BURST_SHOT: 8,
+}
+
+
+class TurretDriver:
+    """The turret and its gun."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.turret = self.wanted = physics.Turret()
+        self.fired = 0
+        self.states = rospy.Publisher("/landshark/joint_states", JointState, queue_size=10)
+        self.shots = rospy.Publisher("/landshark/shots", UInt32, queue_size=10, latch=True)
+        self.shots.publish(0)
+        rospy.Subscriber("/landshark_control/turret", JointState, self.command)
+        rospy.Subscriber("/landshark_control/trigger", PaintballTrigger, self.fire)
+
+    def command(self, message):
+        """Take over the wanted angles of the joints that are named."""
+        angles = dict(zip(message.name, message.position))  # noqa: B905  a shorter list leaves joints alone
+        with self.lock:
+            self.wanted = physics.Turret(
+                angles.get("turret_pan", self.wanted.pan), angles.get("turret_tilt", self.wanted.tilt)
+            )
+
+    def fire(self, message):
+        """Shoot."""
+        shots = SHOTS.get(message.trigger, 0)
+        with self.lock:
+            self.fired += shots
+            fired, turret = self.fired, self.turret
+        if shots:
+            rospy.loginfo("fired %d at pan %.2f, tilt %.2f", shots, turret.pan, turret.tilt)
+            self.shots.publish(fired)
+
+    def step(self, seconds):
+        """Move the joints and tell where they are."""
+        with self.lock:
+            self.turret = physics.aim(self.turret, self.wanted, seconds)
+            turret = self.turret
+        message = JointState()
+        message.header.stamp = rospy.Time.now()
+        message.name = ["turret_pan", "turret_tilt"]
+        message.position = [turret.pan, turret.tilt]
+        self.states.publish(message)
+
+
+def main():
+    """Run until told to end."""
+    rospy.init_node("landshark_turret")
+    driver = TurretDriver()
+    rate = rospy.Rate(HERTZ)
+    while not rospy.is_shutdown():
+        driver.step(1 / HERTZ)
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            return
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""The simulated LandShark is a robot like any other: without the appliance it is as open as ROS 1 is."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.cli.landshark import MASTER_URI, Actor, Stage
+from appliance.network.lab import Lab
+from tests.support.nodes import ROOT, has_ros
+from tests.support.requirements import need_root, needs
+from tests.support.rosmaster import PlainMaster
+
+ATTACKS = [  # those that end a node come after those that need it
+    "look around",
+    "spy on the position",
+    "forge the trigger",
+    "take over the operator",
+    "replace a driver",
+    "kill a node",
+    "stop the clock",
+    "wipe the parameters",
+    "stop the master",
+]
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    """The robot and its operator behind a plain ROSMaster."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    home = tmp_path_factory.mktemp("master")
+    with (
+        Lab("rosrv-test") as lab,
+        Stage(lab, ROOT / "examples") as stage,
+        PlainMaster(home, stage.appliance_host) as master,
+    ):
+        assert master.master_uri == MASTER_URI
+        yield stage
+
+
+@pytest.fixture(scope="module")
+def operator(stage: Stage) -> Actor:
+    """The operator's unit, with the robot at its other end."""
+    stage.start_robot()
+    operator = stage.start_operator()
+    operator.expect("connected")
+    return operator
+
+
+def test_mission(operator: Actor) -> None:
+    """The operator drives the robot, aims, and fires once."""
+    assert operator.expect("drove")["metres"] >= 3
+    assert operator.expect("aimed")["tilt"] == pytest.approx(0.2, abs=0.02)
+    assert operator.expect("fired")["shots"] == 1
+    position = operator.expect("position")
+    assert position["x"] > 3
+    assert position["longitude"] > -122.1733
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_attack_succeeds_against_a_plain_master(stage: Stage, operator: Actor, name: str) -> None:
+    """Each attack of the demonstration is real: nothing but the appliance stops it."""
+    assert stage.attack(name).succeeded

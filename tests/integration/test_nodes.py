@@ -1,0 +1,169 @@
+"""Unmodified rospy and roscpp nodes talk to each other, behind a plain master and behind the appliance."""
+
+import json
+
+import pytest
+
+from tests.support.nodes import Client, RosSession
+from tests.support.site import Site
+
+CLIENTS: list[Client] = ["rospy", "roscpp"]
+
+
+@pytest.mark.parametrize("subscriber_first", [True, False], ids=["listener-first", "talker-first"])
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_first: bool) -> None:
+    """Messages arrive in order, from the node that sent them, whichever of the two started first."""
+    if subscriber_first:
+        listener = ros.listener(to, "/chatter")
+        ros.talker(by, "/chatter", name="voice")
+    else:
+        ros.talker(by, "/chatter", name="voice")
+        listener = ros.listener(to, "/chatter")
+    heard = listener.wait_for_count(5, event="received")
+    numbers = [int(event["data"].removeprefix("hello ")) for event in heard]
+    assert numbers == list(range(numbers[0], numbers[0] + 5))
+    assert {event["publisher"] for event in heard} == {"/voice"}
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
+    """Who subscribes late gets the last message of a latched topic, once each."""
+    talker = ros.talker(by, "/map", "--latch")
+    talker.wait_for(event="sent")
+    for number in range(2):
+        listener = ros.listener(to, "/map", name=f"late_{number}")
+        assert listener.wait_for(event="received")["data"] == "hello 1"
+        assert len(listener.seen(event="received")) == 1
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+def test_two_talkers_on_one_topic(ros: RosSession, to: Client) -> None:
+    """A subscriber hears every publisher of its topic and knows which is which."""
+    listener = ros.listener(to, "/chatter")
+    ros.talker("rospy", "/chatter", "--text", "one", name="one")
+    ros.talker("roscpp", "/chatter", "--text", "two", name="two")
+    for name in ("one", "two"):
+        assert listener.wait_for(event="received", publisher=f"/{name}")["data"].startswith(name)
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_talker_comes_back(ros: RosSession, by: Client, to: Client) -> None:
+    """A publisher that ended and came back under its name is heard again."""
+    listener = ros.listener(to, "/chatter")
+    first = ros.talker(by, "/chatter", "--text", "before", name="voice")
+    listener.wait_for(lambda event: event.get("data", "").startswith("before"))
+    first.stop()
+    ros.talker(by, "/chatter", "--text", "after", name="voice")
+    listener.wait_for(lambda event: event.get("data", "").startswith("after"))
+
+
+@pytest.mark.parametrize("by", CLIENTS)
+def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -> None:
+    """ROS's own rule stays: a new node of the same name on the same host ends the old one."""
+    listener = ros.listener("rospy", "/chatter")
+    first = ros.talker(by, "/chatter", "--text", "first", name="voice")
+    listener.wait_for(event="received")
+    ros.talker(by, "/chatter", "--text", "second", name="voice")
+    first.wait()
+    listener.wait_for(lambda event: event.get("data", "").startswith("second"))
+
+
+@pytest.mark.parametrize("by", CLIENTS)
+def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> None:
+    """A publisher is told when somebody connects and when nobody is left."""
+    talker = ros.talker(by, "/chatter")
+    listener = ros.listener("roscpp", "/chatter")
+    talker.wait_for(event="connected")
+    listener.stop()
+    talker.wait_for(event="disconnected")
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_service(ros: RosSession, by: Client, to: Client) -> None:
+    """A service answers its client, again and again, and learns the client's name."""
+    server = ros.service_server(by, "/negate")
+    client = ros.service_client(to, "/negate", name="asker")
+    for number, given in enumerate(("true", "false", "true")):
+        client.send(given)
+        answers = client.wait_for_count(number + 1, event="answered")
+        assert answers[-1]["success"] is (given != "true")
+    assert {event["client"] for event in server.seen(event="called")} == {"/asker"}
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_persistent_service_connection(ros: RosSession, client: Client) -> None:
+    """A client that keeps its connection is served on it."""
+    ros.service_server("roscpp", "/negate")
+    asker = ros.service_client(client, "/negate", "--persistent")
+    for number in range(3):
+        asker.send("false")
+        assert asker.wait_for_count(number + 1, event="answered")[-1]["success"] is True
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_service_that_is_not_there(ros: RosSession, client: Client) -> None:
+    """A call of a service nobody offers fails for the client and leaves it running."""
+    asker = ros.service_client(client, "/nobody")
+    asker.send("true")
+    asker.wait_for(event="failed")
+    ros.service_server("rospy", "/nobody")
+    asker.send("true")
+    asker.wait_for(event="answered")
+
+
+def test_watched_parameter(ros: RosSession) -> None:
+    """A parameter set by one node reaches the nodes that watch it, rospy and roscpp."""
+    python, cpp = ros.parameters("rospy"), ros.parameters("roscpp")
+    python.send(json.dumps({"do": "set", "key": "/speed", "value": "slow"}))
+    python.wait_for(event="done", do="set")
+    python.send(json.dumps({"do": "watch", "key": "/speed"}))
+    python.wait_for(event="done", do="watch", value="slow")
+    cpp.send("watch /speed")
+    cpp.wait_for(event="done", do="watch", value="slow")
+    cpp.send("set /speed fast")
+    cpp.wait_for(event="changed", value="fast")
+    python.wait_for(event="changed", key="/speed/", value="fast")
+    cpp.send("delete /speed")
+    cpp.wait_for(event="done", do="delete")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [True, -7, 2.5, "text with ünïcode & <xml>", "", [1, "two", 3.0], {"a": {"b": [True]}}, []],
+    ids=repr,
+)
+def test_parameter_values(ros: RosSession, value: object) -> None:
+    """Every kind of value a parameter can have comes back as it was set."""
+    node = ros.parameters("rospy")
+    for told in ({"do": "set", "key": "/value", "value": value}, {"do": "get", "key": "/value"}):
+        node.send(json.dumps(told))
+    assert node.wait_for(event="done", do="get")["value"] == value
+    node.send(json.dumps({"do": "delete", "key": "/value"}))
+    node.wait_for(event="done", do="delete")
+    node.send(json.dumps({"do": "has", "key": "/value"}))
+    assert node.wait_for(event="done", do="has")["value"] is False
+
+
+def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
+    """A node on the operator's machine hears the robot, and the robot hears it."""
+    elsewhere = ros.on(site.ocu)
+    here, there = ros.listener("rospy", "/down"), elsewhere.listener("roscpp", "/up")
+    ros.talker("roscpp", "/up", name="robot_voice")
+    elsewhere.talker("rospy", "/down", name="ocu_voice")
+    assert here.wait_for(event="received")["publisher"] == "/ocu_voice"
+    assert there.wait_for(event="received")["publisher"] == "/robot_voice"
+
+
+def test_relative_and_private_names(ros: RosSession) -> None:
+    """Namespaces and remappings are resolved as ever."""
+    listener = ros.listener("roscpp", "/left/chatter")
+    ros.talker("rospy", "chatter", "__ns:=/left")
+    listener.wait_for(event="received")
+    other = ros.listener("rospy", "/heard")
+    ros.talker("roscpp", "/said", "/said:=/heard", name="remapped")
+    other.wait_for(event="received", publisher="/remapped")
