@@ -49,8 +49,6 @@ class Appliance:
         self.state = self.directory / "state"
         self.policy_file = self.directory / "policy.ini"
         self.policy_file.write_text(policy)
-        self.monitors = self.directory / "monitors"
-        self.monitors.mkdir()
         self.process: Process | None = None
         self.ready: Event = {}
 
@@ -59,26 +57,14 @@ class Appliance:
         """Where nodes find their master."""
         return str(self.ready["master"])
 
-    @property
-    def api_uri(self) -> str:
-        """Where REST answers."""
-        return str(self.ready["api"])
-
     def start(self) -> Self:
         """Start (again, on the same state); returns when nodes may connect."""
         loopback = isinstance(self.host, ThisMachine)
         command = [ROSRV, "up", "--json", "--isolation", self.isolation, "--state", str(self.state)]
-        command += ["--policy", str(self.policy_file), "--monitors", str(self.monitors)]
+        command += ["--policy", str(self.policy_file), *self.options]
         command += ["--listen", "127.0.0.1:0" if loopback else f"{self.host.address}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
-        command += [
-            "--api",
-            f"{self.host.address}:{0 if loopback else 8443}",
-            "--api-tls",
-            "off",
-            *self.options,
-        ]
         self.process = Process(self.host, command, env=_environment(), label="rosrv up")
         self.ready = self.process.wait_for(event="ready", timeout=60)
         return self
