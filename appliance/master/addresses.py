@@ -1,0 +1,41 @@
+"""Which of the appliance's addresses a host is told.
+
+It is the one the host reached us at; unless `advertise:` names another for its network, or (in a namespace of its
+own, behind address translation) the machine's address that the host really used.
+"""
+
+import ipaddress
+from collections.abc import Awaitable, Callable, Sequence
+
+from appliance.master.http import Peer
+from appliance.policy.model import Address
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+class Addresses:
+    """`advertised` are (network, address) pairs; `route_to(host)` asks for a translated address, if that can be."""
+
+    def __init__(
+        self,
+        advertised: Sequence[tuple[Network, Address]],
+        route_to: Callable[[str], Awaitable[str | None]] | None,
+    ) -> None:
+        self._advertised = advertised
+        self._route_to = route_to
+        self._routes: dict[Address, str | None] = {}
+
+    def told_to(self, peer: Peer) -> str:
+        """The address this peer is told."""
+        for network, address in self._advertised:
+            if peer.host in network:
+                return str(address)
+        return self._routes.get(peer.host) or peer.local
+
+    async def learn(self, peer: Peer) -> None:
+        """Find out how this peer reaches us, once; to be awaited before `told_to`."""
+        if self._route_to is None or peer.host in self._routes:
+            return
+        if len(self._routes) > 10_000:
+            self._routes.clear()
+        self._routes[peer.host] = await self._route_to(peer.text)

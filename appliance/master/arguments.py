@@ -1,0 +1,133 @@
+"""The kinds of parameters that calls have, and the one canonical value each is turned into before a decision.
+
+A name becomes what ROSMaster would resolve it to; a URI is parsed; anything else is a `PeerError` that names
+the parameter, as ROSMaster's own validators would.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.ros import names
+from appliance.ros.errors import InvalidNameError, PeerError, ProtocolError
+from appliance.ros.uris import NodeUri, parse_node_uri, parse_service_uri
+from appliance.ros.xmlrpc import Value
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of a call: its name in the ROS documentation, and how its value is made canonical."""
+
+    name: str
+    canonicalise: "Callable[[Value, str], object]"
+
+
+@dataclass(frozen=True, slots=True)
+class ApiUri:
+    """A node's or service's URI as it was given and as it was parsed."""
+
+    text: str
+    uri: NodeUri
+
+
+def _text(value: Value, _caller_id: str) -> str:
+    if not isinstance(value, str):
+        raise ProtocolError(f"must be a string, not {_type_name(value)}")
+    return value
+
+
+def _name(value: Value, caller_id: str) -> str:
+    return names.resolve(_filled(value), caller_id)
+
+
+def _subgraph(value: Value, caller_id: str) -> str:
+    text = _text(value, caller_id)
+    return names.resolve_namespace(text, caller_id) if text else ""
+
+
+def _key(value: Value, caller_id: str) -> str:
+    return names.resolve_parameter(_filled(value), caller_id)
+
+
+def _search_key(value: Value, caller_id: str) -> str:
+    text = _filled(value)
+    if text.startswith("~"):
+        raise InvalidNameError(f"{text!r} is private: searchParam takes a relative or global name")
+    names.resolve_parameter(text, caller_id)
+    return text
+
+
+def _type(value: Value, _caller_id: str) -> str:
+    text = _filled(value)
+    if not names.is_valid_type_name(text):
+        raise InvalidNameError(f"{text[:80]!r} is not the name of a message type: write package/Type")
+    return text
+
+
+def _node_api(value: Value, _caller_id: str) -> ApiUri:
+    text = _filled(value)
+    return ApiUri(text, parse_node_uri(text))
+
+
+def _service_api(value: Value, _caller_id: str) -> ApiUri:
+    text = _filled(value)
+    return ApiUri(text, parse_service_uri(text))
+
+
+def _anything(value: Value, _caller_id: str) -> Value:
+    if value is None:
+        raise ProtocolError("must be specified")
+    return value
+
+
+def _names(value: Value, caller_id: str) -> list[str]:
+    if not isinstance(value, list):
+        raise ProtocolError(f"must be a list of names, not {_type_name(value)}")
+    return [_text(one, caller_id) for one in value]
+
+
+def _list(value: Value, _caller_id: str) -> list[Value]:
+    if not isinstance(value, list):
+        raise ProtocolError(f"must be a list, not {_type_name(value)}")
+    return value
+
+
+TOPIC = Parameter("topic", _name)
+TOPIC_TYPE = Parameter("topic_type", _type)
+SERVICE = Parameter("service", _name)
+NODE = Parameter("node_name", _name)
+CALLER_API = Parameter("caller_api", _node_api)
+SERVICE_API = Parameter("service_api", _service_api)
+SUBGRAPH = Parameter("subgraph", _subgraph)
+KEY = Parameter("key", _key)
+SEARCH_KEY = Parameter("key", _search_key)
+VALUE = Parameter("value", _anything)
+MESSAGE = Parameter("msg", _text)
+STATE = Parameter("state", _text)
+MONITORS = Parameter("monitors", _names)
+PROTOCOLS = Parameter("protocols", _list)
+METHOD = Parameter("method_name", _text)
+
+
+def canonicalise(
+    parameters: tuple[Parameter, ...], required: int, caller_id: str, values: tuple[Value, ...]
+) -> tuple[object, ...]:
+    """The canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
+    if not required <= len(values) <= len(parameters):
+        raise ProtocolError("Error: bad call arity")
+    canonical = []
+    for parameter, value in zip(parameters, values, strict=False):
+        try:
+            canonical.append(parameter.canonicalise(value, caller_id))
+        except PeerError as error:
+            raise type(error)(f"ERROR: parameter [{parameter.name}] {error}") from error
+    return tuple(canonical)
+
+
+def _filled(value: Value) -> str:
+    if not isinstance(value, str) or not value:
+        raise ProtocolError("must be a non-empty string")
+    return value
+
+
+def _type_name(value: Value) -> str:
+    return "nothing" if value is None else type(value).__name__

@@ -1,0 +1,35 @@
+"""What a call is performed with: the parts of RVMaster, named once."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.master.addresses import Addresses
+from appliance.master.faces import Faces
+from appliance.master.gate import Gate
+from appliance.master.graph import Graph
+from appliance.master.liveness import Liveness
+from appliance.master.parameters import ParameterMirror
+from appliance.master.recorder import Recorder
+from appliance.master.registry import Registry
+from appliance.master.relays import RelayControl
+from appliance.master.rosmaster import RosMaster
+from appliance.policy import Policy
+
+
+@dataclass(slots=True)
+class Master:
+    """The parts of RVMaster; `port` is its own, `stop(reason)` ends the appliance."""
+
+    port: int
+    registry: Registry
+    gate: Gate
+    recorder: Recorder
+    rosmaster: RosMaster
+    relay: RelayControl
+    graph: Graph
+    faces: Faces
+    liveness: Liveness
+    parameters: ParameterMirror
+    addresses: Addresses
+    policy: Callable[[], Policy]
+    stop: Callable[[str], None]

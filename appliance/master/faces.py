@@ -1,0 +1,147 @@
+"""The two faces of every incarnation, and how an incarnation comes to be.
+
+*Inner*: one loopback listener for ROSMaster; the path of the URI is the incarnation's key. *Outer*: a port of its
+own that other nodes call. Neither reveals the node's real URI, and neither is ever another incarnation's.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from appliance.master.arguments import ApiUri
+from appliance.master.call import Caller
+from appliance.master.http import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Turns, Visitors
+from appliance.master.places import NoPortError, Places
+from appliance.master.registry import Incarnation, Life, Registry, new_key
+from appliance.policy.model import Address
+from appliance.ros.uris import node_uri
+from appliance.store.state import StateStore
+
+
+class Faces:
+    """Opens and closes faces. `serve(incarnation)` makes the handler of an outer face.
+
+    `address_for(peer)` is the appliance's address that the peer is told in URIs.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        places: Places,
+        store: StateStore,
+        *,
+        inner_port: int,
+        serve: Callable[[Incarnation], Handler],
+        address_for: Callable[[Peer], str],
+        limits: HttpLimits,
+        visitors: Visitors,
+        turns: Turns,
+        refuse: Callable[[Peer], bytes | None],
+        troubled: Callable[[Peer, str], None],
+    ) -> None:
+        self._registry = registry
+        self._places = places
+        self._store = store
+        self._inner_port = inner_port
+        self._serve = serve
+        self._address_for = address_for
+        self._limits = limits
+        self._visitors = visitors
+        self._turns = turns
+        self._refuse = refuse
+        self._troubled = troubled
+        self._servers: dict[str, HttpServer] = {}
+        self._coming: dict[tuple[str, Address, str], asyncio.Future[Incarnation]] = {}
+
+    def inner_uri(self, incarnation: Incarnation) -> str:
+        """What ROSMaster knows the incarnation by."""
+        return node_uri("127.0.0.1", self._inner_port, f"/{incarnation.key}/")
+
+    def nobody(self) -> str:
+        """An inner URI that is no incarnation's: for unregistering what was never registered."""
+        return node_uri("127.0.0.1", self._inner_port, "/nobody/")
+
+    def by_inner_uri(self, text: str) -> Incarnation | None:
+        """The incarnation of an inner URI that ROSMaster gave back."""
+        return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
+
+    def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """The incarnation that calls, if it is known."""
+        return self._registry.find(caller.caller_id, caller.peer.host, api.text)
+
+    async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
+        """The incarnation that calls; made, with its ports and durably, when it is new.
+
+        Raises `NoPortError` when the range of ports is exhausted.
+        """
+        identity = (caller.caller_id, caller.peer.host, api.text)
+        incarnation = self._registry.find(*identity)
+        if incarnation is not None and incarnation.life is Life.LIVE:
+            incarnation.told = self._address_for(caller.peer)
+            return incarnation
+        if incarnation is not None and incarnation.life is Life.SHADOW:
+            # It registers again although ROS 1 nodes never do: another process at the same URI.
+            self._registry.forget(incarnation)
+            self.close(incarnation)
+        coming = self._coming.get(identity)
+        if coming is None:
+            coming = asyncio.ensure_future(self._make(caller, api))
+            self._coming[identity] = coming
+            coming.add_done_callback(lambda _done: self._coming.pop(identity, None))
+        return await asyncio.shield(coming)
+
+    async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
+        outer_port, relay_port = self._places.open()
+        incarnation = Incarnation(
+            key=new_key(),
+            name=caller.caller_id,
+            host=caller.peer.host,
+            api=api.uri,
+            api_text=api.text,
+            told=self._address_for(caller.peer),
+            outer_port=outer_port,
+            relay_port=relay_port,
+            own=caller.own,
+            changed=time.time(),
+        )
+        self._registry.add(incarnation)
+        await self.open(incarnation)
+        await self._store.settled()  # a node never registers twice: it must be known after a crash, too
+        return incarnation
+
+    async def open(self, incarnation: Incarnation) -> None:
+        """Serve the outer face."""
+        server = HttpServer(
+            self._places.socket(incarnation.outer_port).dup(),
+            self._serve(incarnation),
+            limits=self._limits,
+            visitors=self._visitors,
+            turns=self._turns,
+            refuse=self._refuse,
+            troubled=self._troubled,
+        )
+        self._servers[incarnation.key] = server
+        await server.start()
+
+    async def reopen(self, incarnation: Incarnation) -> None:
+        """Serve the faces of an incarnation that was restored. Raises `NoPortError` when a port is taken."""
+        if not self._places.reopen(incarnation):
+            raise NoPortError(f"a port of {incarnation.name} is in use by another program")
+        await self.open(incarnation)
+
+    def close(self, incarnation: Incarnation) -> None:
+        """Close the outer face and both ports."""
+        server = self._servers.pop(incarnation.key, None)
+        if server is not None:
+            server.close()
+        self._places.close(incarnation)
+
+    def close_all(self) -> None:
+        """Stop serving; the ports stay open for the next control."""
+        for server in self._servers.values():
+            server.close()
+
+
+def key_of(request: HttpRequest) -> str:
+    """The key in the path of a call to the inner face."""
+    return request.path.strip("/")

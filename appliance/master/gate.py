@@ -1,0 +1,183 @@
+"""The one decision point: the policy first, then the binding of claims to hosts, then the limits per host.
+
+`Gate.decide` is a function of the running policy and the registry; it forwards nothing and records nothing. A
+question that only the network can answer (is the node that holds this name still there?) is returned as
+`Contest`, and asked again with the answer.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.master.arguments import ApiUri
+from appliance.master.call import Call, Caller, Identity, Touch
+from appliance.master.registry import Incarnation, Life, Registry
+from appliance.policy import Policy
+from appliance.policy.model import Category, Decision, Request, Rule
+from appliance.ros.names import resolve_parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """Another host holds the name; the call is granted only if its node is gone. `decision` is then the answer."""
+
+    holder: Incarnation
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True)
+class HostLimits:
+    """How much of the registry one host may take."""
+
+    nodes: int = 500
+    registrations: int = 5000
+
+
+class Gate:
+    """Decides calls by the policy that `policy()` returns at that moment.
+
+    `is_namespace(key)` says whether a parameter holds others.
+    """
+
+    def __init__(
+        self,
+        policy: Callable[[], Policy],
+        registry: Registry,
+        limits: HostLimits,
+        *,
+        is_namespace: Callable[[str], bool],
+    ) -> None:
+        self._policy = policy
+        self._registry = registry
+        self._limits = limits
+        self._is_namespace = is_namespace
+
+    def asked(self, call: Call, arguments: tuple[object, ...]) -> tuple[Category, str]:
+        """The category and resource that a call is decided and recorded under."""
+        if call.resource is None:
+            return Category.COMMAND, call.command or call.name
+        return call.category, str(arguments[call.resource])
+
+    def decide(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | Contest:
+        """Whether `caller` may make this call with these canonical arguments."""
+        if caller.own:
+            return Decision(True, None, "the appliance's own node")
+        decision = self._by_policy(caller, call, arguments)
+        if not decision.allowed:
+            return decision
+        if call.identity is Identity.NOBODY or not caller.caller_id:
+            return decision
+        denial = self._late(caller, call, arguments) or self._over_limit(caller, call, arguments)
+        if denial is not None:
+            return denial
+        return self._bound(caller, call, decision)
+
+    def may(self, request: Request) -> Decision:
+        """Decide one plain question (used when what is live is decided again)."""
+        return self._policy().decide(request)
+
+    def may_be_node(self, request: Request) -> Decision:
+        """Decide a question about something a node has: its category, then `[Nodes]` for its name."""
+        policy = self._policy()
+        decision = policy.decide(request)
+        if not decision.allowed:
+            return decision
+        return _both(decision, policy.decide(_node_request(request)))
+
+    # --- the policy ---
+
+    def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision:
+        policy = self._policy()
+        host, caller_id = caller.peer.host, caller.caller_id
+        category, resource = self.asked(call, arguments)
+        decision = policy.decide(Request(host, caller_id, category, resource))
+        if decision.allowed and category is not Category.COMMAND and call.command is not None:
+            decision = _both(
+                decision, policy.decide(Request(host, caller_id, Category.COMMAND, call.command))
+            )
+        if decision.allowed and call.extension is not None:
+            extension, index = call.extension
+            if policy.has_section(extension):
+                decision = _both(
+                    decision, policy.decide(Request(host, caller_id, extension, str(arguments[index])))
+                )
+        if decision.allowed and call.touches is not None and policy.has_section(Category.READ):
+            decision = _both(decision, self._parameter(policy, caller, call.touches, arguments))
+        if decision.allowed and call.identity is Identity.NODE:
+            decision = _both(decision, policy.decide(Request(host, caller_id, Category.NODE, caller_id)))
+        return decision
+
+    def _parameter(
+        self, policy: Policy, caller: Caller, touches: Touch, arguments: tuple[object, ...]
+    ) -> Decision:
+        category = Category.READ if touches is Touch.READ else Category.WRITE
+        key = str(arguments[-1] if touches is Touch.READ else arguments[0])
+        resolved = resolve_parameter(key, caller.caller_id)
+        return policy.decide_parameter(
+            Request(caller.peer.host, caller.caller_id, category, resolved), subtree=True
+        )
+
+    # --- the binding of claims ---
+
+    def _late(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        if call.api is None:
+            return None
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        known = self._registry.find(caller.caller_id, caller.peer.host, api.text)
+        if known is not None and known.life is Life.REPLACED:
+            return _no(
+                f"this call is late: the node {known.name} at {api.text} was replaced by another of its name"
+            )
+        return None
+
+    def _bound(self, caller: Caller, call: Call, decision: Decision) -> Decision | Contest:
+        holder = self._registry.holder(caller.caller_id)
+        if holder is None or holder.host == caller.peer.host:
+            return decision
+        if holder.own:
+            return _no(f"the name {holder.name} belongs to the appliance")
+        if call.identity is Identity.NODE and call.name.startswith("register"):
+            if self._policy().takeover == "granted":
+                return decision
+            return Contest(holder, decision)
+        return _no(f"{caller.caller_id} is held by {holder.host}; {caller.peer.host} cannot speak for it")
+
+    # --- limits ---
+
+    def _over_limit(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        if call.api is None or call.name.startswith("un"):
+            return None
+        host = caller.peer.host
+        if self._registry.registrations_of(host) >= self._limits.registrations:
+            return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        if (
+            self._registry.nodes_of(host) >= self._limits.nodes
+            and self._registry.find(caller.caller_id, host, api.text) is None
+        ):
+            return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
+        return None
+
+
+def contested(contest: Contest, gone: bool) -> Decision:
+    """The decision of a contest, once it is known whether the holder's node is gone."""
+    if gone:
+        return contest.decision
+    return _no(
+        f"{contest.holder.name} is held by a running node on {contest.holder.host}; another host may take the name "
+        "over once that node is gone (or at once with [Options] takeover = granted)"
+    )
+
+
+def _both(first: Decision, second: Decision) -> Decision:
+    """Both must allow; the one that denies (or would) is the answer, else the first."""
+    return second if not second.allowed or (second.would_deny and not first.would_deny) else first
+
+
+def _no(reason: str, rule: Rule | None = None) -> Decision:
+    return Decision(False, rule, reason)
+
+
+def _node_request(request: Request) -> Request:
+    return Request(request.host, request.caller_id, Category.NODE, request.caller_id)

@@ -1,0 +1,188 @@
+"""A change of the registry and what follows from it: who is told, what the relay carries, what is recorded.
+
+Every way in which the graph changes is a verb here, so that no change can happen without its consequences. The
+lists of publishers that subscribers get are made from the registry at the moment of the change, never from what
+ROSMaster's notification threads say later: a list that is partial (while ROSMaster is rebuilt) or out of date
+never reaches a node.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+
+from appliance.audit.record import Severity
+from appliance.master.delivery import Delivery, NodeCall
+from appliance.master.recorder import Recorder
+from appliance.master.registry import Incarnation, Kind, Registration, Registry
+from appliance.master.relays import RelayControl
+from appliance.policy.model import Decision
+
+
+class Graph:
+    """The verbs. `closed(incarnation)` is told when an incarnation's faces are to be closed."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        relay: RelayControl,
+        delivery: Delivery,
+        recorder: Recorder,
+        *,
+        closed: Callable[[Incarnation], None],
+    ) -> None:
+        self._registry = registry
+        self._relay = relay
+        self._delivery = delivery
+        self._recorder = recorder
+        self._closed = closed
+
+    def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
+        """ROSMaster took a registration."""
+        holder = self._registry.holder(incarnation.name)
+        if holder is not None and holder is not incarnation:
+            self.replaced(holder, incarnation)
+        if kind is Kind.SERVICE:
+            for provider in list(self._registry.registered(Kind.SERVICE, resource)):
+                if provider is not incarnation:  # ROSMaster keeps one provider of a service: the last
+                    self.unregistered(provider, Kind.SERVICE, resource)
+        new = (kind, resource) not in incarnation.registrations
+        self._registry.register(incarnation, kind, resource, detail)
+        self._relay.placed(incarnation, kind, resource, detail)
+        if kind is Kind.PUBLICATION:
+            self.tell(resource)
+        if new:
+            self._record(
+                "registered", incarnation, kind, resource, f"{incarnation.name} registered {resource}"
+            )
+
+    def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        """A registration is gone at ROSMaster."""
+        if not self._registry.unregister(incarnation, kind, resource):
+            return
+        self._relay.withdrawn(incarnation, kind, resource)
+        if kind is Kind.PUBLICATION:
+            self.tell(resource)
+        elif kind is Kind.SUBSCRIPTION:
+            incarnation.told_lists.pop(resource, None)
+            self._relay.revoke_subscriber(incarnation.host, incarnation.name, resource)
+        self._record(
+            "unregistered", incarnation, kind, resource, f"{incarnation.name} unregistered {resource}"
+        )
+
+    def revoked(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> None:
+        """The policy no longer allows a registration; it is gone at ROSMaster."""
+        self._recorder.happened(
+            "revoked",
+            decision.reason,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=str(incarnation.host),
+            caller_id=incarnation.name,
+            category=registration.kind.value,
+            resource=registration.resource,
+            rule=decision.rule,
+        )
+        self.unregistered(incarnation, registration.kind, registration.resource)
+        if registration.kind is Kind.SUBSCRIPTION:
+            # Neither client library drops a publisher for anything but a list without it.
+            self._delivery.push(incarnation, NodeCall("publisherUpdate", (registration.resource, [])))
+
+    def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
+        """Another incarnation took the name; ROSMaster tells the old one to shut down."""
+        lost = self._registry.replace(incarnation, time.time())
+        self._withdraw(incarnation, lost)
+        self._relay.forgotten(incarnation)
+        self._closed(incarnation)
+        other = by.host != incarnation.host
+        self._recorder.happened(
+            "takeover" if other else "replaced",
+            f"{by.name} of {by.host} took the place of the one of {incarnation.host}",
+            severity=Severity.NOTICE if other else Severity.INFO,
+            host=str(by.host),
+            caller_id=by.name,
+            category="node",
+            resource=by.name,
+        )
+
+    def lost(self, incarnation: Incarnation, why: str) -> None:
+        """The node does not answer any more: what it had counts for nobody until it returns."""
+        lost = self._registry.overshadow(incarnation, time.time())
+        self._withdraw(incarnation, lost)
+        self._relay.node_withdrawn(incarnation)
+        self._delivery.drop(incarnation)
+        self._recorder.happened(
+            "node lost",
+            why,
+            severity=Severity.NOTICE,
+            host=str(incarnation.host),
+            caller_id=incarnation.name,
+            category="node",
+            resource=incarnation.name,
+        )
+
+    def returned(self, incarnation: Incarnation) -> list[Registration]:
+        """A lost node answers again; what it had, in order, to be put back at ROSMaster."""
+        registrations = self._registry.revive(incarnation, time.time())
+        self._relay.node_returned(incarnation)
+        for registration in registrations:
+            if registration.kind is Kind.PUBLICATION:
+                self.tell(registration.resource)
+            elif registration.kind is Kind.SUBSCRIPTION:
+                self._tell_one(incarnation, registration.resource, always=True)
+        self._recorder.happened(
+            "node returned",
+            f"{incarnation.name} answers again",
+            host=str(incarnation.host),
+            caller_id=incarnation.name,
+            category="node",
+            resource=incarnation.name,
+        )
+        return registrations
+
+    def forgotten(self, incarnation: Incarnation) -> None:
+        """An incarnation is dropped for good."""
+        registrations = list(incarnation.registrations.values())
+        self._registry.forget(incarnation)
+        self._withdraw(incarnation, registrations)
+        self._relay.forgotten(incarnation)
+        self._delivery.drop(incarnation)
+        self._closed(incarnation)
+
+    # --- what subscribers are told ---
+
+    def tell(self, topic: str, *, always: bool = False) -> None:
+        """Give every subscriber of a topic its list, if it has another one (or `always`)."""
+        for subscriber in list(self._registry.registered(Kind.SUBSCRIPTION, topic)):
+            self._tell_one(subscriber, topic, always=always)
+
+    def tell_everybody(self) -> None:
+        """Give every subscriber the lists of all its topics, once: after a rebuild or a new relay."""
+        topics = {one.resource for _node, one in self._registry.in_order() if one.kind is Kind.SUBSCRIPTION}
+        for topic in sorted(topics):
+            self.tell(topic, always=True)
+
+    def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
+        """The list that answers a registration: what the subscriber is told from here on is relative to it."""
+        uris = self._registry.publishers_for(subscriber, topic)
+        subscriber.told_lists[topic] = uris
+        return list(uris)
+
+    def _tell_one(self, subscriber: Incarnation, topic: str, *, always: bool) -> None:
+        uris = self._registry.publishers_for(subscriber, topic)
+        if always or subscriber.told_lists.get(topic) != uris:
+            subscriber.told_lists[topic] = uris
+            self._delivery.push(subscriber, NodeCall("publisherUpdate", (topic, list(uris))))
+
+    def _withdraw(self, incarnation: Incarnation, registrations: Iterable[Registration]) -> None:
+        for registration in registrations:
+            if registration.kind is Kind.PUBLICATION:
+                self.tell(registration.resource)
+
+    def _record(self, event: str, incarnation: Incarnation, kind: Kind, resource: str, reason: str) -> None:
+        self._recorder.happened(
+            event,
+            reason,
+            host=str(incarnation.host),
+            caller_id=incarnation.name,
+            category=kind.value,
+            resource=resource,
+        )

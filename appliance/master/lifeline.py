@@ -1,0 +1,111 @@
+"""Control's end of its lifeline: what the supervisor tells it, and what it asks of the supervisor."""
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import structlog
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.master.admin import Surroundings
+
+_log = structlog.get_logger()
+
+
+class ControlLifeline:
+    """The lifeline; `links[role]` is called with each new link, `stopped()` when control is to end."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
+        self.surroundings = Surroundings()
+        self.sockets: dict[str, socket.socket] = {}
+        self.restored = asyncio.Event()
+        self.links: dict[str, Callable[[int], None]] = {}
+        self.stopped: Callable[[], None] = lambda: None
+        self.processes_changed: Callable[[], None] = lambda: None
+        self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
+        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
+        self._early_links: list[tuple[str, int]] = []
+
+    def attach(self) -> None:
+        """Begin to listen; `restored` is set when all kept sockets are here."""
+        self._channel.attach(asyncio.get_running_loop(), self._received, self._closed)
+
+    def open_links(self) -> None:
+        """Hand out the links that came before control was ready for them."""
+        early, self._early_links = self._early_links, []
+        for role, descriptor in early:
+            self._open_link(role, descriptor)
+
+    def say(self, message: messages.Message) -> None:
+        """Tell the supervisor something."""
+        self._send(message, ())
+
+    def keep(self, name: str, sock: socket.socket) -> None:
+        """Have the supervisor keep a listening socket over our death."""
+        self._send(messages.SocketKept(name), (sock.fileno(),))
+
+    def drop(self, name: str) -> None:
+        """A kept socket is needed no longer."""
+        self.say(messages.SocketDropped(name))
+
+    async def route_to(self, host: str) -> str | None:
+        """The machine's address that `host` reaches the appliance at; None: the one it used."""
+        future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
+        self._routes.setdefault(host, []).append(future)
+        self.say(messages.RouteWanted(host))
+        return await future
+
+    def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
+        try:
+            self._channel.send(message, descriptors)
+        except ChannelClosedError:
+            self._closed()
+
+    def _closed(self) -> None:
+        _log.warning("the supervisor is gone")
+        self.stopped()
+
+    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case messages.Ping(number):
+                self.say(messages.Pong(number))
+            case messages.Stop():
+                self.stopped()
+            case messages.SocketRestored(name):
+                self.sockets[name] = socket.socket(fileno=descriptors[0])
+            case messages.SocketsRestored():
+                self.restored.set()
+            case messages.LinkOpened(role):
+                self._open_link(role, descriptors[0])
+            case messages.ProcessesChanged(processes):
+                self.surroundings.processes = processes
+                self.processes_changed()
+            case messages.FirewallReported():
+                self.surroundings.firewall = message
+            case messages.ProbeFailed(reason):
+                self.surroundings.probe = reason
+                self.probed(reason)
+            case messages.ProbePassed():
+                self.surroundings.probe = "passed"
+                self.probed("")
+            case messages.RouteFound(host, address):
+                for future in self._routes.pop(host, ()):
+                    if not future.done():
+                        future.set_result(address)
+            case _:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+                _log.error(
+                    "the supervisor said something that is not for control", message=type(message).__name__
+                )
+
+    def _open_link(self, role: str, descriptor: int) -> None:
+        serve = self.links.get(role)
+        if serve is not None:
+            serve(descriptor)
+        else:
+            self._early_links.append((role, descriptor))

@@ -1,0 +1,151 @@
+"""Which nodes are still there: looked at every few seconds, and at once when something of a node breaks.
+
+A node whose API refuses connections (twice in a row), cannot be reached or does not answer for `silent` seconds is
+*lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations kept as a shadow. A shadow whose API
+answers again gets them back, because a ROS 1 node never registers twice.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+import structlog
+
+from appliance.master.client import CallFailedError, RefusedError, XmlRpcClient
+from appliance.master.graph import Graph
+from appliance.master.registry import Incarnation, Life, Registration, Registry
+from appliance.master.relays import RELAY_NAME
+from appliance.ros.xmlrpc import Limits
+
+_log = structlog.get_logger()
+_AT_ONCE = 64  # nodes asked at the same time
+_REPLACED_SECONDS = 60.0
+_LOOK_AGAIN_SECONDS = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class LivenessSettings:
+    """Seconds: between looks, without an answer until lost, as a shadow until forgotten, for one call."""
+
+    interval: float = 5.0
+    silent: float = 20.0
+    shadow: float = 600.0
+    call: float = 3.0
+
+
+class Liveness:
+    """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        graph: Graph,
+        settings: LivenessSettings,
+        limits: Limits,
+        *,
+        withdraw: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+    ) -> None:
+        self._registry = registry
+        self._graph = graph
+        self._settings = settings
+        self._limits = limits
+        self._withdraw = withdraw
+        self._put_back = put_back
+        self._answered: dict[str, float] = {}
+        self._looks: dict[str, asyncio.Task[None]] = {}
+        self._slots = asyncio.Semaphore(_AT_ONCE)
+
+    def client(self, incarnation: Incarnation) -> XmlRpcClient:
+        """A client that calls the node at its peer address."""
+        return XmlRpcClient(incarnation.call_uri, timeout=self._settings.call, limits=self._limits)
+
+    async def run(self) -> None:
+        """Look at every incarnation every `interval` seconds, until cancelled."""
+        while True:
+            await asyncio.sleep(self._settings.interval)
+            for incarnation in self._registry.all():
+                self.look_at(incarnation)
+
+    def look_at(self, incarnation: Incarnation) -> None:
+        """Look at a node now (unless it is being looked at)."""
+        if incarnation.key not in self._looks:
+            task = asyncio.get_running_loop().create_task(self._look(incarnation))
+            self._looks[incarnation.key] = task
+            task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
+
+    async def is_gone(self, incarnation: Incarnation) -> bool:
+        """Whether the node refuses connections or cannot be reached, asked now."""
+        try:
+            await self.client(incarnation).call("getPid", RELAY_NAME)
+        except RefusedError:
+            return True
+        except CallFailedError:
+            return False
+        return False
+
+    async def _look(self, incarnation: Incarnation) -> None:
+        async with self._slots:
+            there, why = await self._ask(incarnation)
+        if self._registry.by_key(incarnation.key) is not incarnation:
+            return
+        now = time.monotonic()
+        since = self._answered.setdefault(incarnation.key, now)
+        if there:
+            self._answered[incarnation.key] = now
+        if incarnation.life is Life.LIVE:
+            refused = there is None
+            if refused or (not there and now - since >= self._settings.silent):
+                await self._lose(incarnation, why)
+        else:
+            await self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
+
+    async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
+        """Whether it answers: True, False, or None when it refuses connections; and why."""
+        for attempt in (1, 2):
+            try:
+                await self.client(incarnation).call("getPid", RELAY_NAME)
+            except RefusedError as error:
+                if attempt == 2:
+                    return None, f"{incarnation.name}: {error}"
+                await asyncio.sleep(_LOOK_AGAIN_SECONDS)
+            except CallFailedError as error:
+                return False, f"{incarnation.name}: {error}"
+            else:
+                return True, ""
+        return False, ""
+
+    async def _lose(self, incarnation: Incarnation, why: str) -> None:
+        if not incarnation.registrations:
+            self._forget(incarnation)
+            return
+        registrations = list(incarnation.registrations.values())
+        self._graph.lost(incarnation, why)
+        await self._tell(self._withdraw, incarnation, registrations)
+
+    async def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
+        age = time.time() - incarnation.changed
+        if incarnation.life is Life.REPLACED:
+            if refused or age > _REPLACED_SECONDS:
+                self._forget(incarnation)
+        elif age > self._settings.shadow:
+            self._forget(incarnation)
+        elif answered and self._registry.holder(incarnation.name) is None:
+            registrations = self._graph.returned(incarnation)
+            await self._tell(self._put_back, incarnation, registrations)
+
+    async def _tell(
+        self,
+        tell: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        incarnation: Incarnation,
+        registrations: list[Registration],
+    ) -> None:
+        try:
+            await tell(incarnation, registrations)
+        except CallFailedError as error:
+            _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
+
+    def _forget(self, incarnation: Incarnation) -> None:
+        self._answered.pop(incarnation.key, None)
+        self._graph.forgotten(incarnation)

@@ -1,0 +1,68 @@
+"""The calls that ask about the graph, and RVMaster's own."""
+
+import os
+from typing import TYPE_CHECKING
+
+from appliance.master.call import Answer, Caller
+from appliance.master.registration import key_of_stand_in
+from appliance.ros.uris import node_uri, service_uri
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+
+async def lookup_node(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`lookupNode(caller_id, node_name)` → the node's outer URI."""
+    answer = await master.rosmaster.call("lookupNode", caller.caller_id, str(arguments[0]))
+    if answer[0] == 1:
+        incarnation = master.faces.by_inner_uri(str(answer[2]))
+        if incarnation is None:
+            return [-1, f"unknown node [{arguments[0]}]", ""]
+        answer[2] = incarnation.outer_uri(master.addresses.told_to(caller.peer))
+    return answer
+
+
+async def lookup_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`lookupService(caller_id, service)` → the relay's port for it; the caller's host may then call it."""
+    service = str(arguments[0])
+    answer = await master.rosmaster.call("lookupService", caller.caller_id, service)
+    if answer[0] == 1:
+        incarnation = master.registry.by_key(key_of_stand_in(str(answer[2])))
+        if incarnation is None:
+            return [-1, "no provider", ""]
+        master.relay.grant_service(incarnation, service, caller.peer.host)
+        uri = service_uri(master.addresses.told_to(caller.peer), incarnation.relay_port)
+        answer[1], answer[2] = f"rosrpc URI: [{uri}]", uri
+    return answer
+
+
+async def get_system_state(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getSystemState(caller_id)` → `[publishers, subscribers, services]`."""
+    return await master.rosmaster.call("getSystemState", caller.caller_id)
+
+
+async def get_published_topics(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`getPublishedTopics(caller_id, subgraph)`."""
+    return await master.rosmaster.call("getPublishedTopics", caller.caller_id, str(arguments[0]))
+
+
+async def get_topic_types(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getTopicTypes(caller_id)`."""
+    return await master.rosmaster.call("getTopicTypes", caller.caller_id)
+
+
+async def get_uri(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getUri(caller_id)` → RVMaster's own, at the address the caller knows it by."""
+    return [1, "", node_uri(master.addresses.told_to(caller.peer), master.port)]
+
+
+async def get_pid(_master: "Master", _caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getPid(caller_id)` → RVMaster's own."""
+    return [1, "", os.getpid()]
+
+
+async def shutdown_master(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`shutdown(caller_id, msg)`: ends the appliance, as it would end `roscore`."""
+    message = str(arguments[0]) if arguments else ""
+    master.stop(f"{caller.caller_id} on {caller.peer.text} called shutdown: {message}")
+    return [1, "shutdown", 0]

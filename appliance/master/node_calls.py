@@ -1,0 +1,165 @@
+"""The outer face: the node API that other nodes and tools call, answered as if the appliance were not there.
+
+`caller.target` is the incarnation the call is for. Only `getPid` and `shutdown` are carried to the node; the rest is
+answered from the registry and the relay. `publisherUpdate` and `paramUpdate` are not in the table: only a master
+sends those, so from anybody else they are denied like any unknown call.
+"""
+
+from typing import TYPE_CHECKING, cast
+
+from appliance.master.arguments import MESSAGE, PROTOCOLS, TOPIC
+from appliance.master.call import Answer, Call, Caller, Identity
+from appliance.master.client import CallFailedError
+from appliance.master.registry import Incarnation, Kind
+from appliance.master.relays import TOPIC as TOPIC_CONNECTION
+from appliance.policy.model import Category
+from appliance.ros.uris import node_uri
+from appliance.ros.xmlrpc import Value
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+
+async def request_topic(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`requestTopic(caller_id, topic, protocols)` → the relay's port; the grant is installed first."""
+    target = _target(caller)
+    topic, protocols = str(arguments[0]), cast(list[Value], arguments[1])
+    if (Kind.PUBLICATION, topic) not in target.registrations:
+        return [0, f"{target.name} is not a publisher of [{topic}]", []]
+    names = [one[0] for one in protocols if isinstance(one, list) and one]
+    if "TCPROS" not in names:
+        offered = ", ".join(str(one)[:40] for one in names) or "nothing"
+        return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
+    master.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
+    address = master.addresses.told_to(caller.peer)
+    return [1, f"ready on {address}:{target.relay_port}", ["TCPROS", address, target.relay_port]]
+
+
+async def get_pid(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getPid(caller_id)`: asked of the node."""
+    try:
+        answer = await master.liveness.client(_target(caller)).call("getPid", caller.caller_id)
+    except CallFailedError as error:
+        master.liveness.look_at(_target(caller))
+        return [0, str(error) if caller.own else f"{_target(caller).name} does not answer", -1]
+    if isinstance(answer, list) and len(answer) == 3:
+        return answer
+    return [0, f"{_target(caller).name} answered with something that is not [code, message, pid]", -1]
+
+
+async def shutdown(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`shutdown(caller_id, msg)`: carried to the node, which often dies before it answers."""
+    target = _target(caller)
+    message = str(arguments[0]) if arguments else ""
+    try:
+        await master.liveness.client(target).call("shutdown", caller.caller_id, message)
+    except CallFailedError:
+        master.liveness.look_at(target)
+    return [1, "shutdown", 0]
+
+
+async def get_name(_master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getName(caller_id)`."""
+    return [1, "node name", _target(caller).name]
+
+
+async def get_uri(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getUri(caller_id)` → the outer URI."""
+    return [1, "", _target(caller).outer_uri(master.addresses.told_to(caller.peer))]
+
+
+async def get_master_uri(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getMasterUri(caller_id)` → RVMaster's."""
+    uri = node_uri(master.addresses.told_to(caller.peer), master.port)
+    return [1, uri, uri]
+
+
+async def get_subscriptions(_master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getSubscriptions(caller_id)` → `[[topic, type], …]`."""
+    return [1, "subscriptions", _typed(_target(caller), Kind.SUBSCRIPTION)]
+
+
+async def get_publications(_master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getPublications(caller_id)` → `[[topic, type], …]`."""
+    return [1, "publications", _typed(_target(caller), Kind.PUBLICATION)]
+
+
+async def get_bus_info(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getBusInfo(caller_id)` → `[[id, other end, direction, transport, topic, connected, text], …]`."""
+    target, address = _target(caller), master.addresses.told_to(caller.peer)
+    rows: list[Value] = []
+    for connection in master.relay.connections.values():
+        if connection.kind != TOPIC_CONNECTION:
+            continue
+        if connection.key == target.key:
+            text = f"TCPROS connection on port {target.relay_port} to [{connection.host}]"
+            rows.append(
+                [connection.number, connection.caller_id, "o", "TCPROS", connection.resource, True, text]
+            )
+        if connection.caller_id == target.name and connection.host == str(target.host):
+            publisher = master.registry.by_key(connection.key)
+            if publisher is not None:
+                uri = publisher.outer_uri(address)
+                text = f"TCPROS connection to [{address}:{publisher.relay_port}]"
+                rows.append([connection.number, uri, "i", "TCPROS", connection.resource, True, text])
+    return [1, "bus info", rows]
+
+
+async def get_bus_stats(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getBusStats(caller_id)` → `[publications, subscriptions, services]`, from the relay's counters."""
+    target = _target(caller)
+    connections = [one for one in master.relay.connections.values() if one.kind == TOPIC_CONNECTION]
+    published: list[Value] = []
+    for topic in target.resources(Kind.PUBLICATION):
+        traffic = master.relay.traffic.get((target.key, topic))
+        size, count = (traffic.bytes, traffic.messages) if traffic is not None else (0, 0)
+        rows: list[Value] = [
+            [one.number, size, count, True]
+            for one in connections
+            if one.key == target.key and one.resource == topic
+        ]
+        published.append([topic, size, rows])
+    subscribed: list[Value] = []
+    for topic in target.resources(Kind.SUBSCRIPTION):
+        rows = []
+        for one in connections:
+            if one.resource == topic and one.caller_id == target.name and one.host == str(target.host):
+                traffic = master.relay.traffic.get((one.key, topic))
+                rows.append([one.number, traffic.bytes if traffic is not None else 0, -1, True])
+        subscribed.append([topic, rows])
+    return [1, "bus stats", [published, subscribed, []]]
+
+
+def _target(caller: Caller) -> Incarnation:
+    if caller.target is None:
+        raise RuntimeError("a call of the node API was made without a target")
+    return caller.target
+
+
+def _typed(target: Incarnation, kind: Kind) -> list[Value]:
+    return [[one.resource, one.detail] for one in target.registrations.values() if one.kind is kind]
+
+
+NODE_CALLS: dict[str, Call] = {
+    call.name: call
+    for call in (
+        Call(
+            "requestTopic",
+            request_topic,
+            (TOPIC, PROTOCOLS),
+            denial=[],
+            identity=Identity.NODE,
+            category=Category.SUBSCRIBE,
+            resource=0,
+        ),
+        Call("getPid", get_pid, denial=-1, reads=True),
+        Call("shutdown", shutdown, (MESSAGE,), optional=1),
+        Call("getName", get_name, denial="", reads=True),
+        Call("getUri", get_uri, denial="", reads=True),
+        Call("getMasterUri", get_master_uri, denial="", reads=True),
+        Call("getSubscriptions", get_subscriptions, denial=[], reads=True),
+        Call("getPublications", get_publications, denial=[], reads=True),
+        Call("getBusInfo", get_bus_info, denial=[], reads=True),
+        Call("getBusStats", get_bus_stats, denial=[[], [], []], reads=True),
+    )
+}

@@ -1,0 +1,153 @@
+"""The parameter calls, and the mirror of ROSMaster's parameter tree that survives its death.
+
+The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
+
+from appliance.master.arguments import ApiUri
+from appliance.master.call import Answer, Caller
+from appliance.master.registry import Kind
+from appliance.policy.model import Category, Request
+from appliance.ros.xmlrpc import Value
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+Tree = dict[str, Value]
+
+
+class ParameterMirror:
+    """A copy of ROSMaster's parameter tree; `changed()` hears of every change."""
+
+    def __init__(self, tree: Tree, changed: Callable[[], None]) -> None:
+        self.tree = tree
+        self._changed = changed
+
+    def is_namespace(self, key: str) -> bool:
+        """Whether `key` (canonical) holds other keys."""
+        node: Value = self.tree
+        for part in key.split("/"):
+            if part:
+                if not isinstance(node, dict) or part not in node:
+                    return False
+                node = node[part]
+        return isinstance(node, dict)
+
+    def replace(self, tree: Tree) -> None:
+        """Take the tree that ROSMaster has."""
+        self.tree = tree
+        self._changed()
+
+    def set(self, key: str, value: Value) -> None:
+        """`key` (canonical) has this value; a dictionary replaces the namespace."""
+        parts = [part for part in key.split("/") if part]
+        value = copy.deepcopy(value)
+        if not parts:
+            self.tree = cast(Tree, value)
+        else:
+            node = self.tree
+            for part in parts[:-1]:
+                below = node.get(part)
+                if not isinstance(below, dict):
+                    below = node[part] = {}
+                node = below
+            node[parts[-1]] = value
+        self._changed()
+
+    def delete(self, key: str) -> None:
+        """`key` (canonical) is gone."""
+        parts = [part for part in key.split("/") if part]
+        node: Value = self.tree
+        for part in parts[:-1]:
+            if not isinstance(node, dict):
+                return
+            node = node.get(part)
+        if parts and isinstance(node, dict):
+            node.pop(parts[-1], None)
+            self._changed()
+
+
+async def get_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`getParam(caller_id, key)`."""
+    return await master.rosmaster.call("getParam", caller.caller_id, str(arguments[0]))
+
+
+async def has_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`hasParam(caller_id, key)`."""
+    return await master.rosmaster.call("hasParam", caller.caller_id, str(arguments[0]))
+
+
+async def set_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`setParam(caller_id, key, value)`."""
+    key, value = str(arguments[0]), cast(Value, arguments[1])
+    answer = await master.rosmaster.call("setParam", caller.caller_id, key, value)
+    if answer[0] == 1:
+        master.parameters.set(key, value)
+    return answer
+
+
+async def delete_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`deleteParam(caller_id, key)`."""
+    key = str(arguments[0])
+    answer = await master.rosmaster.call("deleteParam", caller.caller_id, key)
+    if answer[0] == 1:
+        master.parameters.delete(key)
+    return answer
+
+
+async def search_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`searchParam(caller_id, key)`: the name that is found must be one the host may read."""
+    answer = await master.rosmaster.call("searchParam", caller.caller_id, str(arguments[0]))
+    policy = master.policy()
+    if answer[0] == 1 and isinstance(answer[2], str) and policy.has_section(Category.READ) and not caller.own:
+        request = Request(caller.peer.host, caller.caller_id, Category.READ, answer[2])
+        decision = policy.decide(request)
+        if not decision.allowed:
+            master.recorder.decided(caller, "searchParam", Category.READ.value, answer[2], decision)
+            return [0, decision.reason, ""]
+    return answer
+
+
+async def get_param_names(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
+    """`getParamNames(caller_id)`: those that the host may read."""
+    answer = await master.rosmaster.call("getParamNames", caller.caller_id)
+    policy = master.policy()
+    if (
+        answer[0] == 1
+        and isinstance(answer[2], list)
+        and policy.has_section(Category.READ)
+        and not caller.own
+    ):
+        host, caller_id = caller.peer.host, caller.caller_id
+        answer[2] = [
+            name
+            for name in answer[2]
+            if isinstance(name, str) and policy.decide(Request(host, caller_id, Category.READ, name)).allowed
+        ]
+    return answer
+
+
+async def subscribe_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`subscribeParam(caller_id, caller_api, key)`."""
+    api, key = cast(ApiUri, arguments[0]), str(arguments[1])
+    incarnation = await master.faces.incarnation_for(caller, api)
+    answer = await master.rosmaster.call(
+        "subscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
+    )
+    if answer[0] == 1:
+        master.graph.registered(incarnation, Kind.PARAMETER, key, "")
+    return answer
+
+
+async def unsubscribe_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`unsubscribeParam(caller_id, caller_api, key)`."""
+    api, key = cast(ApiUri, arguments[0]), str(arguments[1])
+    incarnation = master.faces.known(caller, api)
+    inner = master.faces.inner_uri(incarnation) if incarnation is not None else master.faces.nobody()
+    answer = await master.rosmaster.call("unsubscribeParam", caller.caller_id, inner, key)
+    if answer[0] == 1 and incarnation is not None:
+        master.graph.unregistered(incarnation, Kind.PARAMETER, key)
+    return answer

@@ -1,0 +1,193 @@
+"""The way of a request, stage by stage: parse → canonicalise → decide → record → perform → answer.
+
+The same stages serve the Master API and the outer faces, with another table of calls. What goes wrong on the way is
+an answer of the right shape for the caller, and a record; never an exception for anybody else.
+"""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.master.arguments import canonicalise
+from appliance.master.call import Answer, Call, Caller, Identity
+from appliance.master.client import CallFailedError
+from appliance.master.gate import Contest, contested
+from appliance.master.http import Handler, HttpRequest
+from appliance.master.places import NoPortError
+from appliance.master.registry import Incarnation
+from appliance.policy.model import Category, Decision
+from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
+from appliance.ros.names import check_caller_id
+from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+_log = structlog.get_logger()
+_PARSE_FAULT, _LIMIT_FAULT, _INTERNAL_FAULT = -32700, -32600, -32603
+
+
+class Pipeline:
+    """Serves requests by a table of calls. Bodies over `offload` bytes are parsed in a thread."""
+
+    def __init__(self, master: "Master", *, limits: Limits, offload: int) -> None:
+        self._master = master
+        self._limits = limits
+        self._offload = offload
+
+    def handler(
+        self, calls: Mapping[str, Call], *, own: bool = False, target: Incarnation | None = None
+    ) -> Handler:
+        """The handler of one listener: its table, whether it is for the appliance's own nodes, and its target."""
+
+        async def handle(request: HttpRequest) -> bytes:
+            await self._master.addresses.learn(request.peer)
+            caller = Caller(request.peer, "", request.arrived, own=own, target=target)
+            return await self._serve(calls, caller, request.body)
+
+        return handle
+
+    # --- parse, and write the answer ---
+
+    async def _serve(self, calls: Mapping[str, Call], caller: Caller, body: bytes) -> bytes:
+        try:
+            if len(body) > self._offload:
+                method_call = await asyncio.to_thread(parse_call, body, self._limits)
+            else:
+                method_call = parse_call(body, self._limits)
+        except PeerError as error:
+            return self._not_understood(caller, error)
+        try:
+            answer = await self._answer_all(calls, caller, method_call)
+            return build_response(answer)
+        except EncodingError as error:
+            _log.error("answer cannot be written", call=method_call.method, error=str(error))
+            return build_fault(
+                _INTERNAL_FAULT, f"the answer to {method_call.method} cannot be written: {error}"
+            )
+
+    def _not_understood(self, caller: Caller, error: PeerError) -> bytes:
+        limit = isinstance(error, LimitExceededError)
+        decision = self._master.recorder.happened(
+            "limit exceeded" if limit else "malformed",
+            str(error),
+            severity=Severity.WARNING,
+            decision="deny",
+            host=caller.peer.text,
+        )
+        return build_fault(_LIMIT_FAULT if limit else _PARSE_FAULT, f"{error} [{decision}]")
+
+    # --- one call, or the parts of a multicall ---
+
+    async def _answer_all(self, calls: Mapping[str, Call], caller: Caller, call: MethodCall) -> Value:
+        if call.method != "system.multicall" or caller.target is not None:
+            return await self._answer(calls, caller, call.method, call.params)
+        if len(call.params) != 1 or not isinstance(call.params[0], list):
+            return [-1, "system.multicall takes one list of calls", 0]
+        results: list[Value] = []
+        for part in call.params[0]:
+            match part:
+                case {"methodName": "system.multicall", **_rest}:
+                    results.append(_part_fault("a multicall inside a multicall is not served"))
+                case {"methodName": str(method), "params": list(params), **rest} if not rest:
+                    results.append([await self._answer(calls, caller, method, tuple(params))])
+                case _:
+                    results.append(
+                        _part_fault("a part of a multicall has methodName and params, nothing else")
+                    )
+        return results
+
+    async def _answer(
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+    ) -> Value:
+        call = calls.get(method)
+        if call is None:
+            return self._unknown(caller, method, params)
+        try:
+            caller, arguments = _canonical(call, caller, params)
+        except PeerError as error:
+            return self._malformed(call, caller, params, error)
+        decision = await self._decide(caller, call, arguments)
+        category, resource = self._master.gate.asked(call, arguments)
+        recorder = self._master.recorder
+        record = recorder.decided(caller, method, category.value, resource, decision)
+        if recorder.strict:
+            obstacle = await recorder.durable()
+            if obstacle is not None:
+                return [0, f"denied: the audit log cannot be written: {obstacle}", call.denial]
+        if not decision.allowed:
+            return [0, denial_text(decision, record), call.denial]
+        return await self._perform(call, caller, arguments)
+
+    async def _decide(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision:
+        obstacle = self._master.recorder.obstacle
+        if obstacle is not None:
+            return Decision(False, None, obstacle)
+        outcome = self._master.gate.decide(caller, call, arguments)
+        if isinstance(outcome, Contest):
+            gone = await self._master.liveness.is_gone(outcome.holder)
+            return contested(outcome, gone)
+        return outcome
+
+    async def _perform(self, call: Call, caller: Caller, arguments: tuple[object, ...]) -> Value:
+        try:
+            return await call.perform(self._master, caller, arguments)
+        except NoPortError as error:
+            self._master.recorder.happened(
+                "limit exceeded", str(error), severity=Severity.ALARM, decision="deny", host=caller.peer.text
+            )
+            return [0, str(error), call.denial]
+        except CallFailedError as error:
+            # The text names the hidden ROSMaster's address: it is for our log, not for a node.
+            _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
+            return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
+
+    def _unknown(self, caller: Caller, method: str, params: tuple[Value, ...]) -> Answer:
+        claimed = params[0] if params and isinstance(params[0], str) else ""
+        caller = replace(caller, caller_id=claimed)
+        decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
+        record = self._master.recorder.decided(caller, method, Category.COMMAND.value, method[:200], decision)
+        return [0, denial_text(decision, record), 0]
+
+    def _malformed(self, call: Call, caller: Caller, params: tuple[Value, ...], error: PeerError) -> Answer:
+        claimed = params[0] if params and isinstance(params[0], str) else ""
+        self._master.recorder.happened(
+            "malformed",
+            str(error),
+            severity=Severity.WARNING,
+            decision="deny",
+            host=caller.peer.text,
+            caller_id=claimed,
+            category=call.category.value,
+            resource=call.name,
+            call=call.name,
+        )
+        return [-1, str(error), call.denial]
+
+
+def denial_text(decision: Decision, record: str) -> str:
+    """What a denied caller is told: reason, rule and the id of the record."""
+    return f"{decision.reason} [{decision.rule or 'no rule'}] [{record}]"
+
+
+def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[Caller, tuple[object, ...]]:
+    required = len(call.parameters) - call.optional
+    if call.identity is Identity.NOBODY:
+        return caller, canonicalise(call.parameters, required, "", params)
+    if not params:
+        raise ProtocolError("missing required caller_id parameter")
+    caller_id = params[0]
+    if not isinstance(caller_id, str):
+        raise ProtocolError("caller_id must be a string")
+    if caller_id or not call.reads:
+        check_caller_id(caller_id)
+    caller = replace(caller, caller_id=caller_id)
+    return caller, canonicalise(call.parameters, required, caller_id, params[1:])
+
+
+def _part_fault(text: str) -> dict[str, Value]:
+    return {"faultCode": _PARSE_FAULT, "faultString": text}

@@ -1,0 +1,104 @@
+"""Makes audit records of what happens in control, and says when nothing may be answered because none can be made."""
+
+import time
+from typing import Any
+
+from appliance.audit.ids import IdSource
+from appliance.audit.log import AuditLog
+from appliance.audit.record import Record, RuleReference, Severity
+from appliance.master.call import Caller
+from appliance.policy.model import Decision, Rule
+
+
+class Recorder:
+    """Records decisions and events under the running policy revision.
+
+    `strict`: an answer waits until its record is on disk. `deny_when_failed`: while the log cannot be written,
+    every request is denied.
+    """
+
+    def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
+        self._log = log
+        self._ids = IdSource()
+        self.strict = strict
+        self._deny_when_failed = deny_when_failed
+        self.revision = 0
+
+    @property
+    def obstacle(self) -> str | None:
+        """Why nothing can be granted now (the log cannot be written), or None."""
+        if self._deny_when_failed and self._log.failed is not None:
+            return f"the audit log cannot be written: {self._log.failed}"
+        return None
+
+    async def durable(self) -> str | None:
+        """Wait until everything recorded so far is on disk; why not, when it cannot be and must be."""
+        failure = await self._log.wait_durable()
+        return failure if self._deny_when_failed else None
+
+    def decided(self, caller: Caller, method: str, category: str, resource: str, decision: Decision) -> str:
+        """Record a decision; its id."""
+        record_id = self._ids.next()
+        word = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
+        detail: dict[str, Any] = {"call": method}
+        if caller.target is not None:
+            detail["node"] = caller.target.name
+        self._log.record(
+            Record(
+                id=record_id,
+                time=time.time_ns(),
+                event="decision",
+                severity=Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING,
+                decision=word,
+                host=caller.peer.text,
+                caller_id=caller.caller_id,
+                category=category,
+                resource=resource,
+                rule=rule_reference(decision.rule),
+                revision=self.revision,
+                reason=decision.reason,
+                duration_us=(time.monotonic_ns() - caller.arrived) // 1000,
+                detail=detail,
+            )
+        )
+        return record_id
+
+    def happened(
+        self,
+        event: str,
+        reason: str,
+        *,
+        severity: Severity = Severity.INFO,
+        host: str | None = None,
+        caller_id: str | None = None,
+        category: str | None = None,
+        resource: str | None = None,
+        rule: Rule | None = None,
+        decision: str | None = None,
+        **detail: Any,
+    ) -> str:
+        """Record an event that is no decision; its id."""
+        record_id = self._ids.next()
+        self._log.record(
+            Record(
+                id=record_id,
+                time=time.time_ns(),
+                event=event,
+                severity=severity,
+                decision=decision,
+                host=host,
+                caller_id=caller_id,
+                category=category,
+                resource=resource,
+                rule=rule_reference(rule),
+                revision=self.revision,
+                reason=reason,
+                detail=detail,
+            )
+        )
+        return record_id
+
+
+def rule_reference(rule: Rule | None) -> RuleReference | None:
+    """The policy's rule as a record keeps it."""
+    return None if rule is None else RuleReference(rule.section, rule.key, rule.file, rule.line)

@@ -1,0 +1,121 @@
+"""The calls that make a node part of the graph, or take it out: topics and services."""
+
+from typing import TYPE_CHECKING, cast
+
+from appliance.master.arguments import ApiUri
+from appliance.master.call import Answer, Caller
+from appliance.master.registry import Incarnation, Kind
+from appliance.ros.uris import service_uri
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+
+async def register_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
+    topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
+    incarnation = await master.faces.incarnation_for(caller, api)
+    inner = master.faces.inner_uri(incarnation)
+    answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
+    if answer[0] == 1:
+        master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
+        subscribers = master.registry.registered(Kind.SUBSCRIPTION, topic)
+        answer[2] = [
+            one.api_text if one is incarnation else one.outer_uri(incarnation.told) for one in subscribers
+        ]
+    return answer
+
+
+async def register_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
+    topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
+    incarnation = await master.faces.incarnation_for(caller, api)
+    inner = master.faces.inner_uri(incarnation)
+    answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
+    if answer[0] == 1:
+        master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
+        answer[2] = list(master.graph.list_for(incarnation, topic))
+    return answer
+
+
+async def register_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`registerService(caller_id, service, service_api, caller_api)`."""
+    service, service_api, api = str(arguments[0]), cast(ApiUri, arguments[1]), cast(ApiUri, arguments[2])
+    incarnation = await master.faces.incarnation_for(caller, api)
+    inner = master.faces.inner_uri(incarnation)
+    answer = await master.rosmaster.call(
+        "registerService", caller.caller_id, service, stand_in(incarnation), inner
+    )
+    if answer[0] == 1:
+        master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
+    return answer
+
+
+async def unregister_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`unregisterPublisher(caller_id, topic, caller_api)`."""
+    return await _unregister(master, caller, "unregisterPublisher", Kind.PUBLICATION, arguments)
+
+
+async def unregister_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`unregisterSubscriber(caller_id, topic, caller_api)`."""
+    return await _unregister(master, caller, "unregisterSubscriber", Kind.SUBSCRIPTION, arguments)
+
+
+async def unregister_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
+    """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
+    service, service_api = str(arguments[0]), cast(ApiUri, arguments[1])
+    provider = next(
+        (
+            one
+            for one in master.registry.registered(Kind.SERVICE, service)
+            if one.name == caller.caller_id
+            and one.registrations[Kind.SERVICE, service].detail == str(service_api.uri.port)
+        ),
+        None,
+    )
+    uri = stand_in(provider) if provider is not None else NO_SERVICE
+    answer = await master.rosmaster.call("unregisterService", caller.caller_id, service, uri)
+    if answer[0] == 1 and provider is not None:
+        master.graph.unregistered(provider, Kind.SERVICE, service)
+    return answer
+
+
+async def _unregister(
+    master: "Master", caller: Caller, method: str, kind: Kind, arguments: tuple[object, ...]
+) -> Answer:
+    resource, api = str(arguments[0]), cast(ApiUri, arguments[1])
+    incarnation = master.faces.known(caller, api)
+    inner = master.faces.inner_uri(incarnation) if incarnation is not None else master.faces.nobody()
+    answer = await master.rosmaster.call(method, caller.caller_id, resource, inner)
+    if answer[0] == 1 and incarnation is not None:
+        master.graph.unregistered(incarnation, kind, resource)
+    return answer
+
+
+async def withdraw(master: "Master", incarnation: Incarnation, kind: Kind, resource: str) -> None:
+    """Unregister something at ROSMaster for a node that is gone or may not have it any more."""
+    inner = master.faces.inner_uri(incarnation)
+    match kind:
+        case Kind.PUBLICATION:
+            await master.rosmaster.call("unregisterPublisher", incarnation.name, resource, inner)
+        case Kind.SUBSCRIPTION:
+            await master.rosmaster.call("unregisterSubscriber", incarnation.name, resource, inner)
+        case Kind.SERVICE:
+            await master.rosmaster.call(
+                "unregisterService", incarnation.name, resource, stand_in(incarnation)
+            )
+        case Kind.PARAMETER:
+            await master.rosmaster.call("unsubscribeParam", incarnation.name, inner, resource)
+
+
+def stand_in(incarnation: Incarnation) -> str:
+    """The service URI that ROSMaster has for every service of an incarnation; nobody is ever told it."""
+    return service_uri(incarnation.key, incarnation.relay_port)
+
+
+def key_of_stand_in(uri: str) -> str:
+    """The key of the incarnation behind a stand-in."""
+    return uri.removeprefix("rosrpc://").partition(":")[0]
+
+
+NO_SERVICE = "rosrpc://nobody:1"

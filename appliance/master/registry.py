@@ -1,0 +1,270 @@
+"""The registry: who is who, what each node registered, and who was told what.
+
+An *incarnation* is one life of a node: its name and the API URI it registered with, from one host. It holds the
+two faces and the relay port that stand for the node. The registry is plain state: it does no I/O and has no clock;
+what has to be durable is handed to the `Journal` it was made with.
+
+Invariants:
+
+1. At most one incarnation of a name is *live*; it alone holds the name. An earlier one is *replaced* and never
+   comes back.
+2. A live incarnation that does not answer any more becomes a *shadow*: its registrations are kept but count for
+   nobody until it returns or expires. A shadow does not hold its name.
+3. A registration has the order in which it was made; a rebuilt ROSMaster is given them in that order.
+4. Keys and ports are never given to another incarnation while this one is known.
+"""
+
+import enum
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from appliance.policy.model import Address
+from appliance.ros.uris import NodeUri, node_uri
+
+
+class Kind(enum.StrEnum):
+    """What can be registered."""
+
+    PUBLICATION = "publication"
+    SUBSCRIPTION = "subscription"
+    SERVICE = "service"
+    PARAMETER = "parameter"
+
+
+class Life(enum.StrEnum):
+    """Where an incarnation stands."""
+
+    LIVE = "live"
+    SHADOW = "shadow"
+    REPLACED = "replaced"
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """One thing a node registered; `detail` is the topic's type, or the service's `rosrpc` port."""
+
+    kind: Kind
+    resource: str
+    detail: str
+    order: int
+
+
+@dataclass(slots=True)
+class Incarnation:
+    """One life of a node.
+
+    `api` is the URI it gave (its host is a claim and never followed); `told` is the appliance's address that this
+    node reaches us at, used in every URI we tell it. `own` marks the appliance's own nodes (the rosout aggregator).
+    """
+
+    key: str
+    name: str
+    host: Address
+    api: NodeUri
+    api_text: str
+    told: str
+    outer_port: int
+    relay_port: int
+    own: bool = False
+    life: Life = Life.LIVE
+    changed: float = 0.0  # wall-clock seconds when `life` changed
+    registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
+    told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def call_uri(self) -> NodeUri:
+        """Where the appliance calls the node: at its peer address, whatever host it claimed."""
+        return NodeUri("http", str(self.host), self.api.port, self.api.path)
+
+    def outer_uri(self, told: str) -> str:
+        """The URI other nodes know this one by, as seen by somebody who reaches the appliance at `told`."""
+        return node_uri(told, self.outer_port)
+
+    def resources(self, kind: Kind) -> list[str]:
+        """What it registered of that kind, in order."""
+        return [one.resource for one in self.registrations.values() if one.kind is kind]
+
+
+class Journal(Protocol):
+    """Where the registry writes what must survive a crash of control."""
+
+    def incarnation_saved(self, incarnation: Incarnation) -> None:
+        """A new incarnation, or a changed `life`."""
+
+    def incarnation_forgotten(self, key: str) -> None:
+        """The incarnation and all its registrations are gone."""
+
+    def registration_saved(self, key: str, registration: Registration) -> None:
+        """A registration was made (or made again with another detail)."""
+
+    def registration_removed(self, key: str, kind: Kind, resource: str) -> None:
+        """A registration is gone."""
+
+
+class Registry:
+    """All incarnations that are known, by key, by name and by topic."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._by_key: dict[str, Incarnation] = {}
+        self._known: dict[tuple[str, Address, str], Incarnation] = {}
+        self._live: dict[str, Incarnation] = {}
+        self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
+        self._nodes_of: Counter[Address] = Counter()
+        self._registrations_of: Counter[Address] = Counter()
+        self._order = 0
+
+    # --- looking ---
+
+    def by_key(self, key: str) -> Incarnation | None:
+        """The incarnation with this key, whatever its life."""
+        return self._by_key.get(key)
+
+    def find(self, name: str, host: Address, api_text: str) -> Incarnation | None:
+        """The incarnation that registered as `name` from `host` with this API URI."""
+        return self._known.get((name, host, api_text))
+
+    def holder(self, name: str) -> Incarnation | None:
+        """The live incarnation that holds a name: one with at least one registration."""
+        incarnation = self._live.get(name)
+        return incarnation if incarnation is not None and incarnation.registrations else None
+
+    def live(self) -> list[Incarnation]:
+        """All live incarnations."""
+        return list(self._live.values())
+
+    def all(self) -> list[Incarnation]:
+        """Every incarnation that is known."""
+        return list(self._by_key.values())
+
+    def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
+        """Live incarnations that registered this resource, in the order of registration."""
+        return self._topics.get((kind, resource), {}).values()
+
+    def nodes_of(self, host: Address) -> int:
+        """How many incarnations of a host are known (for the limit per host)."""
+        return self._nodes_of[host]
+
+    def registrations_of(self, host: Address) -> int:
+        """How many registrations a host has (for the limit per host)."""
+        return self._registrations_of[host]
+
+    def in_order(self) -> Iterator[tuple[Incarnation, Registration]]:
+        """Every registration of live incarnations, in the order they were made."""
+        pairs = [(one, each) for one in self._live.values() for each in one.registrations.values()]
+        return iter(sorted(pairs, key=lambda pair: pair[1].order))
+
+    def publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
+        """The list of publisher URIs as this subscriber must see it: its own entry is its own real URI."""
+        return tuple(
+            one.api_text if one is subscriber else one.outer_uri(subscriber.told)
+            for one in self.registered(Kind.PUBLICATION, topic)
+        )
+
+    # --- changing ---
+
+    def add(self, incarnation: Incarnation) -> None:
+        """Make a new incarnation known; it holds nothing yet."""
+        self._by_key[incarnation.key] = incarnation
+        self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
+        self._nodes_of[incarnation.host] += 1
+        self._journal.incarnation_saved(incarnation)
+
+    def restore(self, incarnation: Incarnation) -> None:
+        """Put back an incarnation that was read from the store, with its registrations."""
+        self._by_key[incarnation.key] = incarnation
+        self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
+        self._nodes_of[incarnation.host] += 1
+        self._registrations_of[incarnation.host] += len(incarnation.registrations)
+        for registration in incarnation.registrations.values():
+            self._order = max(self._order, registration.order)
+        if incarnation.life is Life.LIVE:
+            self._live[incarnation.name] = incarnation
+            for registration in incarnation.registrations.values():
+                self._index(incarnation, registration)
+
+    def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Registration:
+        """Record that ROSMaster took this registration."""
+        self._live[incarnation.name] = incarnation
+        known = incarnation.registrations.get((kind, resource))
+        if known is not None and known.detail == detail:
+            registration = known
+        else:
+            self._order += 1
+            order = known.order if known is not None else self._order
+            self._registrations_of[incarnation.host] += known is None
+            registration = Registration(kind, resource, detail, order)
+            incarnation.registrations[kind, resource] = registration
+            self._journal.registration_saved(incarnation.key, registration)
+        self._index(incarnation, registration)
+        return registration
+
+    def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
+        """Record that a registration is gone; whether there was one."""
+        if incarnation.registrations.pop((kind, resource), None) is None:
+            return False
+        self._registrations_of[incarnation.host] -= 1
+        self._unindex(incarnation, kind, resource)
+        self._journal.registration_removed(incarnation.key, kind, resource)
+        return True
+
+    def replace(self, incarnation: Incarnation, when: float) -> list[Registration]:
+        """Another incarnation took the name: this one's registrations are gone. Returns what it had."""
+        lost = list(incarnation.registrations.values())
+        for registration in lost:
+            self.unregister(incarnation, registration.kind, registration.resource)
+        self._retire(incarnation, Life.REPLACED, when)
+        return lost
+
+    def overshadow(self, incarnation: Incarnation, when: float) -> list[Registration]:
+        """The node does not answer: its registrations count for nobody until it returns."""
+        for registration in incarnation.registrations.values():
+            self._unindex(incarnation, registration.kind, registration.resource)
+        self._retire(incarnation, Life.SHADOW, when)
+        return list(incarnation.registrations.values())
+
+    def revive(self, incarnation: Incarnation, when: float) -> list[Registration]:
+        """A shadow answers again and its name is free: it is live as before."""
+        incarnation.life, incarnation.changed = Life.LIVE, when
+        self._live[incarnation.name] = incarnation
+        for registration in incarnation.registrations.values():
+            self._index(incarnation, registration)
+        self._journal.incarnation_saved(incarnation)
+        return sorted(incarnation.registrations.values(), key=lambda one: one.order)
+
+    def forget(self, incarnation: Incarnation) -> None:
+        """Drop an incarnation for good; its ports may go to another."""
+        for registration in incarnation.registrations.values():
+            self._unindex(incarnation, registration.kind, registration.resource)
+        if self._live.get(incarnation.name) is incarnation:
+            del self._live[incarnation.name]
+        if self._by_key.pop(incarnation.key, None) is not None:
+            self._nodes_of[incarnation.host] -= 1
+            self._registrations_of[incarnation.host] -= len(incarnation.registrations)
+        self._known.pop((incarnation.name, incarnation.host, incarnation.api_text), None)
+        self._journal.incarnation_forgotten(incarnation.key)
+
+    def _retire(self, incarnation: Incarnation, life: Life, when: float) -> None:
+        incarnation.life, incarnation.changed = life, when
+        incarnation.told_lists.clear()
+        if self._live.get(incarnation.name) is incarnation:
+            del self._live[incarnation.name]
+        self._journal.incarnation_saved(incarnation)
+
+    def _index(self, incarnation: Incarnation, registration: Registration) -> None:
+        self._topics.setdefault((registration.kind, registration.resource), {})[incarnation.key] = incarnation
+
+    def _unindex(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        holders = self._topics.get((kind, resource))
+        if holders is not None:
+            holders.pop(incarnation.key, None)
+            if not holders:
+                del self._topics[kind, resource]
+
+
+def new_key() -> str:
+    """A key for a new incarnation: 128 random bits, so that an inner URI cannot be guessed."""
+    return secrets.token_hex(16)

@@ -1,0 +1,101 @@
+"""The hidden ROSMaster as control calls it: kept-alive connections, and a door that is shut while it is rebuilt.
+
+While ROSMaster is down, or up but not yet told everything again, calls of nodes wait at the door (bounded): a node
+that registers in that moment notices nothing but a delay. The reconcile loop shuts the door, passes it with
+`call_now`, and opens it.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+
+from appliance.master.call import Answer
+from appliance.master.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
+from appliance.ros.uris import NodeUri
+from appliance.ros.xmlrpc import Limits, Value
+
+
+class RosMaster:
+    """ROSMaster at `127.0.0.1:port`; `lost()` hears when it seems to be gone. Times are seconds."""
+
+    def __init__(
+        self,
+        port: int,
+        *,
+        lost: Callable[[], None],
+        limits: Limits,
+        timeout: float = 10.0,
+        hold: float = 15.0,
+    ) -> None:
+        self._lost = lost
+        self._hold = hold
+        self._client = XmlRpcClient(
+            NodeUri("http", "127.0.0.1", port, "/"),
+            timeout=timeout,
+            pool=32,
+            limits=limits,
+            disconnected=lost,
+        )
+        self._open = asyncio.Event()
+        self._alone = asyncio.Lock()
+        self._inside = 0
+        self._empty = asyncio.Event()
+        self._empty.set()
+
+    @property
+    def reachable(self) -> bool:
+        """Whether calls pass (ROSMaster is there and whole)."""
+        return self._open.is_set()
+
+    async def call(self, method: str, *params: Value) -> Answer:
+        """Call for a node; waits while the door is shut. Raises `CallFailedError` when it stays shut."""
+        try:
+            async with asyncio.timeout(self._hold):
+                while True:
+                    if not self._open.is_set():
+                        await self._open.wait()
+                    self._enter()
+                    try:
+                        return await self.call_now(method, *params)
+                    except (RefusedError, BrokenOffError):
+                        self._open.clear()
+                        self._lost()
+                    finally:
+                        self._leave()
+        except TimeoutError:
+            raise CallFailedError(f"the ROS Master did not come back within {self._hold:g} s") from None
+
+    async def call_now(self, method: str, *params: Value) -> Answer:
+        """Call whether or not the door is open: for the reconcile loop."""
+        answer = await self._client.call(method, *params)
+        if isinstance(answer, list) and len(answer) == 3 and isinstance(answer[0], int):
+            return answer
+        raise CallFailedError(
+            f"the ROS Master answered {method} with something that is not [code, message, value]"
+        )
+
+    def shut(self) -> None:
+        """Let calls wait from now on: ROSMaster is away."""
+        self._open.clear()
+
+    @contextlib.asynccontextmanager
+    async def alone(self) -> AsyncIterator[None]:
+        """Shut the door and wait until those inside have left; it opens again unless the work inside fails."""
+        async with self._alone:
+            self._open.clear()
+            await self._empty.wait()
+            yield
+            self._open.set()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._client.close()
+
+    def _enter(self) -> None:
+        self._inside += 1
+        self._empty.clear()
+
+    def _leave(self) -> None:
+        self._inside -= 1
+        if not self._inside:
+            self._empty.set()

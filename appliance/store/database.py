@@ -1,0 +1,110 @@
+"""One SQLite file with one writer thread: statements are queued, written in groups, and can be awaited.
+
+What was queued together is committed together with whatever else is waiting (group commit). A process that is
+killed loses at most what was not yet taken from the queue; whoever must not lose a row awaits `settled`.
+"""
+
+import asyncio
+import contextlib
+import queue
+import sqlite3
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+Parameters = Sequence[str | int | float | bytes | None]
+_GROUP = 2_000
+
+
+class StoreError(Exception):
+    """The state cannot be read or written; the text says which file and why."""
+
+
+class Database:
+    """The state file at `path`, created with `schema` when it is new.
+
+    Raises `StoreError` when the file is no database or cannot be opened. `failed` hears of a write that could not
+    be done (a full disk): nothing is dropped, the write is tried again until it succeeds or the database is closed.
+    """
+
+    def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
+        self._path = path
+        self._failed = failed
+        try:
+            self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+            self._connection.execute("PRAGMA journal_mode=WAL")
+            self._connection.execute("PRAGMA synchronous=NORMAL")
+            self._connection.executescript(schema)
+        except sqlite3.Error as error:
+            raise StoreError(f"{path}: {error}; move the file away to start with an empty state") from error
+        self._queue: queue.SimpleQueue[tuple[str, Parameters] | Callable[[], None] | None] = (
+            queue.SimpleQueue()
+        )
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._write, name="store", daemon=True)
+        self._thread.start()
+
+    def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
+        """Read rows; for start-up and rare look-ups, not for the hot path."""
+        try:
+            with contextlib.closing(sqlite3.connect(self._path)) as reader:
+                return reader.execute(sql, parameters).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path}: {error}") from error
+
+    def submit(self, sql: str, parameters: Parameters = ()) -> None:
+        """Queue one statement."""
+        self._queue.put((sql, parameters))
+
+    async def settled(self) -> None:
+        """Wait until everything queued so far is in the file."""
+        loop = asyncio.get_running_loop()
+        done = loop.create_future()
+
+        def tell() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        self._queue.put(lambda: _call_back(loop, tell))
+        await done
+
+    def close(self) -> None:
+        """Write what is queued and close the file."""
+        self._closing.set()
+        self._queue.put(None)
+        self._thread.join()
+        self._connection.close()
+
+    def _write(self) -> None:
+        while True:
+            group = [self._queue.get()]
+            while len(group) < _GROUP and not self._queue.empty():
+                group.append(self._queue.get())
+            self._commit([one for one in group if isinstance(one, tuple)])
+            for one in group:
+                if callable(one):
+                    one()
+            if None in group:
+                return
+
+    def _commit(self, statements: list[tuple[str, Parameters]]) -> None:
+        while statements:
+            try:
+                self._connection.execute("BEGIN")
+                for sql, parameters in statements:
+                    self._connection.execute(sql, parameters)
+                self._connection.execute("COMMIT")
+            except sqlite3.Error as error:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                self._failed(f"{self._path}: {error}")
+                if self._closing.wait(0.5):
+                    return
+            else:
+                return
+
+
+def _call_back(loop: asyncio.AbstractEventLoop, tell: Callable[[], None]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
+        loop.call_soon_threadsafe(tell)

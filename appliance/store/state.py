@@ -1,0 +1,199 @@
+"""The tables of control's state file: incarnations, registrations, parameters, policy revisions, settings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from appliance.store.database import Database
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS incarnation (
+    key TEXT PRIMARY KEY, name TEXT NOT NULL, host TEXT NOT NULL, api TEXT NOT NULL, told TEXT NOT NULL,
+    outer_port INTEGER NOT NULL, relay_port INTEGER NOT NULL, own INTEGER NOT NULL,
+    life TEXT NOT NULL, changed REAL NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS registration (
+    key TEXT NOT NULL, kind TEXT NOT NULL, resource TEXT NOT NULL, detail TEXT NOT NULL,
+    ordinal INTEGER NOT NULL, PRIMARY KEY (key, kind, resource)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS permission (
+    key TEXT NOT NULL, kind TEXT NOT NULL, resource TEXT NOT NULL, host TEXT NOT NULL, caller_id TEXT NOT NULL,
+    PRIMARY KEY (key, kind, resource, host, caller_id)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS parameters (id INTEGER PRIMARY KEY CHECK (id = 1), tree BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS policy_revision (
+    revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
+    who TEXT NOT NULL, note TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class IncarnationRow:
+    """One incarnation as it is kept; `changed` is seconds since the epoch."""
+
+    key: str
+    name: str
+    host: str
+    api: str
+    told: str
+    outer_port: int
+    relay_port: int
+    own: bool
+    life: str
+    changed: float
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationRow:
+    """One registration as it is kept; `ordinal` is its place in the order they were made."""
+
+    key: str
+    kind: str
+    resource: str
+    detail: str
+    ordinal: int
+
+
+@dataclass(frozen=True, slots=True)
+class PermissionRow:
+    """One grant of the relay (`kind` "topic" or "service"; `caller_id` empty for services)."""
+
+    key: str
+    kind: str
+    resource: str
+    host: str
+    caller_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class RevisionRow:
+    """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where."""
+
+    revision: int
+    text: str
+    file: str
+    loaded: float
+    who: str
+    note: str
+
+
+class StateStore:
+    """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
+
+    def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
+        self._database = Database(directory / "state.db", _SCHEMA, failed=failed)
+
+    async def settled(self) -> None:
+        """Wait until everything saved so far is in the file."""
+        await self._database.settled()
+
+    def close(self) -> None:
+        """Write what is left and close."""
+        self._database.close()
+
+    # --- registry ---
+
+    def save_incarnation(self, row: IncarnationRow) -> None:
+        """Keep an incarnation, or its new `life`."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO incarnation VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                row.key, row.name, row.host, row.api, row.told,
+                row.outer_port, row.relay_port, int(row.own), row.life, row.changed,
+            ),
+        )  # fmt: skip
+
+    def forget_incarnation(self, key: str) -> None:
+        """Drop an incarnation and its registrations."""
+        self._database.submit("DELETE FROM incarnation WHERE key = ?", (key,))
+        self._database.submit("DELETE FROM registration WHERE key = ?", (key,))
+        self._database.submit("DELETE FROM permission WHERE key = ?", (key,))
+
+    def save_registration(self, row: RegistrationRow) -> None:
+        """Keep a registration."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO registration VALUES (?, ?, ?, ?, ?)",
+            (row.key, row.kind, row.resource, row.detail, row.ordinal),
+        )
+
+    def remove_registration(self, key: str, kind: str, resource: str) -> None:
+        """Drop a registration."""
+        self._database.submit(
+            "DELETE FROM registration WHERE key = ? AND kind = ? AND resource = ?", (key, kind, resource)
+        )
+
+    def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
+        """Everything that is kept, registrations in order."""
+        incarnations = [
+            IncarnationRow(*row[:7], own=bool(row[7]), life=row[8], changed=row[9])
+            for row in self._database.query("SELECT * FROM incarnation ORDER BY changed")
+        ]
+        registrations = [
+            RegistrationRow(*row)
+            for row in self._database.query("SELECT * FROM registration ORDER BY ordinal")
+        ]
+        return incarnations, registrations
+
+    # --- grants ---
+
+    def save_permission(self, row: PermissionRow) -> None:
+        """Keep a grant."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO permission VALUES (?, ?, ?, ?, ?)",
+            (row.key, row.kind, row.resource, row.host, row.caller_id),
+        )
+
+    def remove_permission(self, row: PermissionRow) -> None:
+        """Drop a grant."""
+        self._database.submit(
+            "DELETE FROM permission WHERE key = ? AND kind = ? AND resource = ? AND host = ? AND caller_id = ?",
+            (row.key, row.kind, row.resource, row.host, row.caller_id),
+        )
+
+    def permissions(self) -> list[PermissionRow]:
+        """All grants that are kept."""
+        return [PermissionRow(*row) for row in self._database.query("SELECT * FROM permission")]
+
+    # --- parameters ---
+
+    def save_parameters(self, tree: dict[str, Any]) -> None:
+        """Keep the whole parameter tree."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO parameters VALUES (1, ?)", (msgspec.msgpack.encode(tree),)
+        )
+
+    def load_parameters(self) -> dict[str, Any]:
+        """The kept parameter tree; empty when there is none."""
+        rows = self._database.query("SELECT tree FROM parameters WHERE id = 1")
+        return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
+
+    # --- policy revisions ---
+
+    def save_revision(self, row: RevisionRow) -> None:
+        """Keep a policy that comes into force."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO policy_revision VALUES (?, ?, ?, ?, ?, ?)",
+            (row.revision, row.text, row.file, row.loaded, row.who, row.note),
+        )
+
+    def revisions(self) -> list[RevisionRow]:
+        """All kept revisions, the newest first."""
+        return [
+            RevisionRow(*row)
+            for row in self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
+        ]
+
+    # --- settings ---
+
+    def save_setting(self, name: str, value: str) -> None:
+        """Keep a named value."""
+        self._database.submit("INSERT OR REPLACE INTO setting VALUES (?, ?)", (name, value))
+
+    def settings(self) -> dict[str, str]:
+        """All named values."""
+        return dict(self._database.query("SELECT name, value FROM setting"))
