@@ -1,8 +1,8 @@
-"""A record as columns of the database and back. Strangers' text is kept as it is; what cannot be kept is escaped.
+"""A record as columns of the database and back. Strangers' text is kept as it is where it can be stored.
 
 Lone surrogates (undecodable bytes), integers beyond 64 bits and objects that are no data cannot be stored in
-SQLite or JSON: they become their escaped or printed form. A record is bounded: past `LARGEST_DETAIL` bytes the
-long strings in it are cut, and say how long they were.
+SQLite or JSON: they become their escaped or printed form. A record is bounded: texts past `LONGEST_TEXT`
+characters are cut and say how long they were; details past `LARGEST_DETAIL` bytes keep their first parts.
 """
 
 from typing import Any
@@ -35,9 +35,10 @@ def _columns(record: Record, sequence: int) -> StoredColumns:
     rule = record.rule
     section, key, file, line = (None,) * 4 if rule is None else (rule.section, rule.key, rule.file, rule.line)
     return StoredColumns(
-        sequence, record.id, record.time, SCHEMA_VERSION, record.event, record.severity.value, record.decision,
-        record.host, record.caller_id, record.category, record.resource, section, key, file, line,
-        record.revision, record.reason, record.duration_us, _encoder.encode(record.detail),
+        sequence, record.id, record.time, SCHEMA_VERSION, record.event, record.severity.value,
+        record.decision, record.host, record.caller_id, record.category, record.resource,
+        section, key, file, line, record.revision, record.reason, record.duration_us,
+        _encoder.encode(record.detail),
     )  # fmt: skip
 
 
@@ -84,23 +85,32 @@ _TYPED = ("severity", "rule", "detail")
 
 def _plain(value: Any, depth: int = 0) -> Any:
     if value is None or isinstance(value, bool | float):
-        return value
-    if isinstance(value, int):
-        return value if -(1 << 63) <= value < 1 << 63 else str(value)
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, bytes | bytearray):
-        return _text(bytes(value[:LONGEST_TEXT]).decode("ascii", "backslashreplace"))
-    if depth >= _DEEPEST:
-        return "(nested too deeply)"
-    if isinstance(value, dict):
-        pairs = list(value.items())[:_MOST_ITEMS]
-        plain = {_text(str(key)): _plain(item, depth + 1) for key, item in pairs}
-        return plain if len(value) == len(pairs) else {**plain, "...": f"{len(value) - len(pairs)} more"}
-    if isinstance(value, list | tuple | set | frozenset):
-        items = [_plain(item, depth + 1) for item in list(value)[:_MOST_ITEMS]]
-        return items if len(value) == len(items) else [*items, f"... {len(value) - len(items)} more"]
-    return _text(repr(value))
+        plain: Any = value
+    elif isinstance(value, int):
+        plain = value if -(1 << 63) <= value < 1 << 63 else _text(hex(value))
+    elif isinstance(value, str):
+        plain = _text(value)
+    elif isinstance(value, bytes | bytearray):
+        plain = _text(bytes(value[:LONGEST_TEXT]).decode("ascii", "backslashreplace"))
+    elif depth >= _DEEPEST:
+        plain = "(nested too deeply)"
+    elif isinstance(value, dict):
+        plain = _plain_dict(value, depth)
+    elif isinstance(value, list | tuple | set | frozenset):
+        plain = [_plain(item, depth + 1) for item in list(value)[:_MOST_ITEMS]]
+        if len(value) > len(plain):
+            plain.append(f"... {len(value) - len(plain)} more")
+    else:
+        plain = _text(repr(value))
+    return plain
+
+
+def _plain_dict(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+    pairs = list(value.items())[:_MOST_ITEMS]
+    plain = {_text(str(key)): _plain(item, depth + 1) for key, item in pairs}
+    if len(value) > len(pairs):
+        plain["..."] = f"{len(value) - len(pairs)} more"
+    return plain
 
 
 def _text(value: str) -> str:

@@ -1,12 +1,13 @@
 """The database file of the log: its tables, how it is made, opened for writing, and opened for reading.
 
-A new log is made beside its place and moved there complete, so a file that is empty, cut or of another kind is
-never a log in the making: it is an error that is told, and the file is left as it is.
+A new log is made beside its place and moved there complete, so a file that is empty, cut or of another kind
+is never a log in the making: it is an error that is told, and the file is left as it is.
 """
 
 import os
 import secrets
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
@@ -20,8 +21,9 @@ TABLES = (
     "CREATE TABLE log (id TEXT NOT NULL, begun INTEGER NOT NULL) STRICT",
     "CREATE TABLE record (sequence INTEGER PRIMARY KEY, id TEXT NOT NULL, time INTEGER NOT NULL,"
     " version INTEGER NOT NULL, event TEXT NOT NULL, severity TEXT NOT NULL, decision TEXT, host TEXT,"
-    " caller_id TEXT, category TEXT, resource TEXT, rule TEXT, rule_key TEXT, rule_file TEXT, rule_line INTEGER,"
-    " revision INTEGER, reason TEXT NOT NULL, duration_us INTEGER, detail BLOB NOT NULL, hash BLOB NOT NULL) STRICT",
+    " caller_id TEXT, category TEXT, resource TEXT, rule TEXT, rule_key TEXT, rule_file TEXT,"
+    " rule_line INTEGER, revision INTEGER, reason TEXT NOT NULL, duration_us INTEGER, detail BLOB NOT NULL,"
+    " hash BLOB NOT NULL) STRICT",
     "CREATE TABLE checkpoint (number INTEGER PRIMARY KEY, sequence INTEGER NOT NULL, text BLOB NOT NULL,"
     " signature BLOB, public_key BLOB) STRICT",
     "CREATE TABLE open_fold (key BLOB PRIMARY KEY, state BLOB NOT NULL) STRICT",
@@ -36,7 +38,7 @@ TABLES = (
     "CREATE INDEX record_caller_id ON record (caller_id) WHERE caller_id IS NOT NULL",
     "CREATE INDEX record_category ON record (category) WHERE category IS NOT NULL",
     "CREATE INDEX record_resource ON record (resource) WHERE resource IS NOT NULL",
-    "CREATE INDEX record_rule ON record (rule) WHERE rule IS NOT NULL",
+    "CREATE INDEX record_rule ON record (rule, rule_key) WHERE rule IS NOT NULL",
     "CREATE INDEX checkpoint_unsigned ON checkpoint (number) WHERE signature IS NULL",
 )
 
@@ -77,8 +79,15 @@ def create(path: Path, begun: int) -> None:
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
     """Open an existing log for its writer. Raises `LogUnreadableError`, or `sqlite3.Error` from below."""
-    return _checked(sqlite3.connect(_uri(path, "rw"), uri=True, isolation_level=None, timeout=_BUSY_SECONDS,
-                                    check_same_thread=False, cached_statements=64), path, _prepare_writing)  # fmt: skip
+    connection = sqlite3.connect(
+        _uri(path, "rw"),
+        uri=True,
+        isolation_level=None,
+        timeout=_BUSY_SECONDS,
+        check_same_thread=False,
+        cached_statements=64,
+    )
+    return _checked(connection, path, _prepare_writing)
 
 
 def _prepare_writing(connection: sqlite3.Connection) -> None:
@@ -116,7 +125,9 @@ def _uri(path: Path, mode: str) -> str:
     return f"file:{quote(str(path.absolute()))}?mode={mode}"
 
 
-def _checked(connection: sqlite3.Connection, path: Path, prepare: object) -> sqlite3.Connection:
+def _checked(
+    connection: sqlite3.Connection, path: Path, prepare: Callable[[sqlite3.Connection], object]
+) -> sqlite3.Connection:
     try:
         kind = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
@@ -126,8 +137,7 @@ def _checked(connection: sqlite3.Connection, path: Path, prepare: object) -> sql
             )
         if version != LAYOUT_VERSION:
             raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
-        if callable(prepare):
-            prepare(connection)
+        prepare(connection)
     except sqlite3.DatabaseError as error:
         connection.close()
         if isinstance(error, sqlite3.OperationalError):

@@ -2,11 +2,11 @@
 
 Invariants:
 1. The first denial of its kind is recorded in full; every repetition is counted in exactly one summary.
-2. Memory is bounded: at most `keys_per_host` kinds of one host, `keys` in all. Past that a host's further denials
-   are one kind (`scope` "host"); past `keys` all further ones are one kind (`scope` "all").
+2. Memory is bounded: at most `keys_per_host` kinds of one host, `keys` in all. Past that a host's further
+   denials are one kind (`scope` "host"); past `keys` all further ones are one kind (`scope` "all").
 3. A kind is forgotten when it did not repeat for `seconds`; its next denial is recorded in full again.
-4. An allow for the same host, caller, category and resource ends the kinds it contradicts: their summaries come
-   before it.
+4. An allow for the same host, caller, category and resource ends the kinds it contradicts: their summaries
+   come before it.
 """
 
 from collections.abc import Callable, Iterator

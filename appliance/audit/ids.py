@@ -2,8 +2,8 @@
 
 An id is 20 lower-case hexadecimal characters: nanoseconds since the epoch (16) and four random ones of this
 source, so that ids made by two processes in the same nanosecond differ. The time part never stands still and
-never goes back: with the clock set back it counts on from the last id. Over a restart the last id of the log is
-the floor (`after`), which `AuditLog.ids` sees to.
+never goes back: with the clock set back it counts on from the last id. Over a restart the last id of the log
+is the floor (`after`), which `AuditLog.ids` sees to.
 """
 
 import secrets

@@ -27,6 +27,7 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.folding import Folder, FoldSettings, Key, summary
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Record, Severity
+from appliance.audit.retention import Retention
 from appliance.audit.signatures import Signatures, Signer
 from appliance.audit.writer import ChainWriter
 
@@ -37,6 +38,9 @@ _RETRY_SECONDS = 0.5
 _LARGEST_BATCH = 2048
 _IDLE_SECONDS = 1.0
 _CLOSE_SECONDS = 10.0
+_REMOVED_AT_ONCE = 512
+_RETENTION_SECONDS = 5.0
+_AGE_SECONDS = 3600.0
 _WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
 
 
@@ -62,6 +66,11 @@ class _Signature(NamedTuple):
     public_key: bytes
 
 
+class _Refusal(NamedTuple):
+    number: int
+    reason: str
+
+
 class _AskSignatures(NamedTuple):
     pass
 
@@ -69,9 +78,10 @@ class _AskSignatures(NamedTuple):
 class AuditLog:
     """The log at `path`, open for writing.
 
-    `durability` says when writing starts: `strict` at once (group commit), `batched` after gathering for 20 ms;
-    both fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is
-    first, and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed`.
+    `durability` says when writing starts: `strict` at once (group commit), `batched` after 20 ms; both
+    fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is first,
+    and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed` or
+    `refused`.
     """
 
     def __init__(
@@ -83,6 +93,7 @@ class AuditLog:
         checkpoint_seconds: float = 60.0,
         fold: FoldSettings | None = None,
         signer: Signer | None = None,
+        retention: Retention | None = None,
         queue_limit: int = 100_000,
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -92,6 +103,9 @@ class AuditLog:
         self._clock = clock
         self._checkpoint_every = checkpoint_every
         self._checkpoint_seconds = checkpoint_seconds
+        self._retention = retention or Retention()
+        self._retained_at = 0.0
+        self._aged_at = 0.0
         self._queue_limit = queue_limit
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
@@ -107,6 +121,7 @@ class AuditLog:
         self._lost = _Lost()
         self._idle = False
         self._ended = False
+        self._unwritten: str | None = None
         self._wake = threading.Event()
         self._hurry = threading.Event()
         self._stopping = threading.Event()
@@ -156,16 +171,23 @@ class AuditLog:
         """The signer's answer: kept if it is right and made with the pinned key, else recorded as refused."""
         self._put(_Signature(number, signature, public_key))
 
+    def refused(self, number: int, reason: str) -> None:
+        """The signer refused a checkpoint: recorded as an alarm."""
+        self._put(_Refusal(number, reason))
+
     def request_signatures(self) -> None:
         """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
         self._put(_AskSignatures())
 
-    def close(self) -> None:
-        """Write what waits, make a last checkpoint and close; `failed` says why something was not written."""
+    def close(self) -> str | None:
+        """Write what waits, make a last checkpoint and close; the reason when that did not succeed."""
         self._stopping.set()
         self._hurry.set()
         self._wake.set()
         self._thread.join(_CLOSE_SECONDS)
+        if self._thread.is_alive():
+            return f"{self.path}: still being written after {_CLOSE_SECONDS:g} s"
+        return self._unwritten
 
     def _put(self, item: Any) -> None:
         self._queue.append(item)
@@ -183,7 +205,7 @@ class AuditLog:
             self._serve()
         except BaseException as error:
             # A defect of ours: the owner must see that nothing is recorded any more, and deny.
-            self._failed = f"{self.path}: the log's thread ended: {type(error).__name__}: {error}"
+            self._unwritten = self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
             raise
         finally:
             self._failed = self._failed or f"{self.path}: the log is closed"
@@ -211,6 +233,7 @@ class AuditLog:
         if self._attempt(self._write) and self._unsealed:
             self._attempt(self._seal)
         self._answer_barriers()
+        self._unwritten = self._failed
         if self._writer is not None:
             self._writer.close()
 
@@ -222,12 +245,14 @@ class AuditLog:
             self._held.extend(self._folder.expire(now))
             written = self._attempt(self._write)
             self._answer_barriers()
+            if written and self._seal_is_due():
+                written = self._attempt(self._seal)
             if not more or not written:
                 break
-        if self._failed is None and self._seal_is_due():
-            self._attempt(self._seal)
         if self._writer is not None and not self._queue:
             self._attempt(self._index)
+        if self._writer is not None and time.monotonic() >= self._retained_at:
+            self._attempt(self._retain)
 
     def _wait(self) -> None:
         if self._failed is not None:
@@ -249,6 +274,8 @@ class AuditLog:
         now = time.monotonic()
         due = self._folder.next_due()
         waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
+        if not self._retained_at:
+            return 0.001
         if self._unsealed:
             waits.append(self._sealed_at + self._checkpoint_seconds - now)
         return max(0.001, min(waits))
@@ -265,6 +292,8 @@ class AuditLog:
                 self._held.extend(offer(item, now))
             elif isinstance(item, _Signature):
                 self._attempt(partial(self._keep_signature, item))
+            elif isinstance(item, _Refusal):
+                self._refused(item.number, item.reason)
             elif isinstance(item, _AskSignatures):
                 self._attempt(self._ask_signatures)
             else:
@@ -352,13 +381,36 @@ class AuditLog:
         self._unsealed = 0
         self._signatures.sealed(checkpoint.number, text)
 
+    def _retain(self) -> None:
+        """Remove one step of old records if they must go; the next step follows at once."""
+        writer, now = self._writer, time.monotonic()
+        self._retained_at = now + _RETENTION_SECONDS
+        if writer is None:
+            return
+        before = None
+        reason = self._retention.excess(writer.size())
+        if reason is None and self._retention.days is not None and now >= self._aged_at:
+            before = self._retention.oldest_kept(self._clock())
+            reason = f"older than {self._retention.days} days"
+        signed = self._signatures.has_signer
+        gone = None if reason is None else writer.removable(_REMOVED_AT_ONCE, signed=signed, before=before)
+        if gone is None:
+            self._aged_at = now + _AGE_SECONDS if before is not None else self._aged_at
+            return
+        detail = gone._asdict() | {"count": gone.last_sequence - gone.first_sequence + 1}
+        writer.remove(gone, self._own("records removed", Severity.NOTICE, reason or "", detail))
+        self._unsealed += 1
+        self._retained_at = 0.0
+
     def _keep_signature(self, item: _Signature) -> None:
         if self._writer is None:
             return
         refusal = self._signatures.keep(self._writer, item.number, item.signature, item.public_key)
         if refusal is not None:
-            detail = {"number": item.number, "public_key": item.public_key.hex()}
-            self._held.append(self._own("signature refused", Severity.ALARM, refusal, detail))
+            self._refused(item.number, refusal)
+
+    def _refused(self, number: int, reason: str) -> None:
+        self._held.append(self._own("signature refused", Severity.ALARM, reason, {"number": number}))
 
     def _ask_signatures(self) -> None:
         if self._writer is not None:

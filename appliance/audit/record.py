@@ -1,7 +1,7 @@
 """One record of the audit log: the documented schema, the same in the CLI, REST and the export.
 
-Schema version 1. A record is made where the thing happens, gets its `sequence` and its place in the hash chain
-when the log takes it, and is never changed afterwards.
+Schema version 1. A record is made where the thing happens, gets its `sequence` and its place in the hash
+chain when the log takes it, and is never changed afterwards.
 """
 
 import enum
@@ -34,9 +34,9 @@ class RuleReference(msgspec.Struct, frozen=True):
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What happened, who did it, and what was decided by which rule.
 
-    `id` is sortable (time first) and unique; `time` is nanoseconds since the epoch, UTC; `decision` is `allow`,
-    `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is microseconds from the request's
-    arrival to the decision; `detail` holds the fields of this event.
+    `id` is sortable (time first) and unique; `time` is nanoseconds since the epoch, UTC; `decision` is
+    `allow`, `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is microseconds from
+    the request's arrival to the decision; `detail` holds the fields of this event.
     """
 
     id: str

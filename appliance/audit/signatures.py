@@ -57,6 +57,12 @@ class Signatures:
         self._pin = pinned_key_path(log)
         self._signer = signer
         self._asked: set[int] = set()
+        self._waiting = False
+
+    @property
+    def has_signer(self) -> bool:
+        """Whether checkpoints of this log are signed."""
+        return self._signer is not None
 
     @property
     def key_was_pinned(self) -> bool:
@@ -64,15 +70,20 @@ class Signatures:
         return self._pin.exists()
 
     def sealed(self, number: int, text: bytes) -> None:
-        """A checkpoint was made: ask for its signature, unless enough are asked for already."""
-        if len(self._asked) < _ASKED_AT_ONCE:
+        """A checkpoint was made: ask for its signature, unless others have to be asked for before."""
+        # The signer signs in order only, so once one had to wait all that follow wait until `ask`.
+        self._waiting = self._waiting or len(self._asked) >= _ASKED_AT_ONCE
+        if not self._waiting:
             self._ask(number, text)
 
     def ask(self, writer: ChainWriter) -> None:
         """The signer is (back) in service, or is asked once more: ask for what is still unsigned."""
         self._asked.clear()
+        self._waiting = False
         if self._signer is not None:
-            for number, text in writer.unsigned(_ASKED_AT_ONCE):
+            unsigned = writer.unsigned(_ASKED_AT_ONCE)
+            self._waiting = len(unsigned) == _ASKED_AT_ONCE
+            for number, text in unsigned:
                 self._ask(number, text)
 
     def _ask(self, number: int, text: bytes) -> None:
@@ -95,11 +106,13 @@ class Signatures:
             except KeyUnreadableError as error:
                 return str(error)
             if pinned != public_key:
-                return f"checkpoint {number} was signed with {public_key.hex()}, but {self._pin} has {pinned.hex()}"
+                return (
+                    f"checkpoint {number} is signed with {public_key.hex()}, {self._pin} has {pinned.hex()}"
+                )
         else:
             _pin_key(self._pin, public_key)
         writer.keep_signature(number, signature, public_key)
-        if not self._asked:
+        if not self._asked and self._waiting:
             self.ask(writer)
         return None
 

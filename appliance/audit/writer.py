@@ -10,6 +10,7 @@ import fcntl
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -27,8 +28,9 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.folding import FoldState
 from appliance.audit.record import Record
 
-# Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy event
-# loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a second.
+# Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy
+# event loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a
+# second.
 _ROWS_PER_INSERT = 64
 _WIDTH = len(StoredColumns._fields) + 1
 _ROW = "(" + ", ".join("?" * _WIDTH) + ")"
@@ -41,6 +43,18 @@ def _insert(rows: int) -> str:
 
 
 _INSERTS = {rows: _insert(rows) for rows in (_ROWS_PER_INSERT, 8, 1)}
+
+
+class RemovedRange(NamedTuple):
+    """Records that retention removes, and the hashes that chain and checkpoints go on from."""
+
+    first_sequence: int
+    last_sequence: int
+    last_hash: str
+    first_time: int
+    last_time: int
+    last_checkpoint: int
+    last_checkpoint_hash: str
 
 
 class ChainWriter:
@@ -196,6 +210,59 @@ class ChainWriter:
             self._roll_back()
             raise
         return bool(end < self.sequence)
+
+    def size(self) -> int:
+        """How many bytes the records take on disk."""
+        (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
+        (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
+        (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
+        return int((pages - free) * page_size)
+
+    def removable(self, step: int, *, signed: bool, before: int | None = None) -> RemovedRange | None:
+        """The oldest records (before the time `before`), at most `step`, that a (signed) checkpoint seals."""
+        execute = self._connection.execute
+        (first,) = execute("SELECT coalesce(min(sequence), 0) FROM record").fetchone()
+        condition = "WHERE signature IS NOT NULL" if signed else ""
+        query = f"SELECT coalesce(max(sequence), 0) FROM checkpoint {condition}"  # noqa: S608  fixed text
+        last = min(first + step - 1, execute(query).fetchone()[0])
+        if before is not None:
+            young = "SELECT min(sequence) FROM record WHERE sequence BETWEEN ? AND ? AND time >= ?"
+            (kept,) = execute(young, (first, last, before)).fetchone()
+            last = last if kept is None else kept - 1
+        if not first or last < first:
+            return None
+        times = "SELECT time, hash FROM record WHERE sequence = ?"
+        first_time, _hash = execute(times, (first,)).fetchone()
+        last_time, last_hash = execute(times, (last,)).fetchone()
+        number, digest = 0, NO_CHECKPOINT
+        query = "SELECT number, text FROM checkpoint WHERE sequence <= ? ORDER BY number DESC LIMIT 1"
+        gone = execute(query, (last,)).fetchone()
+        if gone is not None:
+            number, digest = gone[0], checkpoint_hash(gone[1])
+        return RemovedRange(first, last, last_hash.hex(), first_time, last_time, number, digest)
+
+    def remove(self, gone: RemovedRange, report: Record) -> None:
+        """Remove records and their checkpoints, and append the record that says so, in one transaction."""
+        self._check_file()
+        execute = self._connection.execute
+        execute("BEGIN IMMEDIATE")
+        try:
+            sequence, digest, last_id = self._insert([report])
+            (through,) = execute("SELECT through FROM indexed").fetchone()
+            execute(
+                f"INSERT INTO words (words, rowid, text) SELECT 'delete', sequence, {database.TEXT_OF_RECORD}"  # noqa: S608  fixed names
+                " FROM record WHERE sequence <= ?",
+                (min(gone.last_sequence, through),),
+            )
+            execute("UPDATE indexed SET through = max(through, ?)", (gone.last_sequence,))
+            execute("DELETE FROM record WHERE sequence <= ?", (gone.last_sequence,))
+            execute("DELETE FROM checkpoint WHERE number <= ?", (gone.last_checkpoint,))
+            execute("COMMIT")
+        except BaseException:
+            self._roll_back()
+            raise
+        self.sequence, self.hash, self.last_id = sequence, digest, last_id
+        execute("PRAGMA incremental_vacuum(256)").fetchall()
 
     def _check_file(self) -> None:
         if _identity(self.path) != self._file:

@@ -1,0 +1,1 @@
+"""The signer, which holds the keys; certificates and tunnels come to it."""

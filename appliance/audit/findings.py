@@ -1,0 +1,55 @@
+"""What a verification finds, as data that the CLI, REST and the console show alike."""
+
+import enum
+
+import msgspec
+
+
+class Kind(enum.StrEnum):
+    """What is wrong."""
+
+    CHANGED = "changed"
+    MISSING = "missing"
+    INSERTED = "inserted"
+    REORDERED = "reordered"
+    TRUNCATED = "truncated"
+    UNREADABLE = "unreadable"
+    STRUCTURE = "structure"
+    CHECKPOINT_CHANGED = "checkpoint changed"
+    CHECKPOINT_MISSING = "checkpoint missing"
+    SIGNATURE_WRONG = "signature wrong"
+    SIGNATURE_MISSING = "signature missing"
+    WRONG_KEY = "wrong key"
+    NO_KEY = "no key"
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One thing that is wrong; `first` and `last` are sequences of records, or numbers of checkpoints."""
+
+    kind: Kind
+    first: int
+    last: int
+    message: str
+
+
+class Verification(msgspec.Struct, frozen=True, kw_only=True):
+    """The result: `ok` when nothing is wrong.
+
+    `first` and `last` are the sequences of the first and last record; `records` how many there are; `removed`
+    how many retention removed before them; `signed_through` is the sequence up to which the chain is
+    proven by a signature, `unsealed` how many records come after it; `key` the public key it was held
+    against.
+    """
+
+    ok: bool
+    log: str
+    records: int
+    first: int
+    last: int
+    removed: int
+    checkpoints: int
+    signed_checkpoints: int
+    signed_through: int
+    unsealed: int
+    key: str | None
+    findings: list[Finding]

@@ -1,0 +1,78 @@
+"""What leaves the log: a record as the documented JSON object, strangers' text made fit for a terminal.
+
+JSON is ASCII only. Text for people has every character escaped that a terminal could act on or that could
+make a name look like another one by order of writing: control characters, escape sequences, bidirectional
+marks.
+"""
+
+import json
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+from appliance.audit.record import SCHEMA_VERSION, Record
+
+_SECOND = 1_000_000_000
+
+
+class Entry(NamedTuple):
+    """A record of the log with its sequence."""
+
+    sequence: int
+    record: Record
+
+
+def rfc3339(time: int) -> str:
+    """Nanoseconds since the epoch as RFC 3339 in UTC, nine digits of a second."""
+    seconds, fraction = divmod(time, _SECOND)
+    try:
+        moment = datetime.fromtimestamp(seconds, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"@{time}ns"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction:09d}Z"
+
+
+def as_object(entry: Entry) -> dict[str, Any]:
+    """The documented JSON object of a record; `decision` is absent where nothing was decided."""
+    record = entry.record
+    rule = record.rule
+    shown: dict[str, Any] = {
+        "schema": SCHEMA_VERSION,
+        "id": record.id,
+        "time": rfc3339(record.time),
+        "sequence": entry.sequence,
+        "event": record.event,
+        "severity": record.severity.value,
+    }
+    if record.decision is not None:
+        shown["decision"] = record.decision
+    return shown | {
+        "host": record.host,
+        "caller_id": record.caller_id,
+        "category": record.category,
+        "resource": record.resource,
+        "rule": rule and {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line},
+        "revision": record.revision,
+        "reason": record.reason,
+        "duration_us": record.duration_us,
+        "detail": record.detail,
+    }
+
+
+def as_json(entry: Entry) -> str:
+    """One line of NDJSON, without the newline; ASCII only."""
+    return json.dumps(as_object(entry), separators=(",", ":"))
+
+
+def printable(text: str) -> str:
+    """Text that no terminal acts on: what is not printable is written as an escape, a backslash as two."""
+    if text.isprintable() and "\\" not in text:
+        return text
+    return "".join(_escape(character) for character in text)
+
+
+def _escape(character: str) -> str:
+    if character == "\\":
+        return "\\\\"
+    if character.isprintable():
+        return character
+    return character.encode("unicode_escape", "backslashreplace").decode("ascii")

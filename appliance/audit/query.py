@@ -1,0 +1,119 @@
+"""What is searched for, as SQL. No I/O.
+
+A condition knows the index that answers it alone; `search` measures which of them is the most selective
+and walks that one. Values are always bound, never part of the statement.
+"""
+
+from typing import NamedTuple
+
+import msgspec
+
+from appliance.audit.database import TEXT_OF_RECORD
+from appliance.audit.record import Severity
+
+_LONGEST_PATTERN = 256
+_MOST_STARS = 8
+_TRIGRAM = 3
+
+
+class FilterError(ValueError):
+    """A filter that cannot be used; the message says which part and why."""
+
+
+class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a record must be to be found; what is None or empty is not asked.
+
+    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the least one;
+    `host`, `caller_id`, `resource`, `category` and `event` are exact, or globs when they contain `*`, `?`
+    or `[`; `rule` is a glob for the rule's section or its key; `text` is found anywhere in names, reason and
+    details, regardless of case.
+    """
+
+    decision: tuple[str, ...] = ()
+    since: int | None = None
+    until: int | None = None
+    host: str | None = None
+    caller_id: str | None = None
+    resource: str | None = None
+    category: str | None = None
+    event: str | None = None
+    severity: Severity | None = None
+    rule: str | None = None
+    text: str | None = None
+
+
+class Condition(NamedTuple):
+    """A piece of a WHERE clause, its values, and the index that answers it alone (if there is one)."""
+
+    sql: str
+    values: tuple[object, ...]
+    answered_by: str | None = None
+
+
+def conditions(wanted: Filter) -> list[Condition]:
+    """The conditions of a filter, except for its text. Raises `FilterError`."""
+    found: list[Condition] = []
+    if wanted.decision:
+        marks = ", ".join("?" * len(wanted.decision))
+        found.append(
+            Condition(f"(decision IN ({marks}) AND decision IS NOT NULL)", wanted.decision, "record_decision")
+        )
+    for column in ("host", "caller_id", "resource", "category", "event"):
+        value = getattr(wanted, column)
+        if value is not None:
+            found.append(_match(column, value))
+    if wanted.severity is not None:
+        order = list(Severity)
+        names = tuple(one.value for one in order[order.index(wanted.severity) :])
+        found.append(Condition(f"severity IN ({', '.join('?' * len(names))})", names, "record_severity"))
+    if wanted.rule is not None:
+        pattern = _checked("rule", wanted.rule)
+        found.append(
+            Condition(
+                "(rule IS NOT NULL AND (rule GLOB ? OR rule_key GLOB ? OR rule_key = ?))",
+                (pattern,) * 3,
+                "record_rule",
+            )
+        )
+    if wanted.since is not None:
+        found.append(Condition("time >= ?", (_bounded(wanted.since),), "record_time"))
+    if wanted.until is not None:
+        found.append(Condition("time < ?", (_bounded(wanted.until),), "record_time"))
+    return found
+
+
+def _match(column: str, value: str) -> Condition:
+    value = _checked(column, value)
+    operator = "GLOB" if any(sign in value for sign in "*?[") else "="
+    present = "" if column == "event" else f" AND {column} IS NOT NULL"
+    return Condition(f"({column} {operator} ?{present})", (value,), f"record_{column}")
+
+
+def _checked(name: str, value: str) -> str:
+    if len(value) > _LONGEST_PATTERN:
+        raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
+    if value.count("*") > _MOST_STARS:
+        raise FilterError(f"{name}: more than {_MOST_STARS} times '*'")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise FilterError(f"{name}: not valid Unicode") from error
+    return value
+
+
+def _bounded(time: int) -> int:
+    return max(-(1 << 63), min(time, (1 << 63) - 1))
+
+
+def text_condition(text: str) -> Condition:
+    """The exact check of a text, row by row."""
+    escaped = _checked("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
+    return Condition(f"({TEXT_OF_RECORD}) LIKE ? ESCAPE '\\'", (f"%{escaped}%",))
+
+
+def text_match(text: str) -> str | None:
+    """The full-text expression for candidates of a text; None when it is too short for the index."""
+    if len(text) < _TRIGRAM or "\0" in text:
+        return None
+    trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}
+    return " AND ".join('"' + one.replace('"', '""') + '"' for one in sorted(trigrams))

@@ -1,0 +1,236 @@
+"""Reads the log: search with paging, one record with its neighbours, following, export.
+
+Works while the appliance writes and while it is stopped; takes no lock that the writer waits for. A text is
+looked up in the full-text index as far as the writer has got with it, and by reading the records after that.
+"""
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import msgspec
+
+from appliance.audit.chain import StoredColumns
+from appliance.audit.columns import from_columns
+from appliance.audit.database import COLUMNS, LogUnreadableError, open_for_reading
+from appliance.audit.ids import ID_LENGTH
+from appliance.audit.output import Entry
+from appliance.audit.query import Condition, Filter, FilterError, conditions, text_condition, text_match
+
+LARGEST_PAGE = 10_000
+_SELECTIVE = 20_000
+_Found = TypeVar("_Found")
+
+
+class Page(NamedTuple):
+    """Records found, and the cursor for the next page; None when there are no more."""
+
+    entries: list[Entry]
+    cursor: str | None
+
+
+class Shown(NamedTuple):
+    """One record, and the records of the same host or caller before and after it, in order."""
+
+    entry: Entry
+    before: list[Entry]
+    after: list[Entry]
+
+
+def search(
+    path: Path, wanted: Filter, cursor: str | None = None, limit: int = 100, *, newest_first: bool = True
+) -> Page:
+    """A page of at most `limit` records that `wanted` asks for.
+
+    `cursor` is the one of the page before. Raises `LogUnreadableError` and `FilterError`.
+    """
+    if not 1 <= limit <= LARGEST_PAGE:
+        raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
+    walk = _Walk(_sequence(cursor), newest_first)
+    return _reading(path, lambda connection: _page(connection, wanted, walk, limit))
+
+
+def show(path: Path, record_id: str, neighbours: int = 5) -> Shown | None:
+    """The record with this id (or sequence), with its neighbours; None when there is none."""
+
+    def find(connection: sqlite3.Connection) -> Shown | None:
+        column = "id" if len(record_id) == ID_LENGTH else "sequence"
+        if column == "sequence" and not (record_id.isascii() and record_id.isdecimal()):
+            return None
+        value = record_id if column == "id" else min(int(record_id[:19]), (1 << 63) - 1)
+        found = _fetch(connection, f"WHERE {column} = ? LIMIT 1", (value,))
+        if not found:
+            return None
+        return Shown(
+            found[0],
+            _neighbours(connection, found[0], neighbours, newest_first=True)[::-1],
+            _neighbours(connection, found[0], neighbours, newest_first=False),
+        )
+
+    return _reading(path, find)
+
+
+def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[Entry]:
+    """All records that `wanted` asks for, oldest first, a page in memory at a time."""
+    cursor: str | None = "0"
+    while cursor is not None:
+        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
+        yield from entries
+
+
+class Follower:
+    """What is recorded from now on. Each `poll` gives the records since the last one, oldest first."""
+
+    def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
+        """Begin after the sequence `after`, or at the end of the log."""
+        self._path = path
+        self._wanted = wanted
+        self._after = _reading(path, _last_sequence) if after is None else after
+
+    def poll(self, limit: int = 1000) -> list[Entry]:
+        """The next records, at most `limit`; empty when nothing was recorded."""
+        head = _reading(self._path, _last_sequence)
+        if head <= self._after:
+            self._after = min(self._after, head)
+            return []
+        entries, more = search(self._path, self._wanted, str(self._after), limit, newest_first=False)
+        self._after = (
+            entries[-1].sequence if more is not None else max(head, *(e.sequence for e in entries), 0)
+        )
+        return entries
+
+
+class _Walk(NamedTuple):
+    """Where a page begins (exclusive) and in which direction it goes."""
+
+    start: int | None
+    newest_first: bool
+
+    @property
+    def order(self) -> str:
+        return "DESC" if self.newest_first else "ASC"
+
+    def condition(self, column: str) -> list[Condition]:
+        if self.start is None:
+            return []
+        return [Condition(f"{column} {'<' if self.newest_first else '>'} ?", (self.start,))]
+
+
+def _sequence(cursor: str | None) -> int | None:
+    if cursor is None:
+        return None
+    if not (cursor.isdecimal() and cursor.isascii() and len(cursor) <= 18):
+        raise FilterError("cursor: not one that a search gave")
+    return int(cursor)
+
+
+def _reading(path: Path, read: Callable[[sqlite3.Connection], _Found]) -> _Found:
+    try:
+        with closing(open_for_reading(path)) as connection:
+            connection.execute("BEGIN")
+            return read(connection)
+    except (sqlite3.Error, msgspec.DecodeError, ValueError) as error:
+        if isinstance(error, FilterError):
+            raise
+        raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
+
+
+def _last_sequence(connection: sqlite3.Connection) -> int:
+    (last,) = connection.execute("SELECT coalesce(max(sequence), 0) FROM record").fetchone()
+    return int(last)
+
+
+def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> Page:
+    found = conditions(wanted)
+    index = _most_selective(connection, found)
+    if wanted.text:
+        found.append(text_condition(wanted.text))
+    words = text_match(wanted.text) if wanted.text and index is None else None
+    if words is None:
+        entries = _select(connection, found + walk.condition("sequence"), index, walk, limit + 1)
+    else:
+        entries = _select_by_text(connection, found, words, walk, limit + 1)
+    if len(entries) <= limit:
+        return Page(entries, None)
+    return Page(entries[:limit], str(entries[limit - 1].sequence))
+
+
+def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
+    """The index with the fewest candidates; None when each has so many that walking the log is quick."""
+    best, fewest = None, _SELECTIVE
+    for one in found:
+        if one.answered_by is not None:
+            count = connection.execute(
+                f"SELECT count(*) FROM (SELECT 1 FROM record INDEXED BY {one.answered_by}"  # noqa: S608  fixed names
+                f" WHERE {one.sql} LIMIT ?)",
+                (*one.values, fewest),
+            ).fetchone()[0]
+            if count < fewest:
+                best, fewest = one.answered_by, count
+    return best
+
+
+def _select(
+    connection: sqlite3.Connection, found: list[Condition], index: str | None, walk: _Walk, limit: int
+) -> list[Entry]:
+    hint = "NOT INDEXED" if index is None else f"INDEXED BY {index}"
+    tail = f"ORDER BY sequence {walk.order} LIMIT ?"
+    return _fetch(connection, f"{hint} {_where(found)} {tail}", (*_values(found), limit))
+
+
+def _select_by_text(
+    connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
+) -> list[Entry]:
+    (through,) = connection.execute("SELECT through FROM indexed").fetchone()
+    entries: list[Entry] = []
+    for indexed in (False, True) if walk.newest_first else (True, False):
+        left = limit - len(entries)
+        if left and indexed:
+            entries += _candidates(connection, found, words, walk, left)
+        elif left:
+            rest = [*found, *walk.condition("sequence"), Condition("sequence > ?", (through,))]
+            entries += _select(connection, rest, None, walk, left)
+    return entries
+
+
+def _candidates(
+    connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
+) -> list[Entry]:
+    matching = [Condition("words MATCH ?", (words,)), *walk.condition("words.rowid"), *found]
+    return _fetch(
+        connection,
+        f"{_where(matching)} ORDER BY words.rowid {walk.order} LIMIT ?",
+        (*_values(matching), limit),
+        "words CROSS JOIN record ON record.sequence = words.rowid",
+    )
+
+
+def _neighbours(
+    connection: sqlite3.Connection, entry: Entry, count: int, *, newest_first: bool
+) -> list[Entry]:
+    walk = _Walk(entry.sequence, newest_first)
+    near: dict[int, Entry] = {}
+    for column in ("host", "caller_id"):
+        value = getattr(entry.record, column)
+        if value is not None:
+            same = [Condition(f"{column} = ?", (value,)), *walk.condition("sequence")]
+            near |= {one.sequence: one for one in _select(connection, same, f"record_{column}", walk, count)}
+    return [near[sequence] for sequence in sorted(near, reverse=newest_first)][:count]
+
+
+def _where(found: list[Condition]) -> str:
+    return "WHERE " + " AND ".join(one.sql for one in found) if found else ""
+
+
+def _values(found: list[Condition]) -> tuple[object, ...]:
+    return tuple(value for one in found for value in one.values)
+
+
+def _fetch(
+    connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
+) -> list[Entry]:
+    rows = connection.execute(f"SELECT {COLUMNS} FROM {table} {tail}", values)  # noqa: S608  fixed names
+    stored = (StoredColumns(*row) for row in rows)
+    return [Entry(columns.sequence, from_columns(columns)) for columns in stored]

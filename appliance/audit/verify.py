@@ -1,0 +1,266 @@
+"""Proves that a log is complete and unchanged, or says which records are not, and how.
+
+The chain is walked once from the first record kept to the last. Where a record does not follow from the one
+before it, the records around it are tried in other places to tell a change from a removal, an insertion or a
+reordering. The checkpoints are then held against the chain, the key, and what the signer remembers.
+
+What no reading of the log can show: that records after the last signed checkpoint were cut off or written
+anew. `Verification.unsealed` says how many records that concerns.
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from appliance.audit import database
+from appliance.audit.chain import NO_CHECKPOINT, StoredColumns, genesis, record_hash
+from appliance.audit.checkpoints import CheckpointAudit, checkpoint_rows, read_remembered
+from appliance.audit.database import LogUnreadableError, open_for_reading
+from appliance.audit.findings import Finding, Kind, Verification
+from appliance.audit.signatures import pinned_key_path, read_public_key
+from appliance.audit.writer import RemovedRange
+
+_WINDOW = 64
+_MOST_FINDINGS = 1000
+_EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
+# By how many places a record may have been renumbered.
+_DISTANCES = tuple(distance for one in range(1, 1000) for distance in (one, -one))
+_WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
+
+
+def verify(path: Path, public_key: bytes | None = None, signer: Path | None = None) -> Verification:
+    """Check the log at `path` from end to end.
+
+    `public_key` (raw, 32 bytes) is the key the checkpoints must be signed with; by default the one pinned
+    beside the log. `signer` is the signer's directory, whose memory the checkpoints are held against. Raises
+    `LogUnreadableError` if there is no log, and `KeyUnreadableError` if the pinned key is no key.
+    """
+    if public_key is None and pinned_key_path(path).exists():
+        public_key = read_public_key(pinned_key_path(path))
+    try:
+        with closing(open_for_reading(path)) as connection:
+            connection.text_factory = _undecoded
+            connection.execute("BEGIN")
+            return _Verifier(connection, public_key, signer).run()
+    except sqlite3.Error as error:
+        raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
+
+
+def _undecoded(text: bytes) -> str:
+    return text.decode("utf-8", "surrogateescape")
+
+
+class _Row(NamedTuple):
+    columns: tuple[object, ...]
+    hash: bytes
+    sequence: int
+    detail: bytes
+
+    def follows(self, previous: bytes, sequence: int) -> bool:
+        """Whether this is the record that was written as `sequence` after the hash `previous`."""
+        try:
+            return record_hash(previous, (sequence, *self.columns[1:])) == self.hash
+        except UnicodeEncodeError:  # bytes that no writer stored
+            return False
+
+
+class _Verifier:
+    """One walk over one log."""
+
+    def __init__(self, connection: sqlite3.Connection, key: bytes | None, signer: Path | None) -> None:
+        self._connection = connection
+        self._key = key
+        (self._log,) = connection.execute("SELECT id FROM log").fetchone()
+        remembered = None if signer is None else read_remembered(signer, self._log)
+        self._checkpoints = CheckpointAudit(self._log, key, remembered)
+        self._findings: list[Finding] = []
+        self._sealed: dict[int, bytes] = {}
+        self._reported: dict[int, str] = {}
+        self._shift = 0
+        self._explained = 0
+        self.records = self.first = self.last = 0
+
+    def run(self) -> Verification:
+        self._check_structure()
+        removed = self._last_removal()
+        sequences = self._connection.execute("SELECT sequence FROM checkpoint")
+        self._sealed = {sequence: b"" for (sequence,) in sequences}
+        self._walk(removed)
+        self._check_checkpoints(removed)
+        audit = self._checkpoints
+        self._findings.sort(key=lambda one: one.first)
+        return Verification(
+            ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
+            removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
+            signed_checkpoints=audit.signed, signed_through=audit.signed_through,
+            unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
+            findings=self._findings,
+        )  # fmt: skip
+
+    def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
+        if len(self._findings) < _MOST_FINDINGS:
+            name = f"record {first}" if first == last else f"records {first} to {last}"
+            self._findings.append(Finding(kind, first, last, f"{name}: {message}"))
+
+    # --- the database itself --------------------------------------------------------------------------------
+
+    def _check_structure(self) -> None:
+        found = self._connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL")
+        expected = set(database.TABLES)
+        for name, sql in found:
+            if sql not in expected and name not in _WORDS_TABLES:
+                self._structure(f"{name} does not belong to a log: {sql}")
+            expected.discard(sql)
+        for sql in sorted(expected):
+            self._structure(f"missing: {sql}")
+        try:
+            for (problem,) in self._connection.execute("PRAGMA integrity_check(20)"):
+                if problem != "ok":
+                    self._structure(problem)
+        except sqlite3.DatabaseError as error:
+            self._structure(str(error))
+
+    def _structure(self, message: str) -> None:
+        self._findings.append(Finding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
+
+    def _last_removal(self) -> RemovedRange | None:
+        """What retention removed last; its record is part of the chain that is walked."""
+        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+        try:
+            row = self._connection.execute(query).fetchone()
+            if row is None:
+                return None
+            detail = msgspec.json.decode(row[0])
+            return RemovedRange(**{name: detail[name] for name in RemovedRange._fields})
+        except (msgspec.DecodeError, KeyError, TypeError, sqlite3.DatabaseError):
+            return None  # a damaged record is found when it is walked
+
+    # --- the chain ------------------------------------------------------------------------------------------
+
+    def _walk(self, removed: RemovedRange | None) -> None:
+        self.last = removed.last_sequence if removed else 0
+        previous = bytes.fromhex(removed.last_hash) if removed else genesis(self._log)
+        try:
+            for row in self._rows():
+                self.records += 1
+                self.first = self.first or row.sequence
+                previous = self._step(row, previous)
+        except sqlite3.DatabaseError as error:
+            after = self.last + 1
+            self._find(Kind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
+
+    def _step(self, row: _Row, previous: bytes) -> bytes:
+        """Check one record; gives the hash that the next one must follow."""
+        sequence, expected = row.sequence, self.last + 1
+        if sequence < expected:
+            self._find(Kind.INSERTED, sequence, sequence, "stands before the first record of the log")
+            return previous
+        self.last = sequence
+        if sequence <= self._explained:
+            return previous
+        if sequence > expected:
+            self._find(Kind.MISSING, expected, sequence - 1, "removed from the log")
+        elif not row.follows(previous, sequence - self._shift):
+            return self._explain(row, previous)
+        self._note(row, sequence - self._shift)
+        return row.hash
+
+    def _note(self, row: _Row, place: int) -> None:
+        """Remember what the checkpoints are held against."""
+        if place in self._sealed:
+            self._sealed[place] = row.hash
+        if row.columns[_EVENT] == "checkpoint":
+            try:
+                detail = msgspec.json.decode(bytes(row.detail))
+                self._reported[detail["number"]] = detail["hash"]
+            except (msgspec.DecodeError, KeyError, TypeError):
+                return  # not as the writer wrote it: found when its hash is checked
+
+    def _rows(self, after: int = -(1 << 63), limit: int = -1) -> Iterator[_Row]:
+        rows = self._connection.execute(
+            f"SELECT {database.COLUMNS}, hash FROM record NOT INDEXED WHERE sequence > ?"  # noqa: S608  fixed names
+            " ORDER BY sequence LIMIT ?",
+            (after, limit),
+        )
+        return (_Row(row[:-1], row[-1], row[0], row[_DETAIL]) for row in rows)
+
+    def _explain(self, row: _Row, previous: bytes) -> bytes:
+        """Say what happened at a record that does not follow; gives the hash to go on from."""
+        ahead = list(self._rows(row.sequence, _WINDOW))
+        place = row.sequence - self._shift
+        order = _original_order([row, *ahead], previous, place)
+        if not order:
+            return self._changed_or_renumbered(row, ahead[0] if ahead else None, place)
+        first = order[0].sequence
+        if len(order) > 1 and max(one.sequence for one in order) == row.sequence + len(order) - 1:
+            self._explained = row.sequence + len(order) - 1
+            self._find(Kind.REORDERED, row.sequence, self._explained, "not in the order they were written in")
+            for offset, one in enumerate(order):
+                self._note(one, place + offset)
+            return order[-1].hash
+        self._find(Kind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
+        self._explained = first - 1
+        self._shift += first - row.sequence
+        return previous
+
+    def _changed_or_renumbered(self, row: _Row, following: _Row | None, place: int) -> bytes:
+        plain_change = following is None or following.follows(row.hash, place + 1)
+        for distance in () if plain_change else _DISTANCES:
+            if following is not None and following.follows(row.hash, place + 1 + distance):
+                if distance > 0:
+                    self._find(
+                        Kind.MISSING, place, place + distance - 1, "removed; what follows was renumbered"
+                    )
+                else:
+                    message = "inserted with a hash of its own; what follows was renumbered"
+                    self._find(Kind.INSERTED, row.sequence + distance, row.sequence - 1, message)
+                self._shift -= distance
+                self._note(row, place + distance)
+                return row.hash
+        message = (
+            "does not have the content it was written with"
+            f" (or record {row.sequence - 1} was replaced by one with a hash of its own)"
+        )
+        self._find(Kind.CHANGED, row.sequence, row.sequence, message)
+        self._note(row, place)
+        return row.hash
+
+    # --- the checkpoints ------------------------------------------------------------------------------------
+
+    def _check_checkpoints(self, removed: RemovedRange | None) -> None:
+        before = (removed.last_checkpoint, removed.last_checkpoint_hash) if removed else (0, NO_CHECKPOINT)
+        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
+        audit = self._checkpoints
+        last = self.last - self._shift
+        try:
+            self._findings += audit.check(checkpoint_rows(self._connection), before, chain, last)
+        except sqlite3.DatabaseError as error:
+            self._structure(f"the checkpoints cannot be read: {error}")
+            return
+        for number in sorted(self._reported):
+            if number > audit.last_number:
+                message = f"checkpoint {number}: the chain has its record, but it was removed"
+                self._findings.append(Finding(Kind.CHECKPOINT_MISSING, number, number, message))
+
+
+def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
+    """The records of `rows` in the order they were written from `place` on.
+
+    As far as it can be told: up to where they fill their places again (a reordering), or to the end.
+    """
+    order: list[_Row] = []
+    left = list(rows)
+    while left:
+        found = next((one for one in left if one.follows(previous, place + len(order))), None)
+        if found is None:
+            break
+        order.append(found)
+        left.remove(found)
+        previous = found.hash
+        if max(one.sequence for one in order) == rows[0].sequence + len(order) - 1:
+            break
+    return order
