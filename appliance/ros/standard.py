@@ -1,4 +1,4 @@
-"""The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the services beside them.
+"""The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the common services.
 
 The store has no services, and not the message of `/tf`; these few are written here.
 """
