@@ -206,7 +206,9 @@ def require_everything() -> None:
 
 
 def demo(
-    hold: Annotated[bool, typer.Option(help="Keep everything running at the end, until Ctrl-C")] = False,
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Keep everything running at the end, until Ctrl-C")
+    ] = False,
 ) -> None:
     """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
 
