@@ -13,6 +13,7 @@ working directory.
 
 import difflib
 import re
+import sys
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -49,8 +50,13 @@ class ConfigError(Exception):
     """The configuration is wrong; `mistakes` has everything that is."""
 
     def __init__(self, mistakes: list[Mistake]) -> None:
-        super().__init__("\n".join(map(str, mistakes)))
-        self.mistakes = mistakes
+        self.mistakes = sorted(mistakes, key=_line_of)
+        super().__init__("\n".join(map(str, self.mistakes)))
+
+
+def _line_of(mistake: Mistake) -> int:
+    line = mistake.place.rpartition(":")[2]
+    return int(line) if line.isdigit() else sys.maxsize
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
@@ -93,7 +99,9 @@ class _Gathered:
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             raise ConfigError([Mistake(f"{file}:{line}", f"is not YAML: {error.problem}")]) from error
-        except (yaml.YAMLError, RecursionError, ValueError) as error:
+        except RecursionError as error:
+            raise ConfigError([Mistake(str(file), "is nested too deep, or refers to itself")]) from error
+        except (yaml.YAMLError, ValueError) as error:
             raise ConfigError([Mistake(str(file), f"is not YAML: {error}")]) from error
         if values is None:
             return
@@ -165,8 +173,10 @@ class _Gathered:
                 self._note_places(file, value, (*path, index))
 
     def _mistake(self, kind: str, path: KeyPath, text: str, context: Any) -> Mistake:
+        if kind == "invalid_key":
+            path = (*path[:-1], str(path[-1]))
         place = self._place_of(path)
-        if kind == "extra_forbidden":
+        if kind in ("extra_forbidden", "invalid_key"):
             return Mistake(place, _unknown_key(path))
         if kind == "missing":
             return Mistake(place, f"{_dotted(path)} must be given")
@@ -178,7 +188,10 @@ class _Gathered:
         for length in range(len(path), 0, -1):
             if path[:length] in self._places:
                 return self._places[path[:length]]
-        return "configuration"
+        # A table where a plain value belongs: what is in it was said somewhere.
+        return next(
+            (place for known, place in self._places.items() if known[: len(path)] == path), "configuration"
+        )
 
     def _value_at(self, path: KeyPath) -> Any:
         value: Any = self._values

@@ -1,0 +1,76 @@
+"""Tests of `appliance.config`."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from appliance.config import Settings, load_resolved, split_address
+
+
+def test_every_key_has_a_default() -> None:
+    """An empty configuration is a whole one, with the limits of the design."""
+    settings = Settings()
+    assert settings.listen_address == ("0.0.0.0", 11311)
+    assert settings.limits.body_bytes == 16 * 1024 * 1024
+    assert settings.limits.connections_per_host == 512
+    assert settings.relay.queue_bytes == 64 * 1024 * 1024
+    assert settings.audit.durability == "batched"
+
+
+def test_children_read_what_the_supervisor_wrote(tmp_path: Path) -> None:
+    """The resolved settings survive the way through the file unchanged."""
+    settings = Settings.model_validate(
+        {
+            "listen": "[::1]:0",
+            "advertise": [{"network": "10.0.0.0/8", "address": "10.0.0.1"}],
+            "limits": {"body_bytes": "2MiB"},
+            "audit": {"retention_days": 30},
+        }
+    )
+    file = tmp_path / "config.json"
+    file.write_text(settings.model_dump_json())
+    assert load_resolved(file) == settings
+    assert load_resolved(file).limits.body_bytes == 2 * 1024 * 1024
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("0.0.0.0:11311", ("0.0.0.0", 11311)),
+        ("[::]:11311", ("::", 11311)),
+        ("robot-1.local:0", ("robot-1.local", 0)),
+    ],
+)
+def test_an_address_is_host_and_port(text: str, address: tuple[str, int]) -> None:
+    """IPv4, IPv6 in brackets and names, with any port."""
+    assert split_address(text) == address
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "11311",
+        "host",
+        "host:",
+        ":1",
+        "host:65536",
+        "host:-1",
+        "::1:11311",
+        "[::1:1",
+        "a b:1",
+        "[x]:1",
+        "h:\u0661",
+    ],
+)
+def test_what_is_no_address_is_refused(text: str) -> None:
+    """Anything else is an error, not a guess."""
+    with pytest.raises(ValidationError):
+        Settings(listen=text)
+
+
+@pytest.mark.parametrize("value", [0, -1, float("inf"), float("nan"), "soon"])
+def test_a_time_is_a_positive_number(value: object) -> None:
+    """No limit can be switched off by an odd number."""
+    with pytest.raises(ValidationError):
+        Settings.model_validate({"limits": {"header_seconds": value}})

@@ -1,0 +1,147 @@
+"""Tests of `appliance.config_sources`."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.config import Settings
+from appliance.config_sources import ConfigError, resolve
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A configuration file that is yet to be written."""
+    return tmp_path / "appliance.yaml"
+
+
+def mistakes(
+    file: Path | None, environment: dict[str, str] | None = None, flags: dict[str, Any] | None = None
+) -> list[str]:
+    """What is wrong, one line each."""
+    with pytest.raises(ConfigError) as caught:
+        resolve(file, environment or {}, flags or {})
+    return [str(mistake) for mistake in caught.value.mistakes]
+
+
+def test_later_sources_override_earlier_ones(file: Path) -> None:
+    """File over default, environment over file, flag over environment; what is not said stays."""
+    file.write_text("listen: 127.0.0.1:1\nrosmaster_port: 1\nlimits: {nesting: 7, elements: 8}\n")
+    environment = {"ROSRV_ROSMASTER_PORT": "2", "ROSRV_LISTEN": "127.0.0.1:2", "ROSRV_LIMITS__NESTING": "9"}
+    settings = resolve(file, environment, {"listen": "127.0.0.1:3", "isolation": None})
+    assert settings.listen == "127.0.0.1:3"
+    assert settings.rosmaster_port == 2
+    assert (settings.limits.nesting, settings.limits.elements) == (9, 8)
+    assert settings.isolation == "none"
+
+
+def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
+    """File and line, variable or flag; and the nearest key for one that nobody knows."""
+    file.write_text(
+        "listn: 0.0.0.0:1\nlimits:\n  nesting: deep\n  bodybytes: 1\naudit:\n  durability: sometimes\n"
+    )
+    found = mistakes(file, {"ROSRV_RELAYS": "many"}, {"isolation": "vm"})
+    assert f"{file}:1: unknown key listn: did you mean listen?" in found
+    assert f"{file}:4: unknown key limits.bodybytes: did you mean body_bytes?" in found
+    assert any(one.startswith(f"{file}:3: limits.nesting: ") and "'deep'" in one for one in found)
+    assert any(
+        one.startswith(f"{file}:6: audit.durability: ") and "'strict' or 'batched'" in one for one in found
+    )
+    assert any(one.startswith("ROSRV_RELAYS: relays: ") for one in found)
+    assert any(one.startswith("--isolation: isolation: ") and "'vm'" in one for one in found)
+    assert len(found) == 6
+
+
+def test_a_key_on_the_wrong_level_is_told_where_it_belongs(file: Path) -> None:
+    """A key that exists elsewhere is named with its section."""
+    file.write_text("queue_messages: 10\n")
+    assert mistakes(file) == [f"{file}:1: unknown key queue_messages: did you mean relay.queue_messages?"]
+
+
+def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
+    """The place of a mistake is the entry, not the list."""
+    file.write_text(
+        "advertise:\n- {network: 10.0.0.0/8, address: 10.0.0.1}\n"
+        "- network: 10.0.0.0/99\n  address: 10.0.0.1\n  adress: 1\n"
+    )
+    found = mistakes(file)
+    assert [one.split(": ")[0] for one in found] == [f"{file}:3", f"{file}:5"]
+    assert found[1].endswith("did you mean address?")
+
+
+def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
+    """YAML would silently take the last one."""
+    file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
+    assert mistakes(file) == [f"{file}:3: relays is given a second time"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: [1\n", ":2: is not YAML"),
+        ("- 1\n", ":1: must have lines of the form"),
+        ("listen: !!python/object/apply:os.system [true]\n", "is not YAML"),
+        ("a: &x [*x]\n", "refers to itself"),
+        ("1: 2\n", "unknown key 1"),
+        ("? [1, 2]\n: 3\n", "is not YAML"),
+        ("limits: 5\n", ":1: limits: "),
+        ("limits:\n", ":1: limits: "),
+        ("listen: \x00\n", "is not YAML"),
+        ("[" * 3000, "nested too deep"),
+    ],
+)
+def test_a_strange_file_is_an_error_in_words(file: Path, text: str, expected: str) -> None:
+    """Whatever the file holds, the answer says what is wrong with it and where."""
+    file.write_text(text)
+    assert any(expected in one for one in mistakes(file))
+
+
+def test_a_file_that_is_named_must_be_there(tmp_path: Path) -> None:
+    """Only the file nobody asked for may be missing."""
+    assert "cannot be read: No such file" in mistakes(tmp_path / "missing.yaml")[0]
+    assert (
+        "cannot be read: No such file" in mistakes(None, {"ROSRV_CONFIG": str(tmp_path / "missing.yaml")})[0]
+    )
+
+
+def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a name, `appliance.yaml` here is read; without that, the defaults hold."""
+    monkeypatch.chdir(tmp_path)
+    assert resolve(None, {}, {}).rosmaster_port == Settings().rosmaster_port
+    (tmp_path / "appliance.yaml").write_text("rosmaster_port: 5\n")
+    assert resolve(None, {}, {}).rosmaster_port == 5
+
+
+def test_relative_paths_start_where_they_are_written(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the file they are relative to it, in a flag to the working directory; absolute afterwards."""
+    monkeypatch.chdir("/")
+    file.write_text("policy: policies/a.ini\nstate: /srv/state\n")
+    settings = resolve(file, {}, {})
+    assert settings.policy == file.parent / "policies/a.ini"
+    assert settings.state == Path("/srv/state")
+    assert resolve(file, {}, {"policy": Path("b.ini")}).policy == Path("/b.ini")
+
+
+def test_a_variable_that_nobody_knows_is_a_mistake() -> None:
+    """A typing error in the environment is not passed over."""
+    assert mistakes(None, {"ROSRV_LISTN": "x"}) == ["ROSRV_LISTN: unknown key listn: did you mean listen?"]
+    assert "ROSRV_LISTEN__PORT: " in mistakes(None, {"ROSRV_LISTEN__PORT": "1"})[0]
+
+
+def test_variables_of_others_are_left_alone() -> None:
+    """Kubernetes' links to a service named rosrv and the token of the other verbs are no configuration."""
+    environment = {
+        "ROSRV_SERVICE_HOST": "10.0.0.1",
+        "ROSRV_SERVICE_PORT_MASTER": "11311",
+        "ROSRV_PORT": "tcp://10.0.0.1:11311",
+        "ROSRV_PORT_11311_TCP_ADDR": "10.0.0.1",
+        "ROSRV_TOKEN": "secret",
+    }
+    assert resolve(None, environment, {}).listen == Settings().listen
+
+
+def test_a_list_in_the_environment_is_yaml() -> None:
+    """Structured values can be given by a variable as well."""
+    value = "[{network: 10.0.0.0/8, address: 10.1.1.1}]"
+    assert str(resolve(None, {"ROSRV_ADVERTISE": value}, {}).advertise[0].address) == "10.1.1.1"
+    assert mistakes(None, {"ROSRV_ADVERTISE": "[{"})[0].startswith("ROSRV_ADVERTISE: is not YAML")
