@@ -9,7 +9,6 @@ from appliance.policy.commands import STARTING_COMMANDS
 from appliance.policy.findings import Findings, quoted
 from appliance.policy.groups import Groups
 from appliance.policy.hosts import EVERYONE, Atom, HostTable, Network
-from appliance.policy.keys import Form
 from appliance.policy.model import Category
 from appliance.policy.policy import CompiledRule, RuleTable
 from appliance.policy.reader import SectionText
@@ -37,7 +36,7 @@ def lint(
 
 def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
     for table in tables.values():
-        everything = [r for r in table.rules if r.key and r.key.form is Form.SUBTREE and r.key.literal == "/"]
+        everything = [r for r in table.rules if r.key and r.key.text == "/**"]
         if everything and table.default:
             line = everything[0].rule.line
             text = f"never decides: {everything[0].rule.key} at line {line} matches every name before it"

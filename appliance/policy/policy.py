@@ -10,16 +10,16 @@ Invariants:
 """
 
 import ipaddress
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from appliance.policy import commands
 from appliance.policy.findings import Finding, quoted
 from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
-from appliance.policy.keys import Key, KeyTree, is_parameter_key
+from appliance.policy.keys import Key, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS, PHRASES
+from appliance.policy.tree import KeyTree
 from appliance.ros.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 21001)
@@ -171,11 +171,11 @@ class Policy:
         atoms = self._hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
         if namespace:
-            inherited = table.tree.find_for_subtree(request.resource) or table.default
+            inherited = table.tree.inherited(request.resource) or table.default
             if inherited is None:
                 reason = f"{_what(request, may=False)}: no key of [Parameters] matches what is below it"
                 return _decided(False, None, reason, table.audit_only)
-            deciding = itertools.chain(deciding, [inherited])
+            deciding.append(inherited)
         for rule in deciding:
             if not rule.grants(atoms):
                 reason = f"{_what(request, may=False)} with what is below it: {_only(rule)}"
@@ -213,30 +213,25 @@ class Policy:
 
     def _decide(self, request: Request) -> Decision:
         category = request.category
-        table = self._tables[category]
-        if category not in self._present:
-            return self._without_section(request, table)
         name = request.resource
         if category is Category.COMMAND:
-            return self._decide_command(request, table)
-        if not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
-            return _decided(False, None, f"{quoted(name)} is not a resolved ROS name", False)
-        return self._apply(request, table, table.tree.find(name) or table.default)
-
-    def _decide_command(self, request: Request, table: RuleTable) -> Decision:
-        name = commands.ALIASES.get(request.resource, request.resource)
-        if name not in commands.COMMANDS:
-            elsewhere = commands.DECIDED_ELSEWHERE.get(name)
-            known = (
-                f"{name} is decided by {elsewhere}" if elsewhere else f"{quoted(name)} is not a known call"
-            )
-            return _decided(False, None, known, False)
+            name = commands.ALIASES.get(name, name)
+            if name not in commands.COMMANDS:
+                return Decision(False, None, _not_a_command(name))
+        elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
+            return Decision(False, None, f"{quoted(name)} is not a resolved ROS name")
+        table = self._tables[category]
         found = table.tree.find(name)
-        if name not in commands.NAMED_ONLY:
-            return self._apply(request, table, found or table.default)
+        if category is Category.COMMAND and name in commands.NAMED_ONLY:
+            return self._decide_named_only(request, table, found)
+        if category not in self._present:
+            return self._without_section(request, table)
+        return self._apply(request, table, found or table.default)
+
+    def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:
             reason = f"{_what(request, may=False)}: only its own key in [Commands] grants it, never default"
-            return _decided(False, None, reason, False)
+            return Decision(False, None, reason)
         decision = self._apply(request, table, found)
         # audit-only is for learning what a robot does; no robot needs these calls, so they never just pass.
         return replace(decision, allowed=False, would_deny=False) if decision.would_deny else decision
@@ -267,6 +262,13 @@ def needs_node_rule(request: Request) -> bool:
     if request.category is Category.COMMAND:
         return request.resource in commands.NODE_RULE_COMMANDS
     return request.category in {Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER}
+
+
+def _not_a_command(name: str) -> str:
+    elsewhere = commands.DECIDED_ELSEWHERE.get(name)
+    if elsewhere is not None:
+        return f"{name} is decided by {elsewhere}"
+    return f"{quoted(name)} is not a call that the appliance knows"
 
 
 def node_request(request: Request) -> Request:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from appliance.policy.findings import Findings, quoted
 
-MAXIMUM_CHARACTERS = 4 * 1024 * 1024
+MAXIMUM_CHARACTERS = 2 * 1024 * 1024
 """The longest policy that is read; one of 10,000 rules has about 600,000 characters."""
 
 _WORD = re.compile(r"[^\s,]+", re.ASCII)

@@ -3,13 +3,16 @@
 from appliance.policy import commands
 from appliance.policy.findings import Findings, meant, quoted
 from appliance.policy.groups import Groups
-from appliance.policy.keys import BadKeyError, Form, Key, parse_key
+from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable
 from appliance.policy.reader import Entry, SectionText, Word
 from appliance.policy.sections import PARAMETERS, Decider
 
 DEFAULT = "default"
+MAXIMUM_INNER_STARS = 1000
+"""Keys with a star before the end, in all sections: they make looking up a name branch."""
+
 _VERBS = {"read": Category.READ, "write": Category.WRITE}
 
 
@@ -20,6 +23,8 @@ class RuleCompiler:
         self.tables = {category: RuleTable() for category in Category}
         self._file = file
         self._groups = groups
+        self._patterns: dict[tuple[Category, str, bool], list[tuple[Key, int]]] = {}
+        self._inner_stars = 0
         self._findings = findings
 
     def add_section(self, decider: Decider, section: SectionText) -> None:
@@ -43,10 +48,29 @@ class RuleCompiler:
             key = self._key(category, name)
             if key is None and name.text != DEFAULT:
                 continue
+            if key is not None and not key.exact and not self._fits(category, key, name):
+                continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
             shown = self._groups.shown(entry.values)
             atoms = frozenset(atom for _, atom in words)
             self._add(category, CompiledRule(rule, key, atoms, words, shown, entry.key.column))
+
+    def _fits(self, category: Category, key: Key, name: Word) -> bool:
+        """Whether a pattern ties with none before it, and is not one too many."""
+        self._inner_stars += key.inner_star
+        if self._inner_stars > MAXIMUM_INNER_STARS:
+            text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, as /*/state: use fewer"
+            self._error(name, text)
+            return False
+        alike = self._patterns.setdefault((category, key.literal, key.subtree), [])
+        for other, line in alike:
+            if key.ties_with(other):
+                both = f"{quoted(name.text)} and {quoted(other.text)} (line {line})"
+                text = "are equally specific and match the same names: change one of them"
+                self._error(name, f"{both} {text}")
+                return False
+        alike.append((key, name.line))
+        return True
 
     def _add(self, category: Category, rule: CompiledRule) -> None:
         table = self.tables[category]
@@ -86,7 +110,7 @@ class RuleCompiler:
     def _command(self, name: Word) -> Key | None:
         elsewhere = commands.DECIDED_ELSEWHERE.get(name.text)
         if name.text in commands.COMMANDS:
-            return Key(Form.EXACT, name.text)
+            return command_key(name.text)
         if elsewhere is not None:
             self._error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
         elif "*" in name.text:

@@ -1,0 +1,86 @@
+"""What the policy verbs read: policies, who is who, and requests out of files or the audit log."""
+
+import ipaddress
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.policy import Address, Category, Policy, Request, compile_policy
+from appliance.policy.actions import find_hosts
+from appliance.policy.hosts import Network, canonical_address, canonical_network
+
+Robot = Annotated[
+    list[str] | None, typer.Option("--robot", metavar="ADDRESS", help="What the group robot is (repeatable)")
+]
+Enrolled = Annotated[
+    list[str] | None,
+    typer.Option("--enrolled", metavar="NAME=ADDRESS", help="An enrolled host, for host:NAME (repeatable)"),
+]
+
+
+def usage_error(text: str) -> typer.Exit:
+    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    typer.echo(f"rosrv policy: {text}", err=True)
+    return typer.Exit(2)
+
+
+def read_text(file: Path) -> str:
+    """The text of a file; what is no UTF-8 becomes U+FFFD, which no policy may contain outside comments."""
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise usage_error(f"cannot read {file}: {error.strerror}") from error
+
+
+def compile_file(file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
+    """The policy in a file; raises `PolicyError`."""
+    networks = [_network(text) for text in robot or ()]
+    hosts = dict(_enrolled(text) for text in enrolled or ())
+    return compile_policy(read_text(file), file=str(file), hosts=hosts, robot=networks)
+
+
+def _network(text: str) -> Network:
+    try:
+        return canonical_network(ipaddress.ip_network(text))
+    except ValueError as error:
+        raise usage_error(f"--robot: {error}") from error
+
+
+def _enrolled(text: str) -> tuple[str, Address]:
+    name, _, address = text.partition("=")
+    try:
+        return name, canonical_address(ipaddress.ip_address(address))
+    except ValueError as error:
+        raise usage_error(f"--enrolled: expected NAME=ADDRESS, found {text!r}") from error
+
+
+def find_host(text: str, policy: Policy) -> Address:
+    """The address somebody asks from; `robot` with several addresses is its first."""
+    return find_hosts(text, policy)[0]
+
+
+def requests_of_file(file: Path) -> Iterator[Request]:
+    """Requests from NDJSON with `host`, `caller_id`, `category`, `resource`, one object per line."""
+    for number, line in enumerate(read_text(file).split("\n"), start=1):
+        if not line.strip():
+            continue
+        try:
+            fields = json.loads(line)
+            yield request_of(fields["host"], fields["caller_id"], fields["category"], fields["resource"])
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise usage_error(f"{file}:{number}: not a request: {reason}") from error
+
+
+def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
+    """A request from the strings it was written as; raises ValueError."""
+    address = canonical_address(ipaddress.ip_address(host))
+    return Request(address, str(caller_id or ""), Category(category), str(resource))
+
+
+def requests_of_audit_log(state: Path) -> Iterator[Request]:
+    """Every request that the audit log of a state directory has a decision on."""
+    raise usage_error(f"{state}: the audit log cannot be read here; use --requests")
