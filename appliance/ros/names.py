@@ -23,6 +23,7 @@ _SHOWN = 80  # characters of a refused name that are repeated in the error
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
+_TOOL = re.compile(r"(?:/[A-Za-z0-9_-]+)+\Z")
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
 # Parameters come from YAML files, where `/arm/joint-1.left/gains` and `/analyzers/Base Driver` are common.
 _PARAMETER = re.compile(
@@ -67,6 +68,13 @@ def check_caller_id(caller_id: str) -> str:
     return caller_id
 
 
+def check_tool_id(caller_id: str) -> str:
+    """Like `check_caller_id`, for callers that are no nodes: `rosparam` calls itself `/rosparam-4711`."""
+    if _TOOL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
+        return check_caller_id(caller_id)
+    return caller_id
+
+
 def is_global_name(name: str) -> bool:
     """Whether `name` is a canonical global name (`/a/b`; not `/`, not `//a`, not `a`)."""
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
@@ -91,7 +99,7 @@ def join(namespace: str, name: str) -> str:
 
 def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
     if len(name) > MAX_NAME_LENGTH or grammar.match(name) is None:
-        raise InvalidNameError(_refusal(name))
+        raise InvalidNameError(_refusal(name, grammar))
     first = name[0]
     if first == "/":
         resolved = name
@@ -104,21 +112,24 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
     return resolved.rstrip("/") or "/"
 
 
-def _refusal(name: str) -> str:
+def _refusal(name: str, grammar: re.Pattern[str]) -> str:
     if not name:
         return "empty name: a ROS name has at least one character"
     if len(name) > MAX_NAME_LENGTH:
         return f"name {_show(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
     for position, character in enumerate(name):
-        if not (
-            character.isascii()
-            and (character.isalnum() or character in "_/" or (character == "~" and not position))
-        ):
-            return (
-                f"name {_show(name)}: character {position + 1} is {character!a}; "
-                "a ROS name has letters, digits, '_' and '/'"
+        if character != "~" and grammar.match(f"/a{character}a") is None:
+            allowed = (
+                "printable ASCII without quotes, '*', '?' and '\\'"
+                if grammar is _PARAMETER
+                else "letters, digits, '_', '/'"
             )
-    return f"name {_show(name)}: a ROS name starts with a letter, '/' or '~'"
+            return f"name {_show(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
+    if grammar is _PARAMETER:
+        return (
+            f"name {_show(name)}: '~' stands in front only, and no part of a key starts or ends with a space"
+        )
+    return f"name {_show(name)}: a ROS name starts with a letter, '/' or '~', and '~' stands nowhere else"
 
 
 def _show(name: str) -> str:

@@ -3,7 +3,7 @@
 Reading is a walk over one table, `_GRAMMAR`: what may stand in which element, in which order. Elements,
 attributes, text between elements and values that the table or XML-RPC do not know are refused. Beside the
 specification it takes what ROS clients send: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and
-`nan`, space around numbers, CDATA sections (rosnodejs).
+`nan`, space around numbers, CDATA sections (rosnodejs), the extensions of Apache XML-RPC (rosjava).
 
 Invariants:
 
@@ -27,12 +27,15 @@ _HEAD = re.compile(
     rb"(?:<\?xml[ \t\r\n]+version[ \t\r\n]*=[ \t\r\n]*['\"]1\.0['\"]"
     rb"(?:[ \t\r\n]+encoding[ \t\r\n]*=[ \t\r\n]*['\"]([A-Za-z0-9._-]{1,40})['\"])?"
     rb"(?:[ \t\r\n]+standalone[ \t\r\n]*=[ \t\r\n]*['\"](?:yes|no)['\"])?[ \t\r\n]*\?>)?"
-    rb"[ \t\r\n]*<([A-Za-z]{1,40})[ \t\r\n]*>"
+    rb"[ \t\r\n]*<([A-Za-z]{1,40})"
+    # rosjava (Apache XML-RPC) declares its extensions always
+    rb"(?:[ \t\r\n]+xmlns:ex=['\"]http://ws\.apache\.org/xmlrpc/namespaces/extensions['\"])?[ \t\r\n]*>"
 )
 _ENCODINGS = frozenset({b"utf-8", b"us-ascii", b"iso-8859-1"})
 _SPACE = " \t\r\n"
 
-_SCALARS = ("i4", "int", "boolean", "double", "string", "dateTime.iso8601", "base64", "nil")
+_SCALARS = ("i4", "int", "boolean", "double", "string", "dateTime.iso8601", "base64", "nil",
+            "ex:i1", "ex:i2", "ex:i8", "ex:float", "ex:nil")  # fmt: skip
 _TYPES = (*_SCALARS, "array", "struct")
 
 # Inside an element that is in this state, which child may start, and the state the element is in after it.
@@ -130,7 +133,7 @@ class Document:
 
     def _start(self, tag: str, attributes: list[str]) -> None:
         follow = _GRAMMAR[self._state].get(tag)
-        if follow is None or attributes:
+        if follow is None or (attributes and self._state != "document"):  # the root's: see _HEAD
             raise self._error(f"<{tag[:40]}> {'with attributes' if follow else f'inside {self._place()}'}")
         if self._text:
             self._refuse_text()
@@ -269,6 +272,11 @@ _READ: Mapping[str, Callable[[Document], Value]] = {
     "dateTime.iso8601": Document._date_time,
     "base64": Document._base64,
     "nil": Document._nil,
+    "ex:i1": Document._integer,
+    "ex:i2": Document._integer,
+    "ex:i8": Document._integer,
+    "ex:float": Document._double,
+    "ex:nil": Document._nil,
     "name": Document._member_name,
     "methodName": Document._method_name,
 }

@@ -155,6 +155,10 @@ def test_refusal_names_the_character_and_its_place() -> None:
         names.resolve("/a b", "/talker")
     with pytest.raises(InvalidNameError, match="starts with a letter"):
         names.resolve("1a", "/talker")
+    with pytest.raises(InvalidNameError, match=r"character 4 is '\?'; allowed are printable ASCII"):
+        names.resolve_parameter("a-b?", "/talker")
+    with pytest.raises(InvalidNameError, match="starts or ends with a space"):
+        names.resolve_parameter("/a b/ c", "/talker")
     with pytest.raises(InvalidNameError, match="2001 characters; at most 1024"):
         names.resolve("/" + "a" * 2000, "/talker")
 

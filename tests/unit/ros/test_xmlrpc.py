@@ -197,6 +197,22 @@ def test_values_as_ros_clients_write_them(element: str, expected: Value) -> None
     assert type(value) is type(expected)
 
 
+def test_rosjava_calls_are_read() -> None:
+    """The namespace and the extensions that Apache XML-RPC writes are understood, within ROS's ranges."""
+    namespace = "http://ws.apache.org/xmlrpc/namespaces/extensions"
+    head = f'<?xml version="1.0" encoding="UTF-8"?><methodCall xmlns:ex="{namespace}">'
+    values = "<value>/a</value>", "<value><ex:nil/></value>", "<value><ex:i8>7</ex:i8></value>"
+    params = "".join(f"<param>{value}</param>" for value in values)
+    body = f"{head}<methodName>setParam</methodName><params>{params}</params></methodCall>"
+    assert parse_call(body.encode()) == MethodCall("setParam", ("/a", None, 7))
+    with pytest.raises(ProtocolError, match="32 bits"):
+        parse_call(body.replace(">7<", ">3000000000<").encode())
+    answer = (
+        f"<methodResponse xmlns:ex='{namespace}'><params><param>{values[0]}</param></params></methodResponse>"
+    )
+    assert parse_response(answer.encode()) == "/a"
+
+
 def test_calls_without_parameters() -> None:
     """A call may have no parameters, with or without an empty element for them."""
     assert parse_call(b"<methodCall><methodName>m</methodName></methodCall>") == MethodCall("m", ())
@@ -260,7 +276,8 @@ ENTITY_BOMB = (
         (call("<value><int>1</int>x</value>"), "text 'x' between"),
         (call("<value><int>1</int><int>1</int></value>"), "<int>"),
         (call("<value a='1'/>"), "with attributes"),
-        (call("<value><ex:nil/></value>"), "<ex:nil>"),
+        (call("<value><ex:dom/></value>"), "<ex:dom>"),
+        (b"<methodCall xmlns:ex='urn:other'><methodName>m</methodName></methodCall>", "byte 0"),
         (call("<value><i8>1</i8></value>"), "<i8>"),
         (call("<value><nil>x</nil></value>"), "text in <nil/>"),
         (call("<value><Int>1</Int></value>"), "<Int>"),
