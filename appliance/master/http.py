@@ -17,6 +17,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from typing import cast
 
 import httptools
 
@@ -189,8 +190,7 @@ class _Connection(asyncio.Protocol):
     # --- asyncio.Protocol ---
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - narrows the type for mypy
-        self._transport = transport
+        self._transport = cast(asyncio.Transport, transport)
         peername, sockname = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
         if not peername:  # gone before it was accepted
             self._closing = True

@@ -21,7 +21,7 @@ from appliance.master.places import NoPortError
 from appliance.master.registry import Incarnation
 from appliance.policy.model import Category, Decision
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
-from appliance.ros.names import check_caller_id
+from appliance.ros.names import check_caller_id, check_tool_id
 from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 
 if TYPE_CHECKING:
@@ -183,8 +183,10 @@ def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[C
     caller_id = params[0]
     if not isinstance(caller_id, str):
         raise ProtocolError("caller_id must be a string")
-    if caller_id or not call.reads:
+    if call.identity is Identity.NODE:
         check_caller_id(caller_id)
+    elif caller_id or not call.reads:
+        check_tool_id(caller_id)
     caller = replace(caller, caller_id=caller_id)
     return caller, canonicalise(call.parameters, required, caller_id, params[1:])
 

@@ -130,8 +130,10 @@ class StateStore:
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
         """Everything that is kept, registrations in order."""
         incarnations = [
-            IncarnationRow(*row[:7], own=bool(row[7]), life=row[8], changed=row[9])
-            for row in self._database.query("SELECT * FROM incarnation ORDER BY changed")
+            IncarnationRow(key, name, host, api, told, outer, relay, bool(own), life, changed)
+            for key, name, host, api, told, outer, relay, own, life, changed in self._database.query(
+                "SELECT * FROM incarnation ORDER BY changed"
+            )
         ]
         registrations = [
             RegistrationRow(*row)
