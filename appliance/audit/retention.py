@@ -12,18 +12,20 @@ _DAY = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class Retention:
-    """Keep records for `days` (None: for ever) and the log below `size` bytes."""
+    """Keep records for `days` (None: for ever) and the log below `size` bytes (None: any)."""
 
     days: float | None = None
-    size: int = 4 << 30
+    size: int | None = None
 
     def __post_init__(self) -> None:
-        if (self.days is not None and self.days <= 0) or self.size < 1 << 20:
+        if (self.days is not None and self.days <= 0) or (self.size is not None and self.size < 1 << 20):
             raise ValueError("retention needs more than 0 days and at least 1 MiB")
 
     def excess(self, size: int) -> str | None:
         """Why the oldest records must go from a log of `size` bytes; None when it is not too large."""
-        return f"the log was larger than {self.size} bytes" if size > self.size else None
+        if self.size is None or size <= self.size:
+            return None
+        return f"the log was larger than {self.size} bytes"
 
     def oldest_kept(self, now: int) -> int | None:
         """Records before this time (nanoseconds since the epoch) are too old; None when none is."""

@@ -89,6 +89,11 @@ class Follower:
         self._wanted = wanted
         self._after = _reading(path, _last_sequence) if after is None else after
 
+    @property
+    def position(self) -> int:
+        """The sequence after which the next poll begins."""
+        return self._after
+
     def poll(self, limit: int = 1000) -> list[Entry]:
         """The next records, at most `limit`; empty when nothing was recorded."""
         head = _reading(self._path, _last_sequence)

@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from appliance.cli import config, demo, policy, up
+from appliance.cli import audit, config, demo, policy, up
 from appliance.config_sources import ConfigError
 from appliance.supervisor.errors import StartError
 
@@ -16,6 +16,7 @@ app = typer.Typer(
 )
 app.command()(up.up)
 app.command()(demo.demo)
+app.add_typer(audit.app, name="audit")
 app.add_typer(policy.app, name="policy")
 app.add_typer(config.app, name="config")
 

@@ -1,0 +1,131 @@
+"""How audit records look to a person: a table on a terminal, plain lines in a pipe.
+
+Strangers' text is escaped (`printable`) and handed to the terminal as text, never as markup.
+"""
+
+import sys
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from appliance.audit.findings import Verification
+from appliance.audit.output import Entry, printable, rfc3339
+from appliance.audit.record import Record, Severity
+from appliance.audit.search import Shown
+
+_STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
+_MILLISECONDS = 23
+
+
+def print_entries(entries: list[Entry]) -> None:
+    """Records in the order given."""
+    if sys.stdout.isatty():
+        console = Console(highlight=False)
+        console.print(_table(entries))
+    else:
+        for entry in entries:
+            write(line(entry))
+
+
+def line(entry: Entry) -> str:
+    """One record as one line: time, sequence, decision, event, who, what, why."""
+    record = entry.record
+    parts = [
+        rfc3339(record.time),
+        f"#{entry.sequence}",
+        (record.decision or record.severity.value).upper(),
+        record.event,
+        record.host,
+        record.caller_id,
+        record.category,
+        record.resource,
+    ]
+    shown = " ".join(printable(part) for part in parts if part)
+    return shown + (f": {_why(record)}" if _why(record) else "")
+
+
+def print_shown(shown: Shown) -> None:
+    """One record in full, between its neighbours."""
+    record = shown.entry.record
+    fields = {
+        "id": record.id,
+        "time": rfc3339(record.time),
+        "sequence": str(shown.entry.sequence),
+        "event": record.event,
+        "severity": record.severity.value,
+        "decision": record.decision,
+        "host": record.host,
+        "caller_id": record.caller_id,
+        "category": record.category,
+        "resource": record.resource,
+        "rule": _rule(record),
+        "revision": None if record.revision is None else str(record.revision),
+        "reason": record.reason,
+        "duration": None if record.duration_us is None else f"{record.duration_us} us",
+        **{f"detail.{name}": str(value) for name, value in record.detail.items()},
+    }
+    for name, value in fields.items():
+        if value:
+            write(f"{printable(name):<12} {printable(value)}")
+    for title, entries in (("before", shown.before), ("after", shown.after)):
+        write(
+            f"\n{title}, same host or caller:" if entries else f"\nnothing {title} of the same host or caller"
+        )
+        for entry in entries:
+            write("  " + line(entry))
+
+
+def print_verification(result: Verification) -> None:
+    """What was checked, and each thing that is wrong on a line of its own."""
+    for finding in result.findings:
+        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+    write(f"{result.records} records ({result.first} to {result.last}), log {printable(result.log)}")
+    if result.removed:
+        write(f"records up to {result.removed} were removed by retention, which is recorded")
+    write(
+        f"{result.signed_checkpoints} of {result.checkpoints} checkpoints are signed; records up to"
+        f" {result.signed_through} are proven by a signature, {result.unsealed} after it by the chain only"
+    )
+    write(f"key: {result.key or 'none (nothing was signed yet)'}")
+    write("The log is complete and unchanged." if result.ok else "The log was tampered with or is damaged.")
+
+
+def write(text: str) -> None:
+    """A line on standard output; ASCII where the terminal or pipe takes no more."""
+    encoding = sys.stdout.encoding or "ascii"
+    sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
+
+
+def _table(entries: list[Entry]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("time (UTC)", no_wrap=True)
+    table.add_column("decision", no_wrap=True)
+    for name in ("event", "who", "what", "why"):
+        table.add_column(name, overflow="fold")
+    for entry in entries:
+        record = entry.record
+        alarming = record.severity is Severity.ALARM
+        table.add_row(
+            rfc3339(record.time)[:_MILLISECONDS].replace("T", " "),
+            Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
+            Text(printable(record.event), style="bold red" if alarming else ""),
+            Text(_joined(record.host, record.caller_id)),
+            Text(_joined(record.category, record.resource)),
+            Text(_why(record)),
+        )
+    return table
+
+
+def _joined(*parts: str | None) -> str:
+    return " ".join(printable(part) for part in parts if part)
+
+
+def _why(record: Record) -> str:
+    rule = _rule(record)
+    return printable(record.reason) + (f" ({printable(rule)})" if rule and rule not in record.reason else "")
+
+
+def _rule(record: Record) -> str | None:
+    rule = record.rule
+    return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
