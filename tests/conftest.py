@@ -43,7 +43,7 @@ def robot(lab: Lab) -> Host:
     return lab.host("robot", "10.77.0.10/24")
 
 
-@pytest.fixture(scope="module", params=["plain"])
+@pytest.fixture(scope="module", params=["plain", "appliance"])
 def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """A robot behind a plain master, and the same robot behind the appliance: a test of it runs with both."""
     need_root()
