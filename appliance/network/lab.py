@@ -16,19 +16,16 @@ import contextlib
 import itertools
 import os
 import re
-import select
-import signal
 import subprocess
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from appliance.network import links
+from appliance.network.endings import end_processes
 from appliance.network.namespaces import Namespace, NetworkError, namespaces, require_privileges
 
-END_SECONDS = 3.0  # what a process of the lab has to end after SIGTERM, before SIGKILL
 INTERFACE = "eth0"
 _BRIDGE = "br0"
 
@@ -146,39 +143,6 @@ def clear_leftovers(prefix: str) -> list[str]:
 
 def _clear(gone: Sequence[Namespace]) -> None:
     """End what lives in these namespaces, then delete them."""
-    pids = [pid for namespace in gone for pid in namespace.processes()]
-    _end(pids)
+    end_processes([pid for namespace in gone for pid in namespace.processes()])
     for namespace in gone:
         namespace.delete()
-
-
-def _end(pids: Sequence[int]) -> None:
-    """End processes by id: SIGTERM, and SIGKILL for those that are still there after END_SECONDS."""
-    descriptors: dict[int, int] = {}
-    for pid in pids:
-        with contextlib.suppress(OSError):
-            descriptors[os.pidfd_open(pid)] = pid
-    try:
-        for number, limit in ((signal.SIGTERM, END_SECONDS), (signal.SIGKILL, END_SECONDS)):
-            _signal_and_wait(descriptors, number, limit)
-    finally:
-        for descriptor in descriptors:
-            os.close(descriptor)
-
-
-def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit: float) -> None:
-    """Send a signal to the processes still there and wait until all have ended, at most `limit` seconds."""
-    poll = select.poll()
-    waiting = set(descriptors)
-    for descriptor in descriptors:
-        try:
-            signal.pidfd_send_signal(descriptor, number)
-        except ProcessLookupError:
-            waiting.discard(descriptor)
-        else:
-            poll.register(descriptor, select.POLLIN)
-    deadline = time.monotonic() + limit
-    while waiting and (left := deadline - time.monotonic()) > 0:
-        for descriptor, _ in poll.poll(left * 1000):
-            poll.unregister(descriptor)
-            waiting.discard(descriptor)

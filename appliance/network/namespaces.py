@@ -152,8 +152,11 @@ class Namespace:
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Set the kernel setting `key` (`net.ipv4.ip_forward`) if `value` is given; return what it is."""
-        path = Path("/proc/sys", *key.split("."))
+        """Set the kernel setting `key` if `value` is given; return what it is.
+
+        `key` is written `net.ipv4.ip_forward`, or with slashes when an interface name in it has a dot.
+        """
+        path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
         def access() -> str:
             if value is not None:

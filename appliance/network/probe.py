@@ -12,14 +12,13 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 
+from appliance.network.listeners import listening_addresses
 from appliance.network.namespaces import Namespace, NetworkError
 
 PROBE_UID = 61099  # nobody's: neither root nor one of the appliance's users
 _CONNECT_SECONDS = 1.0
 _CHILD_SECONDS = 20.0
-_TCP_LISTEN = "0A"
 
 _CHILD = """
 import errno, json, socket, sys
@@ -104,20 +103,6 @@ def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeRe
     return ProbeResult(port=port, uid=uid, attempts=attempts, listening=listening)
 
 
-def listening_addresses(port: int) -> tuple[str, ...]:
-    """Return the addresses on which someone listens on a TCP port, in the namespace of the calling thread."""
-    found = set()
-    for name in ("tcp", "tcp6"):
-        table = Path("/proc/thread-self/net", name)
-        if table.exists():
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                _, local, _, state, *_ = line.split()
-                address, _, number = local.partition(":")
-                if state == _TCP_LISTEN and int(number, 16) == port:
-                    found.add(_address(address))
-    return tuple(sorted(found))
-
-
 def _run_child(namespace: Namespace, port: int, uid: int) -> str:
     arguments = [sys.executable, "-I", "-S", "-c", _CHILD, str(port), str(_CONNECT_SECONDS)]
     try:
@@ -156,9 +141,3 @@ def _attempt(address: str, outcome: str) -> Attempt:
         return Attempt(address, Outcome(outcome))
     except ValueError:
         return Attempt(address, Outcome.UNCLEAR, outcome)
-
-
-def _address(text: str) -> str:
-    """Read an address of /proc/net/tcp: words of 32 bits, each in the byte order of the machine."""
-    words = [text[index : index + 8] for index in range(0, len(text), 8)]
-    return str(ipaddress.ip_address(b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)))

@@ -49,6 +49,16 @@ class NftBackend:
         hooked = {jump for rule in rules for jump in _jumps(rule)}
         return tuple(_counter(rule) for rule in rules if rule["chain"] in hooked)
 
+    def foreign_forward_drops(self) -> tuple[str, ...]:
+        """Return the chains of other tables that hook forwarded packets with the policy drop."""
+        listed = json.loads(self._nft(["list", "chains"], ""))["nftables"]
+        chains = [entry["chain"] for entry in listed if "chain" in entry]
+        return tuple(
+            f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
+            for chain in chains
+            if chain.get("hook") == "forward" and chain.get("policy") == "drop"
+        )
+
     def _nft(self, arguments: list[str], text: str) -> str:
         try:
             process = self._namespace.popen(

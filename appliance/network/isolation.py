@@ -1,0 +1,357 @@
+"""Isolation `netns`: the appliance in a namespace of its own on a bare host.
+
+```
+ hosts of the network                host                              namespace `rosrv`
+        |            +-------------------------------+         +---------------------------+
+        +---- eth0 --| ROSRV-NAT: 11311, node ports  |--veth---| eth0 10.111.0.2           |
+                     | on every address of the host  |         | RVMaster, relay, rosmaster|
+                     +-------------------------------+         +---------------------------+
+```
+
+Invariants:
+
+1. What arrives on an address of the host for a forwarded port goes to the namespace with its source address
+   kept; the host's own processes reach it by any address of the host and by 127.0.0.1 (::1 stays refused, for
+   it cannot leave a host). What the appliance opens bears the host's address on the network.
+2. Nothing else of the namespace can be reached through the host, and a host that was no router does not
+   become one: forwarding is on, but the chain ROSRV-FWD lets only the appliance's packets pass.
+3. Whatever is changed is recorded first, so that `down`, or `up` after a crash, puts it back. Nothing
+   without a record is taken for ours: a namespace or interface of the same name is an error, not a
+   leftover.
+4. One appliance at a time: a lock that the kernel releases with the process says whether a record is a
+   leftover.
+"""
+
+import contextlib
+import fcntl
+import ipaddress
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from appliance.network import links
+from appliance.network.endings import end_processes
+from appliance.network.firewall.firewall import RuleStatus, statuses
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.firewall.rules import Chain, Family, Interface, PortRange, Rule, Verdict, family_of
+from appliance.network.forwarding import Forwarding
+from appliance.network.listeners import listening_ports
+from appliance.network.namespaces import Namespace, NetworkError, require_privileges
+
+INSIDE = "eth0"
+_CANDIDATES = 64
+_POOL = ipaddress.IPv4Network("10.111.0.0/16")
+_POOL6 = ipaddress.IPv6Network("fd52:4f53:5256::/48")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IsolationSettings:
+    """Where the appliance's namespace is, and what is forwarded to it.
+
+    `subnet` and `subnet6` None: the first one of a private pool that no route of the host names.
+    """
+
+    ports: tuple[PortRange, ...]  # TCP
+    name: str = "rosrv"
+    subnet: str | None = None  # at least two addresses, such as 10.111.0.0/30
+    subnet6: str | None = None
+    directory: Path = Path("/run/rosrv")  # of the record and the lock
+
+    def __post_init__(self) -> None:
+        if not self.ports:
+            raise ValueError("isolation netns: no port to forward was given")
+        for text, version in ((self.subnet, 4), (self.subnet6, 6)):
+            if text is not None and (
+                family_of(text) != version or ipaddress.ip_network(text).num_addresses < 4
+            ):
+                raise ValueError(
+                    f"isolation netns: {text!r} is no IPv{version} network with room for two hosts"
+                )
+
+    @property
+    def link(self) -> str:
+        """The host's end of the veth pair."""
+        return f"veth-{self.name}"[: links.IFNAMSIZ]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The addresses of a subnet: the host's and the appliance's, without prefix length."""
+
+    network: str
+    host: str
+    appliance: str
+
+    @property
+    def length(self) -> int:
+        """Prefix length, in bits."""
+        return ipaddress.ip_network(self.network).prefixlen
+
+
+class Isolation:
+    """The namespace of the appliance and its way to the host's networks."""
+
+    def __init__(self, host: Namespace, settings: IsolationSettings) -> None:
+        self._host = host
+        self.settings = settings
+        self.namespace = Namespace(settings.name)
+        self.ends: dict[Family, Ends] = {}
+        self._backend = NftBackend(host)
+        self._rules: tuple[Rule, ...] = ()
+        self._forwarding = Forwarding(host)
+        self._lock: int | None = None
+
+    def up(self) -> None:
+        """Make the namespace, its addresses and its forwarding; what a crash left is taken down first.
+
+        Raises: PrivilegeError; NetworkError naming what is in the way. Nothing is left behind then.
+        """
+        require_privileges("isolation netns")
+        self._take_lock()
+        try:
+            self._clear_leftovers()
+            self._refuse_foreign()
+            self._choose_subnets()
+            self._write_record()
+            self._build()
+        except BaseException:
+            self.down()
+            raise
+
+    def down(self) -> None:
+        """Take everything away again and put the host's settings back; taking down twice is fine."""
+        if self._lock is None:
+            return
+        try:
+            self._clear_leftovers()
+        finally:
+            self.ends.clear()
+            self._rules = ()
+            os.close(self._lock)
+            self._lock = None
+
+    def host_address_for(self, peer: str) -> str:
+        """Return the address by which `peer` reaches the host: what nodes on that peer are to be told."""
+        return links.source_address_for(self._host, peer)
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Name chains of others on the host that drop forwarded packets unless told otherwise.
+
+        A drop there cannot be undone from here; whoever owns the chain must let the appliance's link pass.
+        """
+        link = self.settings.link
+        return tuple(
+            f"{chain} drops what is forwarded by default: let interface {link} pass in it, both ways"
+            for chain in self._backend.foreign_forward_drops()
+        )
+
+    def rules(self) -> tuple[RuleStatus, ...]:
+        """Return the rules on the host with their counters."""
+        return statuses(self._rules, self._backend.counters())
+
+    def _build(self) -> None:
+        settings, inside = self.settings, self.namespace
+        inside.create()
+        links.set_link(inside, "lo", up=True)
+        links.create_veth(self._host, settings.link, inside, INSIDE)
+        for family, ends in self.ends.items():
+            links.add_address(self._host, settings.link, f"{ends.host}/{ends.length}")
+            links.add_address(inside, INSIDE, f"{ends.appliance}/{ends.length}")
+            links.add_route(inside, "default", ends.host)
+            if family == 4:  # so that packets the host sends from 127.0.0.1 may leave on this link
+                self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
+        routers = tuple(family for family in self.ends if self._forwarding.before(family))
+        self._rules = isolation_rules(settings, self.ends, routers)
+        self._backend.install(self._rules)  # before forwarding is turned on
+        self._forwarding.enable(tuple(self.ends))
+
+    def _choose_subnets(self) -> None:
+        taken = [ipaddress.ip_network(text) for text in links.networks(self._host)]
+        self.ends = {4: _choose(self.settings.subnet, _POOL, 30, taken)}
+        if self._forwarding.has_ipv6():
+            self.ends[6] = _choose(self.settings.subnet6, _POOL6, 64, taken)
+
+    def _refuse_foreign(self) -> None:
+        name, link = self.settings.name, self.settings.link
+        if self.namespace.exists():
+            raise NetworkError(
+                f"there is a network namespace {name} that this appliance has not made: "
+                f"`sudo ip netns delete {name}` if nobody needs it, or give the appliance another name"
+            )
+        if link in links.links(self._host):
+            raise NetworkError(
+                f"there is an interface {link} that this appliance has not made: `ip link delete {link}`"
+            )
+        in_use = self._host.run(listening_ports)
+        clashes = [
+            str(port)
+            for port in sorted(in_use)
+            if any(r.first <= port <= r.last for r in self.settings.ports)
+        ]
+        if clashes:
+            raise NetworkError(
+                f"the host has programs of its own that listen on TCP {', '.join(clashes[:8])}, which would "
+                "be forwarded to the appliance: stop them (a roscore?), or give the appliance other ports"
+            )
+
+    def _take_lock(self) -> None:
+        if self._lock is not None:
+            raise NetworkError(f"isolation {self.settings.name} is up already")
+        self.settings.directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+        lock = os.open(self._record.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            raise NetworkError(
+                f"another appliance is running in the namespace {self.settings.name}: stop it first"
+            ) from None
+        self._lock = lock
+
+    @property
+    def _record(self) -> Path:
+        return self.settings.directory / f"isolation-{self.settings.name}.json"
+
+    def _write_record(self) -> None:
+        """Write what will have to be put back, before anything is changed."""
+        record = {
+            "namespace": self.settings.name,
+            "link": self.settings.link,
+            "settings": self._forwarding.record(),
+        }
+        partial = self._record.with_suffix(".partial")
+        partial.write_text(json.dumps(record), encoding="utf-8")
+        partial.replace(self._record)
+
+    def _clear_leftovers(self) -> None:
+        """Undo what the record says, if there is one."""
+        try:
+            record = json.loads(self._record.read_text(encoding="utf-8"))
+            link, settings = (
+                str(record["link"]),
+                {str(key): str(value) for key, value in record["settings"].items()},
+            )
+        except FileNotFoundError:
+            return
+        except (ValueError, KeyError, AttributeError) as error:
+            raise NetworkError(
+                f"{self._record} cannot be read ({error}): look at it and delete it"
+            ) from error
+        self._forwarding.restore(settings)  # before the chain that keeps the host from being a router goes
+        self._backend.remove()
+        links.delete_link(self._host, link)
+        end_processes(self.namespace.processes())
+        self.namespace.delete()
+        with contextlib.suppress(FileNotFoundError):
+            self._record.unlink()
+
+
+def isolation_rules(
+    settings: IsolationSettings, ends: dict[Family, Ends], routers: tuple[Family, ...]
+) -> tuple[Rule, ...]:
+    """Return the rules on the host; `routers` are the families for which the host was a router before."""
+    inward, outward = Interface(settings.link), Interface(settings.link, other=True)
+    rules = [
+        Rule(
+            chain=Chain.IN,
+            purpose="the appliance does not reach the host's loopback",
+            verdict=Verdict.DROP,
+            arrives_on=inward,
+            destination="127.0.0.0/8",
+            new_connection=True,
+        ),
+        Rule(
+            chain=Chain.FORWARD,
+            purpose="forwarded ports",
+            verdict=Verdict.RETURN,
+            leaves_on=inward,
+            translated=True,
+        ),
+        Rule(
+            chain=Chain.FORWARD,
+            purpose="no other way to the appliance",
+            verdict=Verdict.DROP,
+            leaves_on=inward,
+            new_connection=True,
+        ),
+    ]
+    for family, end in ends.items():
+        if family not in routers:
+            rules.append(
+                Rule(
+                    chain=Chain.FORWARD,
+                    purpose=f"the host is no IPv{family} router",
+                    verdict=Verdict.DROP,
+                    family=family,
+                    arrives_on=outward,
+                    leaves_on=outward,
+                )
+            )
+        rules.append(_loopback(family, inward))
+        rules += [_forward(ports, end, outward) for ports in settings.ports]
+        rules.append(
+            Rule(
+                chain=Chain.SOURCE_NAT,
+                purpose=f"the appliance's own connections, IPv{family}",
+                verdict=Verdict.MASQUERADE,
+                source=end.network,
+                leaves_on=outward,
+            )
+        )
+    return tuple(rules)
+
+
+def _loopback(family: Family, inward: Interface) -> Rule:
+    """127.0.0.1 is forwarded under the veth's address; ::1 cannot leave a host, so it stays refused."""
+    if family == 4:
+        return Rule(
+            chain=Chain.SOURCE_NAT,
+            purpose="from the host's own loopback",
+            verdict=Verdict.MASQUERADE,
+            source="127.0.0.0/8",
+            leaves_on=inward,
+        )
+    return Rule(chain=Chain.NAT, purpose="not from ::1", verdict=Verdict.RETURN, destination="::1")
+
+
+def _forward(ports: PortRange, end: Ends, outward: Interface) -> Rule:
+    return Rule(
+        chain=Chain.NAT,
+        purpose=f"TCP {ports} to the appliance, IPv{family_of(end.appliance)}",
+        verdict=Verdict.DNAT,
+        arrives_on=outward,
+        tcp_ports=ports,
+        local_destination=True,
+        to=end.appliance,
+    )
+
+
+_Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+def _choose(wanted: str | None, pool: _Network, length: int, taken: list[_Network]) -> Ends:
+    """Return the ends of the wanted subnet, or of the first one of the pool that collides with nothing."""
+    if wanted is not None:
+        network = ipaddress.ip_network(wanted)
+        for other in taken:
+            if _collide(network, other):
+                raise NetworkError(
+                    f"isolation netns: {network} collides with {other}, which this host has a route to"
+                )
+        return _ends(network)
+    candidates: Iterator[_Network] = iter(pool.subnets(new_prefix=length))
+    for candidate in itertools.islice(candidates, _CANDIDATES):
+        if not any(_collide(candidate, other) for other in taken):
+            return _ends(candidate)
+    raise NetworkError(f"isolation netns: this host has routes to all of {pool}: give a free subnet")
+
+
+def _collide(one: _Network, other: _Network) -> bool:
+    return one.version == other.version and one.overlaps(other)
+
+
+def _ends(network: _Network) -> Ends:
+    return Ends(str(network), str(network[1]), str(network[2]))

@@ -1,0 +1,304 @@
+"""Tests of the isolation `netns`: a namespace of the lab plays the bare host."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network import links
+from appliance.network.firewall.rules import PortRange
+from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.lab import Host, Lab
+from appliance.network.listeners import listening_ports
+from appliance.network.namespaces import Namespace, NetworkError
+from tests.support.requirements import need_program, need_root
+
+MASTER, FIRST, LAST = 11311, 20000, 20009
+
+
+@pytest.fixture(autouse=True)
+def _machine() -> None:
+    need_root()
+    need_program("nft", "nftables")
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """A lab of the isolation's tests."""
+    with Lab("rosrv-iso") as one:
+        yield one
+
+
+@pytest.fixture
+def bare(lab: Lab) -> Host:
+    """The bare host that the appliance is started on."""
+    return lab.host("bare", "10.77.0.2/24", "fd77::2/64")
+
+
+@pytest.fixture
+def node(lab: Lab) -> Host:
+    """A host of the network with nodes on it."""
+    return lab.host("node", "10.77.0.30/24", "fd77::30/64")
+
+
+def settings(tmp_path: Path, **others: str) -> IsolationSettings:
+    """Return settings with a name of this test's own."""
+    return IsolationSettings(
+        ports=(PortRange.one(MASTER), PortRange(FIRST, LAST)),
+        name=f"riso{os.getpid()}",
+        directory=tmp_path,
+        **others,
+    )
+
+
+@contextlib.contextmanager
+def isolated(bare: Host, tmp_path: Path, **others: str) -> Iterator[Isolation]:
+    """Bring the isolation up for the length of a block."""
+    isolation = Isolation(bare.namespace, settings(tmp_path, **others))
+    isolation.up()
+    try:
+        yield isolation
+    finally:
+        isolation.down()
+
+
+@contextlib.contextmanager
+def serving(namespace: Namespace, port: int) -> Iterator[socket.socket]:
+    """Listen on all addresses of a namespace."""
+    with namespace.entered():
+        server = socket.create_server(("::", port), family=socket.AF_INET6, dualstack_ipv6=True)
+    server.settimeout(10)
+    with server:
+        yield server
+
+
+def source_seen(server: socket.socket, host: Host, address: str, port: int) -> str:
+    """Connect from a host; return the peer address that the server sees."""
+    with host.entered(), socket.create_connection((address, port), timeout=10) as client:
+        peer, (seen, *_) = server.accept()
+        with peer:
+            peer.sendall(b"!")
+            assert client.recv(1) == b"!"
+    return str(seen).removeprefix("::ffff:")
+
+
+def state(host: Host) -> tuple[str, ...]:
+    """Return all of a host that the isolation may change."""
+    process = host.popen(["nft", "-s", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
+    rules, _ = process.communicate(timeout=30)
+    keys = ["net/ipv4/ip_forward", "net/ipv6/conf/all/forwarding"]
+    for name in ("eth0", "lo", "default"):
+        keys += [f"net/ipv4/conf/{name}/forwarding", f"net/ipv6/conf/{name}/forwarding"]
+        keys += [f"net/ipv6/conf/{name}/accept_ra", f"net/ipv4/conf/{name}/route_localnet"]
+    return (
+        rules,
+        *(f"{key}={host.namespace.sysctl(key)}" for key in keys),
+        *links.links(host.namespace),
+        *(text for text in links.networks(host.namespace) if "." in text),
+    )
+
+
+def test_hosts_reach_the_appliance_with_their_own_address(bare: Host, node: Host, tmp_path: Path) -> None:
+    """A connection to the host's address arrives in the namespace with its source kept, on both families."""
+    with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
+        assert source_seen(server, node, bare.address, MASTER) == node.address
+        assert source_seen(server, node, bare.address6, MASTER) == node.address6
+        assert isolation.host_address_for(node.address) == bare.address
+        assert isolation.host_address_for(node.address6) == bare.address6
+        with serving(isolation.namespace, LAST) as last:
+            assert source_seen(last, node, bare.address, LAST) == node.address
+        assert all(rule.in_force for rule in isolation.rules())
+
+
+def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> None:
+    """Nodes on the host and on the network are reached; the network sees the host's address."""
+    with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567) as local:
+        inside = Host("inside", isolation.namespace, "", (isolation.ends[4].appliance + "/30",))
+        assert source_seen(local, inside, bare.address, 34567) == isolation.ends[4].appliance
+        assert source_seen(local, inside, bare.address6, 34567) == isolation.ends[6].appliance
+        with serving(node.namespace, 34568) as remote:
+            assert source_seen(remote, inside, node.address, 34568) == bare.address
+            assert source_seen(remote, inside, node.address6, 34568) == bare.address6
+
+
+def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path) -> None:
+    """Programs on the host reach it by the host's address, which they keep, and by loopback."""
+    with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
+        assert source_seen(server, bare, bare.address, MASTER) == bare.address
+        assert source_seen(server, bare, bare.address6, MASTER) == bare.address6
+        assert source_seen(server, bare, "127.0.0.1", MASTER) == isolation.ends[4].host
+        with bare.entered(), pytest.raises(ConnectionRefusedError):  # at once, so that clients try 127.0.0.1
+            socket.create_connection(("::1", MASTER), timeout=10)
+        assert isolation.host_address_for(bare.address) == bare.address
+        assert source_seen(server, bare, isolation.ends[4].appliance, MASTER) == isolation.ends[4].host
+
+
+def test_nothing_else_is_reached_through_the_host(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
+    """A host that routes to the namespace by itself reaches no port of it, and the host routes for nobody."""
+    far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
+    links.add_address(bare.namespace, "eth0", "10.99.0.2/24")
+    with isolated(bare, tmp_path) as isolation:
+        appliance = isolation.ends[4].appliance
+        links.add_route(node.namespace, f"{appliance}/32", bare.address)
+        links.add_route(node.namespace, "10.99.0.0/24", bare.address)
+        with (
+            serving(isolation.namespace, 9999),
+            serving(isolation.namespace, MASTER),
+            serving(far.namespace, 9999),
+        ):
+            for target in ((appliance, 9999), (appliance, MASTER), (far.address, 9999)):
+                with node.entered(), pytest.raises(TimeoutError):
+                    socket.create_connection(target, timeout=1)
+
+
+def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: Path) -> None:
+    """A packet that the namespace sends to 127.0.0.1 over the veth is dropped by the host."""
+    with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567):
+        inside = isolation.namespace
+        inside.sysctl("net.ipv4.conf.eth0.route_localnet", "1")
+        ends = isolation.ends[4]
+        for command in (
+            "ip route del table local 127.0.0.1 dev lo",
+            "ip route del table local 127.0.0.0/8 dev lo",
+            f"ip route add 127.0.0.1 via {ends.host} dev eth0 src {ends.appliance}",
+        ):
+            assert inside.popen(command.split()).wait(timeout=20) == 0
+        with inside.entered(), pytest.raises(TimeoutError):
+            socket.create_connection(("127.0.0.1", 34567), timeout=1)
+        dropped = next(
+            rule for rule in isolation.rules() if "loopback" in rule.purpose and rule.chain == "ROSRV-IN"
+        )
+        assert dropped.packets > 0
+
+
+def test_going_down_puts_everything_back(bare: Host, tmp_path: Path) -> None:
+    """Rules, settings, interfaces and routes of the host are afterwards what they were, foreign ones too."""
+    bare.popen(["nft", "add", "table", "inet", "foreign"]).wait(timeout=20)
+    bare.namespace.sysctl("net/ipv4/conf/eth0/forwarding", "1")
+    before = state(bare)
+    with isolated(bare, tmp_path) as isolation:
+        name = isolation.namespace
+        assert bare.namespace.sysctl("net.ipv4.ip_forward") == "1"
+        assert bare.namespace.sysctl("net.ipv6.conf.eth0.accept_ra") == "2"
+        assert state(bare) != before
+    assert state(bare) == before
+    assert not name.exists()
+    isolation.down()
+
+
+def test_a_router_stays_a_router(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
+    """A host that forwarded before goes on forwarding for others while the appliance runs and afterwards."""
+    far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
+    links.add_address(bare.namespace, "eth0", "10.99.0.2/24")
+    links.add_route(node.namespace, "10.99.0.0/24", bare.address)
+    bare.namespace.sysctl("net.ipv4.ip_forward", "1")
+    with serving(far.namespace, 9999) as server:
+        with isolated(bare, tmp_path):
+            assert source_seen(server, node, far.address, 9999) == node.address
+        assert source_seen(server, node, far.address, 9999) == node.address
+
+
+CRASHER = """
+import signal, sys
+from pathlib import Path
+from appliance.network.firewall.rules import PortRange
+from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.namespaces import Namespace
+isolation = Isolation(Namespace(sys.argv[1]), IsolationSettings(
+    ports=(PortRange(11311, 11311), PortRange(20000, 20009)), name=sys.argv[2], directory=Path(sys.argv[3])))
+isolation.up()
+print(isolation.namespace.popen(["sleep", "600"]).pid, flush=True)
+signal.pause()
+"""
+
+
+def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp_path: Path) -> None:
+    """After SIGKILL the next start takes over: one set, old processes ended, all restored at the end."""
+    before = state(bare)
+    wanted = settings(tmp_path)
+    crashed = subprocess.Popen(
+        [sys.executable, "-c", CRASHER, bare.namespace.name, wanted.name, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert crashed.stdout is not None
+    with crashed.stdout:
+        orphan = int(crashed.stdout.readline())
+        with pytest.raises(NetworkError, match="another appliance is running"):
+            Isolation(bare.namespace, wanted).up()
+        crashed.send_signal(signal.SIGKILL)
+        crashed.wait(timeout=20)
+    during = state(bare)
+    assert during != before
+    with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
+        assert source_seen(server, node, bare.address, MASTER) == node.address
+        assert state(bare)[0] == during[0], "one set of rules"
+        status = Path("/proc", str(orphan), "stat")
+        assert not status.exists() or status.read_text(encoding="ascii").rpartition(")")[2].split()[0] == "Z"
+    assert state(bare) == before
+
+
+def test_the_subnet_collides_with_no_route(bare: Host, tmp_path: Path) -> None:
+    """A free subnet is chosen; one that is given and collides is an error that names the route."""
+    links.add_address(bare.namespace, "eth0", "10.111.0.9/26")
+    with isolated(bare, tmp_path) as isolation:
+        assert isolation.ends[4].network == "10.111.0.64/30"
+    with isolated(bare, tmp_path, subnet="10.50.0.0/29", subnet6="fd00:50::/64") as isolation:
+        assert isolation.ends[4].appliance == "10.50.0.2"
+        assert isolation.ends[6].appliance == "fd00:50::2"
+    with pytest.raises(NetworkError, match=r"10\.77\.0\.0/30 collides with 10\.77\.0\."):
+        Isolation(bare.namespace, settings(tmp_path, subnet="10.77.0.0/30")).up()
+
+
+def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Path) -> None:
+    """What bears our name but has no record is left alone, and the error says how to get rid of it."""
+    wanted = settings(tmp_path)
+    foreign = Namespace(wanted.name).create()
+    try:
+        with pytest.raises(NetworkError, match=rf"ip netns delete {wanted.name}"):
+            Isolation(bare.namespace, wanted).up()
+        assert foreign.exists()
+    finally:
+        foreign.delete()
+    links.create_bridge(bare.namespace, wanted.link)
+    before = state(bare)
+    with pytest.raises(NetworkError, match=f"interface {wanted.link}"):
+        Isolation(bare.namespace, wanted).up()
+    assert state(bare) == before
+
+
+def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
+    """A roscore that still listens on the host is an error that names its port, and nothing is changed."""
+    before = state(bare)
+    with serving(bare.namespace, MASTER), pytest.raises(NetworkError, match=r"TCP 11311.*roscore"):
+        Isolation(bare.namespace, settings(tmp_path)).up()
+    assert state(bare) == before
+    assert bare.run(listening_ports) == set()
+
+
+def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path: Path) -> None:
+    """A foreign chain with the policy drop, as container engines make, is named with what has to pass."""
+    with isolated(bare, tmp_path) as isolation:
+        assert isolation.obstacles() == ()
+        run_in = ["nft", "add table ip engine; add chain ip engine FORWARD"]
+        run_in[1] += " { type filter hook forward priority 0; policy drop; }"
+        assert bare.popen(run_in).wait(timeout=20) == 0
+        (obstacle,) = isolation.obstacles()
+        assert "chain ip engine FORWARD" in obstacle
+        assert isolation.settings.link in obstacle
+
+
+def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:
+    """A damaged record is an error that says which file; nothing is guessed."""
+    wanted = settings(tmp_path)
+    record = tmp_path / f"isolation-{wanted.name}.json"
+    record.write_text(json.dumps({"link": "eth0"}), encoding="utf-8")
+    with pytest.raises(NetworkError, match=record.name):
+        Isolation(bare.namespace, wanted).up()
