@@ -252,9 +252,10 @@ class Document:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _refuse_text(self) -> None:
-        text = self._string().strip(_SPACE)
+        text = "".join(self._text).strip(_SPACE)
         if text:
             raise self._error(f"text {text[:40]!a} between elements")
+        self._text.clear()
 
     def _refuse_instruction(self, target: str, _data: str) -> None:
         raise self._error(f"processing instruction <?{target[:40]}")
