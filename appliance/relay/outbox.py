@@ -44,8 +44,12 @@ class Outbox:
 
     @property
     def full(self) -> bool:
-        """Whether another message would be one too many."""
-        return self._messages >= self._limit_messages or self._size >= self._limit_size
+        """Whether another message would be one too many, for this queue or for the process."""
+        return (
+            self._messages >= self._limit_messages
+            or self._size >= self._limit_size
+            or (self._messages > 0 and self._budget.exhausted)
+        )
 
     def append(self, view: memoryview, messages: int, sent: int = 0) -> None:
         """Queue a batch that stays as it is, of which the first `sent` bytes are sent already."""
@@ -98,17 +102,18 @@ class Outbox:
             sent = 0
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the bounds (all of them when the process is out of memory); how
-        many."""
+        """Drop the oldest frames beyond the bounds, or all when the process is out of memory; how many."""
         before = self._messages
-        while self._waiting and (self._over() or self._budget.exhausted):
+        limit_messages, limit_size = self._limit_messages, self._limit_size
+        if self._budget.exhausted:
+            limit_messages = limit_size = 0
+        while self._messages > limit_messages or self._size > limit_size:
             view, messages = self._waiting.popleft()
             self._count(-messages, -len(view))
             dropped = end = 0
             while dropped < messages and (
-                self._budget.exhausted
-                or self._messages + messages - dropped > self._limit_messages
-                or self._size + len(view) - end > self._limit_size
+                self._messages + messages - dropped > limit_messages
+                or self._size + len(view) - end > limit_size
             ):
                 end += int.from_bytes(view[end : end + 4], "little") + 4
                 dropped += 1
@@ -123,9 +128,6 @@ class Outbox:
         self._started = None
         self._waiting.clear()
         self._messages = self._size = 0
-
-    def _over(self) -> bool:
-        return self._messages > self._limit_messages or self._size > self._limit_size
 
     def _count(self, messages: int, size: int) -> None:
         self._messages += messages

@@ -1,0 +1,111 @@
+"""The table of what control has stated."""
+
+from appliance.channel.messages import (
+    ClientGranted,
+    ClientRevoked,
+    GrantInstalled,
+    GrantRevoked,
+    NodePlaced,
+    NodeWithdrawn,
+    PublicationPlaced,
+    PublicationWithdrawn,
+    ServicePlaced,
+    ServiceWithdrawn,
+)
+from appliance.relay.grants import Service, StatedTable
+
+NODE = NodePlaced("k", "/talker", "10.0.0.1")
+TOPIC = PublicationPlaced("k", "/chatter", "std_msgs/String")
+GRANT = GrantInstalled("k", "/chatter", "10.0.0.2", "/listener")
+SERVICE = ServicePlaced("k", "/add", "10.0.0.1", 4000)
+CLIENT = ClientGranted("k", "/add", "10.0.0.2")
+EVERYTHING = (NODE, TOPIC, GRANT, SERVICE, CLIENT)
+
+
+def stated() -> StatedTable:
+    """A table with one of each."""
+    table = StatedTable()
+    for message in EVERYTHING:
+        table.state(message)
+    return table
+
+
+def test_a_grant_is_for_one_host_one_caller_one_topic_and_one_incarnation() -> None:
+    """Whoever differs from the grant in anything has none."""
+    table = stated()
+    assert table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+    assert not table.may_subscribe("other", "/chatter", "10.0.0.2", "/listener")
+    assert not table.may_subscribe("k", "/secret", "10.0.0.2", "/listener")
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.3", "/listener")
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/stranger")
+    assert table.may_call("k", "/add", "10.0.0.2")
+    assert not table.may_call("k", "/add", "10.0.0.3")
+
+
+def test_what_is_withdrawn_is_gone() -> None:
+    """Each kind of statement can be taken back."""
+    table = stated()
+    table.withdraw(GrantRevoked("k", "/chatter", "10.0.0.2", "/listener"))
+    table.withdraw(ClientRevoked("k", "/add", "10.0.0.2"))
+    table.withdraw(PublicationWithdrawn("k", "/chatter"))
+    table.withdraw(ServiceWithdrawn("k", "/add"))
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+    assert not table.may_call("k", "/add", "10.0.0.2")
+    assert table.publication("k", "/chatter") is None
+    assert table.service("k", "/add") is None
+    assert table.node("k") == NODE
+
+
+def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
+    """A withdrawn node leaves nothing behind; others stay."""
+    table = stated()
+    table.state(GrantInstalled("other", "/chatter", "10.0.0.2", "/listener"))
+    table.withdraw(NodeWithdrawn("k"))
+    assert table.publication("k", "/chatter") is None
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+    assert not table.may_call("k", "/add", "10.0.0.2")
+    assert table.may_subscribe("other", "/chatter", "10.0.0.2", "/listener")
+
+
+def test_the_latest_place_of_a_service_counts() -> None:
+    """A service that is placed again is where it was placed last."""
+    table = stated()
+    table.state(ServicePlaced("k", "/add", "10.0.0.1", 5000))
+    assert table.service("k", "/add") == Service("k", "/add", "10.0.0.1", 5000)
+
+
+def test_a_restatement_withdraws_what_is_not_said_again_and_only_at_its_end() -> None:
+    """Existing grants hold until the new control has said everything."""
+    table = stated()
+    table.begin(2)
+    for message in (NODE, TOPIC):
+        table.state(message)
+    assert table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+    gone = table.end(2)
+    assert set(map(type, gone)) == {GrantRevoked, ServiceWithdrawn, ClientRevoked}
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+    assert table.publication("k", "/chatter") == TOPIC
+
+
+def test_a_restatement_that_another_control_begins_again_withdraws_nothing() -> None:
+    """A control that died in the middle of its restatement has not withdrawn what it had not come to."""
+    table = stated()
+    table.begin(2)
+    table.state(NODE)
+    table.begin(3)
+    assert table.end(2) == []
+    for message in EVERYTHING:
+        table.state(message)
+    assert table.end(3) == []
+    assert table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
+
+
+def test_what_is_withdrawn_during_a_restatement_stays_withdrawn() -> None:
+    """A withdrawal after the statement wins, whether or not a restatement is going on."""
+    table = stated()
+    table.begin(2)
+    for message in EVERYTHING:
+        table.state(message)
+    table.withdraw(GrantRevoked("k", "/chatter", "10.0.0.2", "/listener"))
+    assert table.end(2) == []
+    assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")

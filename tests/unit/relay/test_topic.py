@@ -1,0 +1,237 @@
+"""One relayed topic, told as a story of its publisher and its subscribers."""
+
+import struct
+from collections.abc import Mapping
+
+from appliance.channel.messages import TopicTraffic
+from appliance.relay.frames import Batch
+from appliance.relay.topic import RelayedTopic
+
+HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
+
+
+def batch(*texts: bytes) -> Batch:
+    """Frames with these bodies."""
+    frames = [struct.pack("<I", len(text)) + text for text in texts]
+    data = b"".join(frames)
+    return Batch(memoryview(data), len(frames), len(data) - len(frames[-1]))
+
+
+class RecordedUpstream:
+    """Writes down what the topic asks of its publisher's connection."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def want(self) -> None:
+        """Somebody is there."""
+        self.asked.append("want")
+
+    def spare(self) -> None:
+        """Nobody is there."""
+        self.asked.append("spare")
+
+    def pause(self, seconds: float) -> None:
+        """Do not read."""
+        self.asked.append(f"pause {seconds:.2f}")
+
+    def resume(self) -> None:
+        """Read."""
+        self.asked.append("resume")
+
+
+class RecordedMember:
+    """A subscriber that takes everything until it is told to be full."""
+
+    def __init__(self, *, fits: bool = True) -> None:
+        self.header: Mapping[str, str] = {}
+        self.received = b""
+        self.full_since: float | None = None
+        self.was_cut = ""
+        self.trimmed = 0
+        self._fits = fits
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Take the header."""
+        self.header = header
+        return self._fits
+
+    def deliver(self, batch: Batch) -> None:
+        """Take the frames."""
+        self.received += bytes(batch.view)
+
+    @property
+    def full(self) -> bool:
+        """As told."""
+        return self.full_since is not None
+
+    def trim(self) -> int:
+        """Pretend to drop three."""
+        self.trimmed += 1
+        return 3
+
+    def cut(self, reason: str) -> None:
+        """Remember why."""
+        self.was_cut = reason
+
+
+class Story:
+    """A topic with a clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.topic = RelayedTopic("k", "/chatter", "/talker", 0.05, lambda: self.now)
+        self.upstream = RecordedUpstream()
+        self.topic.upstream = self.upstream
+
+    def join(self) -> RecordedMember:
+        """One more subscriber."""
+        member = RecordedMember()
+        self.topic.join(member)
+        return member
+
+
+def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_name() -> None:
+    """The publisher is asked for when the first comes; the header names the node, whatever it claims."""
+    story = Story()
+    member = story.join()
+    assert (story.upstream.asked, member.header) == (["want"], {})
+    story.topic.upstream_opened(HEADER)
+    assert member.header == HEADER | {"callerid": "/talker", "topic": "/chatter"}
+
+
+def test_everybody_gets_every_message_in_order() -> None:
+    """From the moment a subscriber is served."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1"))
+    second = story.join()
+    story.topic.received(batch(b"2", b"3"))
+    assert first.received == bytes(batch(b"1", b"2", b"3").view)
+    assert second.received == bytes(batch(b"2", b"3").view)
+
+
+def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
+    """Not before."""
+    story = Story()
+    first, second = story.join(), story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.leave(first)
+    assert "spare" not in story.upstream.asked
+    story.topic.leave(second)
+    assert story.upstream.asked[-1] == "spare"
+
+
+def test_a_latched_message_is_given_once_to_each() -> None:
+    """Who triggers the connection gets it from the publisher, who comes later from us; nobody twice."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.topic.received(batch(b"old", b"new"))
+    second = story.join()
+    assert first.received == bytes(batch(b"old", b"new").view)
+    assert second.received == bytes(batch(b"new").view)
+
+
+def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
+    """A late subscriber of an ordinary topic starts with the next message."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1"))
+    assert story.join().received == b""
+
+
+def test_a_latched_message_is_forgotten_with_the_connection() -> None:
+    """The publisher sends it again when it is reached again; an old one is not made up for it."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.topic.received(batch(b"1"))
+    story.topic.upstream_closed()
+    assert story.join().received == b""
+
+
+def test_subscribers_survive_the_loss_of_the_publisher() -> None:
+    """When it is reached again, messages go on on the same connections."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    assert member.was_cut == ""
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1"))
+    assert member.received == bytes(batch(b"1").view)
+
+
+def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -> None:
+    """They must read the new header before they read a message of it."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    story.topic.upstream_opened(HEADER | {"md5sum": "other"})
+    assert "another type" in member.was_cut
+
+
+def test_a_subscriber_of_another_type_is_not_served() -> None:
+    """It refuses itself, and gets nothing."""
+    story = Story()
+    member = RecordedMember(fits=False)
+    story.topic.join(member)
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1"))
+    assert member.received == b""
+
+
+def test_the_publisher_is_paused_only_while_all_are_full() -> None:
+    """One with room is never delayed by the others; the full one drops."""
+    story = Story()
+    slow, quick = story.join(), story.join()
+    story.topic.upstream_opened(HEADER)
+    slow.full_since = 100.0
+    story.topic.received(batch(b"1"))
+    assert (slow.trimmed, quick.trimmed) == (1, 0)
+    quick.full_since = 100.01
+    story.topic.received(batch(b"2"))
+    assert story.upstream.asked[-1] == "pause 0.06"
+    story.topic.relieve()
+    assert story.upstream.asked[-1] == "resume"
+
+
+def test_a_stuck_subscriber_is_not_waited_for() -> None:
+    """After the grace the oldest of its messages are dropped and counted, and the publisher is read."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.traffic()
+    member.full_since, story.now = 99.0, 100.0
+    story.topic.received(batch(b"1"))
+    assert member.trimmed == 1
+    assert "pause" not in "".join(story.upstream.asked)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1)
+
+
+def test_traffic_is_reported_once() -> None:
+    """Nothing new, nothing to report."""
+    story = Story()
+    assert story.topic.traffic() is None
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1", b"22"))
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1)
+    assert story.topic.traffic() is None
+
+
+def test_a_withdrawn_topic_cuts_who_is_served_and_who_waits() -> None:
+    """Each with the reason."""
+    story = Story()
+    served = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.cut_all("gone")
+    assert served.was_cut == "gone"
+    other = Story()
+    waiting = other.join()
+    other.topic.cut_all("gone")
+    assert waiting.was_cut == "gone"
