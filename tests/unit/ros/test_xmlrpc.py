@@ -104,6 +104,7 @@ def test_answers_are_read_as_python_reads_them(value: Value) -> None:
     assert python_loads(body) == ((value,), None)
 
 
+@settings(deadline=None)
 @given(code=st.integers(-(2**31), 2**31 - 1), text=XML_TEXT)
 def test_faults_come_back(code: int, text: str) -> None:
     """A fault is an error with its code and text, here and for Python."""
@@ -461,7 +462,7 @@ SCRAPS = st.one_of(
 )
 
 
-@settings(max_examples=500)
+@settings(max_examples=500, deadline=None)
 @given(scraps=st.lists(SCRAPS, max_size=12), whole=st.booleans(), raw=st.binary(max_size=3))
 def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool, raw: bytes) -> None:
     """No mixture of XML-RPC's own elements makes the parsers raise anything but PeerError."""
@@ -476,7 +477,7 @@ def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool
             assert whole or isinstance(result, MethodCall) or "<methodResponse>" in text
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(data=st.data())
 def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) -> None:
     """A call with bytes changed, cut or doubled is refused, or read as rosmaster would read it."""
@@ -495,6 +496,7 @@ def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) ->
     assert repr((parsed.params, parsed.method)) == repr(python_loads(bytes(body)))
 
 
+@settings(deadline=None)
 @given(data=st.binary(max_size=200))
 def test_random_bytes_are_refused(data: bytes) -> None:
     """Bytes that are no document at all are refused as the peer's fault."""
