@@ -14,7 +14,6 @@ ROBOT = "robot"
 _HOST = "host:"
 _GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
-_LIKE_ADDRESS = re.compile(r"[0-9.]+(/.*)?|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%.*)?(/.*)?|[0-9.]*/.*", re.ASCII)
 _SHOWN_LIMIT = 80
 
 
@@ -107,13 +106,15 @@ class Groups:
 
     def _network(self, word: Word) -> Network | None:
         text = word.text
-        if not _LIKE_ADDRESS.fullmatch(text):
+        if not (text[0].isdigit() or ":" in text or "/" in text):
             wanted = meant(text, self.groups) or "; a value is a group, an address, a network, host:NAME or *"
             self._findings.error(word.line, word.column, f"no group {quoted(text)} is defined{wanted}")
             return None
         try:
             network = canonical_network(ipaddress.ip_network(text))
         except ValueError:
+            network = None
+        if network is None or "%" in text:
             self._findings.error(word.line, word.column, _address_fault(text))
             return None
         if network.is_loopback and self.robot and not self._warned_loopback and not self._robot_is_loopback():
@@ -215,7 +216,8 @@ def _address_fault(text: str) -> str:
     try:
         ipaddress.ip_address(address)
     except ValueError:
-        return f"{quoted(text)} is not an IP address"
+        hint = "; an enrolled host is host:NAME" if ":" in text else ""
+        return f"{quoted(text)} is not an IP address{hint}"
     if not slash:
         return f"{quoted(text)} is not an IP address"
     try:

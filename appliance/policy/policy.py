@@ -9,7 +9,6 @@ Invariants:
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
 """
 
-import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -33,7 +32,7 @@ class CompiledRule:
     """One line of a deciding section.
 
     `key` is None for `default`; `atoms` and `words` are the value, the words as they were written; `shown`
-    names its hosts for a person; `column` is where the key begins.
+    says for a person whom it means, `place` where it stands; `column` is where the key begins.
     """
 
     rule: Rule
@@ -41,6 +40,7 @@ class CompiledRule:
     atoms: frozenset[Atom]
     words: tuple[tuple[str, Atom], ...]
     shown: str
+    place: str
     column: int
 
     def grants(self, atoms: frozenset[Atom]) -> bool:
@@ -173,13 +173,13 @@ class Policy:
         if namespace:
             inherited = table.tree.inherited(request.resource) or table.default
             if inherited is None:
-                reason = f"{_what(request, may=False)}: no key of [Parameters] matches what is below it"
+                reason = f"{_what(request, 'may not')}: no key of [Parameters] matches what is below it"
                 return _decided(False, None, reason, table.audit_only)
             deciding.append(inherited)
         for rule in deciding:
             if not rule.grants(atoms):
-                reason = f"{_what(request, may=False)} with what is below it: {_only(rule)}"
-                reason += f", by {_place(rule.rule)}"
+                reason = f"{_what(request, 'may not')} with what is below it: {rule.shown}"
+                reason += f", by {rule.place}"
                 return _decided(False, rule.rule, reason, table.audit_only)
         return None
 
@@ -230,7 +230,7 @@ class Policy:
 
     def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:
-            reason = f"{_what(request, may=False)}: only its own key in [Commands] grants it, never default"
+            reason = f"{_what(request, 'may not')}: only its own key in [Commands] grants it, never default"
             return Decision(False, None, reason)
         decision = self._apply(request, table, found)
         # audit-only is for learning what a robot does; no robot needs these calls, so they never just pass.
@@ -239,21 +239,21 @@ class Policy:
     def _apply(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:
             section = BY_CATEGORY[request.category].name
-            reason = f"{_what(request, may=False)}: no key of [{section}] matches and it has no default"
+            reason = f"{_what(request, 'may not')}: no key of [{section}] matches and it has no default"
             return _decided(False, None, reason, table.audit_only)
         if found.grants(self._hosts.atoms_of(request.host)):
-            return Decision(True, found.rule, f"{_what(request, may=True)} by {_place(found.rule)}")
-        phrase = PHRASES[request.category].format(_shortened(request.resource))
-        host = canonical_address(request.host)
-        reason = f"{host} is not among the hosts that may {phrase}: {_only(found)}, by {_place(found.rule)}"
+            return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
+        what = _what(request, "is not among the hosts that may")
+        reason = f"{what}: {found.shown}, by {found.place}"
         return _decided(False, found.rule, reason, table.audit_only)
 
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
         if decider.extension:
-            phrase = PHRASES[request.category].format(_shortened(request.resource))
-            return Decision(True, None, f"no [{decider.name}] section: every host may {phrase}")
-        reason = f"{_what(request, may=False)}: the policy has no [{decider.name}] section, so nobody may"
+            return Decision(
+                True, None, f"no [{decider.name}] section: {_what(request, 'may')}, as every host"
+            )
+        reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so nobody may"
         return _decided(False, None, reason, table.audit_only)
 
 
@@ -282,13 +282,9 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
     return Decision(allowed, rule, reason)
 
 
-def _what(request: Request, *, may: bool) -> str:
-    phrase = PHRASES[request.category].format(_shortened(request.resource))
-    return f"{canonical_address(request.host)} {'may' if may else 'may not'} {phrase}"
-
-
-def _only(rule: CompiledRule) -> str:
-    return f"only {rule.shown} may" if rule.shown else "nobody may"
+def _what(request: Request, may: str) -> str:
+    phrase = PHRASES[request.category]
+    return f"{canonical_address(request.host)} {may} {phrase} {_shortened(request.resource)}"
 
 
 def _shortened(text: str, limit: int = 60) -> str:
@@ -296,11 +292,7 @@ def _shortened(text: str, limit: int = 60) -> str:
     return shown if shown.isprintable() else quoted(text, limit)
 
 
-def _place(rule: Rule) -> str:
+def place_of(rule: Rule) -> str:
+    """Where a rule stands, short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"
-
-
-def address_of(text: str) -> Address:
-    """An IP address from text, IPv4-mapped ones as IPv4; raises ValueError."""
-    return canonical_address(ipaddress.ip_address(text))

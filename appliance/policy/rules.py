@@ -5,7 +5,7 @@ from appliance.policy.findings import Findings, meant, quoted
 from appliance.policy.groups import Groups
 from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
-from appliance.policy.policy import CompiledRule, RuleTable
+from appliance.policy.policy import CompiledRule, RuleTable, place_of
 from appliance.policy.reader import Entry, SectionText, Word
 from appliance.policy.sections import PARAMETERS, Decider
 
@@ -51,9 +51,11 @@ class RuleCompiler:
             if key is not None and not key.exact and not self._fits(category, key, name):
                 continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
-            shown = self._groups.shown(entry.values)
+            shown = f"only {self._groups.shown(entry.values)} may" if entry.values else "nobody may"
             atoms = frozenset(atom for _, atom in words)
-            self._add(category, CompiledRule(rule, key, atoms, words, shown, entry.key.column))
+            self._add(
+                category, CompiledRule(rule, key, atoms, words, shown, place_of(rule), entry.key.column)
+            )
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
         """Whether a pattern ties with none before it, and is not one too many."""

@@ -38,13 +38,13 @@ GROUPS, PORTS, MONITOR, OPTIONS = "Groups", "Ports", "Monitor", "Options"
 NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), OPTIONS)
 
 PHRASES = {
-    Category.NODE: "use the node name {}",
-    Category.PUBLISH: "publish {}",
-    Category.SUBSCRIBE: "subscribe to {}",
-    Category.COMMAND: "call {}",
-    Category.OFFER: "offer the service {}",
-    Category.CALL: "call the service {}",
-    Category.READ: "read the parameter {}",
-    Category.WRITE: "write the parameter {}",
+    Category.NODE: "use the node name",
+    Category.PUBLISH: "publish",
+    Category.SUBSCRIBE: "subscribe to",
+    Category.COMMAND: "call",
+    Category.OFFER: "offer the service",
+    Category.CALL: "call the service",
+    Category.READ: "read the parameter",
+    Category.WRITE: "write the parameter",
 }
-"""What a request does, for the sentence of a decision; `{}` is the resource."""
+"""What a request does, for the sentence of a decision; the resource follows."""

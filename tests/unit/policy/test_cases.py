@@ -1,0 +1,122 @@
+"""The cases beside a policy: who, does what, allow or deny."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.policy import CaseResult, PolicyError, compile_policy, run_cases
+from appliance.policy.actions import VERBS
+
+POLICY = compile_policy(
+    """[Groups]
+ocu = host:ocu-1 10.0.0.5
+[Nodes]
+/joystick = ocu
+[Publishers]
+/cmd = ocu
+[Commands]
+default = robot
+[Options]
+audit-only = Commands
+""",
+    file="p.ini",
+)
+
+
+def run(text: str) -> list[CaseResult]:
+    """The results of cases against the policy above."""
+    return run_cases(POLICY, text, "p.ini.tests.yaml")
+
+
+def test_cases_pass_and_fail_with_their_place() -> None:
+    """Each action is one check with the line and column it stands on, and the decision that was made."""
+    results = run(
+        "cases:\n"
+        "  - host: 10.0.0.5\n"
+        "    node: /joystick\n"
+        "    allow: [publish /cmd]\n"
+        "    deny:\n"
+        "      - publish /cmd\n"
+        "      - use-node /other\n"
+    )
+    assert [(r.line, r.column, r.passed) for r in results] == [(4, 13, True), (6, 9, False), (7, 9, True)]
+    assert str(results[1]).startswith("p.ini.tests.yaml:6:9: expected deny: 10.0.0.5 may publish /cmd")
+
+
+def test_given_addresses_stand_for_robot_and_enrolled_hosts() -> None:
+    """Cases may give the addresses that the policy leaves open, and use them by name."""
+    results = run(
+        "given: {robot: 192.0.2.1, hosts: {ocu-1: 10.77.0.11}}\n"
+        "cases:\n"
+        "  - {host: [host:ocu-1, 10.0.0.5], node: /joystick, allow: [publish /cmd]}\n"
+        "  - {host: robot, allow: [command getPid], deny: [use-node /joystick]}\n"
+    )
+    assert [str(r.request.host) for r in results] == ["10.77.0.11", "10.0.0.5", "192.0.2.1", "192.0.2.1"]
+    assert all(r.passed for r in results)
+
+
+def test_audit_only_counts_as_the_denial_it_stands_for() -> None:
+    """A case says what the rules say: that a section is in audit-only mode does not turn deny into allow."""
+    assert run("cases: [{host: 10.9.9.9, deny: [command getPid]}]")[0].passed
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "1:1: there is no case in this file"),
+        ("cases: []", "1:1: there is no case in this file"),
+        ("- a", "1:1: the file is a mapping with given, cases"),
+        ("case: []", '1:1: unknown key "case"; did you mean cases?'),
+        ("cases: x", "1:8: cases is a list"),
+        ("cases: [{host: x, allow: [publish /a]}]", '1:16: "x" is not an address, robot or host:NAME'),
+        ("cases: [{host: robot, allow: [publish /a]}]", "1:16: it is not said which address robot is"),
+        (
+            "cases: [{host: 10.0.0.1, allow: [publish /a]}]",
+            '1:34: "publish /a" makes a node part of the graph',
+        ),
+        (
+            "cases: [{host: 10.0.0.1, allow: [publsh /a]}]",
+            '1:34: "publsh /a" begins with no known verb; did you mean',
+        ),
+        (
+            "cases: [{host: 10.0.0.1, allow: [command shutDown]}]",
+            '1:34: "shutDown" is not a command; did you mean',
+        ),
+        ("cases: [{host: 10.0.0.1, allow: [call a]}]", '1:34: "a" is not a resolved ROS name'),
+        ("cases: [{host: 10.0.0.1}]", "1:9: a case needs allow: or deny:"),
+        ("cases: [{allow: [call /a]}]", "1:9: a case needs host:"),
+        ("cases: [{host: 10.0.0.1, node: x, allow: [call /a]}]", '1:32: "x" is not a node name'),
+        ("cases: [{host: 10.0.0.1, host: 10.0.0.1, allow: [call /a]}]", '1:26: the key "host" is repeated'),
+        ("given: {robot: x}", '1:16: "x" is not an IP address'),
+        ("cases: [", "1:9: not YAML"),
+        ("a: !!python/object:os.system x", '1:1: unknown key "a"'),
+    ],
+)
+def test_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: str) -> None:
+    """A file of cases that cannot be understood is refused with line and column, never passed over."""
+    with pytest.raises(PolicyError) as caught:
+        run(text)
+    shown = [f"{f.line}:{f.column}: {f.text}" for f in caught.value.findings]
+    assert any(line.startswith(expected) for line in shown)
+
+
+def test_aliases_cannot_multiply_cases_without_end() -> None:
+    """YAML aliases that would blow a small file up to millions of checks are refused with the limit."""
+    hosts = ", ".join(["10.0.0.1"] * 1000)
+    text = f"cases:\n  - {{host: [{hosts}], allow: &a [{', '.join(['call /x'] * 1000)}]}}\n"
+    with pytest.raises(PolicyError, match="more than 100000 checks"):
+        run(text)
+
+
+WORDS = "cases: given: host: node: allow: deny: - [ ] { } , /a ::1 robot & *a &a !!x"
+PIECES = [*VERBS, *WORDS.split(), "\n  "]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=40).map(" ".join)))
+def test_any_text_gives_results_or_a_policy_error(text: str) -> None:
+    """Whatever the text, there are results or a PolicyError; nothing else."""
+    try:
+        assert run(text)
+    except PolicyError as error:
+        assert error.findings

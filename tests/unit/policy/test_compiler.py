@@ -1,0 +1,253 @@
+"""Compiling a policy: every mistake with its place, all at once, and nothing else whatever the text."""
+
+import ipaddress
+import time
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from appliance.policy import Policy, PolicyError, Severity, compile_policy
+from appliance.policy.findings import MAXIMUM_FINDINGS
+from appliance.policy.reader import MAXIMUM_CHARACTERS
+
+SAMPLE_OF_ROSRV = """# machine-a: 192.168.15.69
+# OCU
+
+[groups]
+localhost = 127.0.0.1\x20
+certikos = 192.168.15.69 192.168.15.90\x20
+ocu = 130.107.95.92 130.107.95.25
+
+[Ports]
+range = 19001-20000
+
+[Monitor]
+topic = /chatter /landshark_control/base_velocity/hmac /rosout\x20
+
+[Nodes]
+default=localhost
+/roslaunch=localhost ocu
+/rostopic=localhost #ocu
+/landshark/gps__monitor__=localhost
+/ankh/joystick_teleop=ocu
+/Ocu_2D=localhost ocu
+
+[Publishers]
+default=localhost certikos
+/chatter = localhost ocu
+/rosout = localhost certikos ocu
+
+[Subscribers]
+default = localhost certikos\x20
+#/landshark_waypoint_navigation = localhost certikos ocu
+/landshark/gun_camera/compressed = localhost certikos ocu
+
+[Commands]
+default = localhost
+# Commands: full access
+getSystemState = localhost certikos ocu
+getRVState = localhost\x20
+subscribeParam = localhost certikos ocu
+# Commands: local access only
+shutdown = localhost
+getBusInfo = localhost
+"""
+
+
+def errors_of(text: str) -> list[str]:
+    """`line:column: text` of every error, as `rosrv policy check` shows them."""
+    with pytest.raises(PolicyError) as caught:
+        compile_policy(text, file="p.ini")
+    found = [f for f in caught.value.findings if f.severity is Severity.ERROR]
+    return [f"{f.line}:{f.column}: {f.text}" for f in found]
+
+
+def warnings_of(text: str, **given: object) -> list[str]:
+    """`line:column: text` of every warning."""
+    policy = compile_policy(text, file="p.ini", **given)  # type: ignore[arg-type]  # forwarded as given
+    return [f"{f.line}:{f.column}: {f.text}" for f in policy.warnings]
+
+
+def test_policy_of_the_shape_of_rosrvs_loads() -> None:
+    """Lower-case [groups], comments behind values, blanks at line ends, [Ports], [Monitor] are read."""
+    policy = compile_policy(SAMPLE_OF_ROSRV, file="access-policy.cfg")
+    assert policy.ports == range(19001, 20001)
+    assert policy.monitored_topics == {"/chatter", "/landshark_control/base_velocity/hmac", "/rosout"}
+
+
+def test_policy_of_rosrv_with_a_group_commented_out_is_refused_for_that() -> None:
+    """Where a group that rules still use is commented out, each use is an error with its place."""
+    found = errors_of(SAMPLE_OF_ROSRV.replace("\nocu =", "\n#ocu ="))
+    assert found[0].startswith('17:22: no group "ocu" is defined')
+    assert len(found) == 8
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[Publisher]\n", '1:1: unknown section "Publisher"; did you mean Publishers?'),
+        ("[Xyz]\n", '1:1: unknown section "Xyz"; sections are Groups, Ports,'),
+        ("[Nodes\n", '1:1: the section "[Nodes" is not closed: add "]"'),
+        ("[Nodes] x\n", '1:9: unexpected text after the section: "x"'),
+        ("[Nodes]\n[nodes]\n", "2:1: the section [Nodes] stands already at line 1"),
+        ("a = b\n", '1:1: "a" stands before the first section'),
+        ("[Nodes]\n  /a\n", '2:3: expected key = value, found "/a"'),
+        ("[Nodes]\n = *\n", '2:2: expected a key before "="'),
+        ("[Nodes]\n/ä = *\n", '2:2: unexpected character "ä"'),
+        ("[Nodes]\n/a\x00 = *\n", '2:3: unexpected character "\\x00"'),
+        ("[Nodes]\n/a = *\n/b=*\n/a = *\n", '4:1: the key "/a" stands already at line 2'),
+        ("[Nodes]\ndefault = *\ndefault =\n", '3:1: the key "default" stands already at line 2'),
+        ("[Nodes]\n/a =  foo\n", '2:7: no group "foo" is defined; a value is'),
+        ("[Groups]\nocu = ::1\n[Nodes]\n/a = ocus\n", '4:6: no group "ocus" is defined; did you mean ocu?'),
+        ("[Nodes]\n/a = 10.0.0\n", '2:6: "10.0.0" is not an IP address'),
+        ("[Nodes]\n/a = 10.0.0.256\n", '2:6: "10.0.0.256" is not an IP address'),
+        (
+            "[Nodes]\n/a = 10.0.0.1/8\n",
+            '2:6: "10.0.0.1/8" has bits set beyond its prefix: did you mean 10.0.0.0/8',
+        ),
+        ("[Nodes]\n/a = 10.0.0.0/33\n", '2:6: "10.0.0.0/33" is not a network'),
+        ("[Nodes]\n/a = fe80::1%eth0\n", '2:6: "fe80::1%eth0" has a zone'),
+        ("[Nodes]\n/a = fe80::g\n", '2:6: "fe80::g" is not an IP address'),
+        ("[Nodes]\n/a = host:\n", '2:6: "host:" is not host:NAME'),
+        ("[Nodes]\na = *\n", '2:1: "a": names here are resolved and begin with a slash: /a'),
+        ("[Nodes]\ndefualt = *\n", '2:1: "defualt": did you mean default?'),
+        ("[Nodes]\n//a = *\n", '2:1: "//a": can never match: resolved names have single slashes: /a'),
+        (
+            "[Nodes]\n/a/ = *\n",
+            '2:1: "/a/": can never match: no resolved name ends with a slash; write /a or /a/**',
+        ),
+        ("[Nodes]\n/ = *\n", '2:1: "/": can never match'),
+        ("[Nodes]\n/a-b = *\n", '2:1: "/a-b": is not a ROS name'),
+        ("[Nodes]\n/a*b = *\n", '2:1: "/a*b": a star may stand at the end of a level only'),
+        ("[Nodes]\n/**/a = *\n", '2:1: "/**/a": a star may stand at the end of a level only'),
+        ("[Nodes]\n/a** = *\n", '2:1: "/a**": a star may stand at the end of a level only'),
+        ("[Nodes]\n/*/x = *\n/*/x* = *\n", '3:1: "/*/x*" and "/*/x" (line 2) are equally specific'),
+        ("[Groups]\na = b\nb = c\nc = b\n", "3:1: the group contains itself: b = c = b"),
+        ("[Groups]\na = a\n", "2:1: the group contains itself: a = a"),
+        ("[Groups]\na = ::1\na = ::2\n", '3:1: the group "a" is defined already at line 2'),
+        ("[Groups]\nrobot = ::1\n", '2:1: the group "robot" is predefined'),
+        ("[Groups]\n10.0.0.1 = ::1\n", '2:1: "10.0.0.1" is not a group name'),
+        ("[Commands]\ngetparam = *\n", '2:1: unknown command "getparam"; did you mean getParam?'),
+        (
+            "[Commands]\nregisterPublisher = *\n",
+            "2:1: can never match: registerPublisher is decided by [Nodes] and",
+        ),
+        ("[Commands]\nget* = *\n", '2:1: "get*": commands have no patterns'),
+        (
+            "[Commands]\nlistMethods = *\nsystem.listMethods = *\n",
+            '3:1: the key "system.listMethods" stands already',
+        ),
+        ("[Parameters]\n/a = *\n", '2:1: "/a": a key here is read or write and a name'),
+        ("[Parameters]\nread a = *\n", '2:6: "a": names here are resolved'),
+        ("[Ports]\nrange = 1-2\n", "2:9: 1-2: the range goes upwards"),
+        ("[Ports]\nrange = 11000-12000\n", "2:9: 11000-12000 contains 11311"),
+        ("[Ports]\nrange = x\n", "2:9: expected range = FIRST-LAST"),
+        ("[Ports]\nrang = 1-2\n", '2:1: unknown key "rang"; did you mean range?'),
+        ("[Monitor]\ntopic = chatter\n", '2:9: "chatter" is not a resolved name'),
+        ("[Monitor]\ntopic = /a\ntopic = /b\n", '3:1: the key "topic" stands already at line 2'),
+        ("[Options]\ntakeover = same host\n", '2:12: takeover is same-host or granted, not "same host"'),
+        (
+            "[Options]\naudit-only = Publisher\n",
+            '2:14: "Publisher" decides nothing; did you mean Publishers?',
+        ),
+        ("[Options]\naudit-only = Groups\n", '2:14: "Groups" decides nothing'),
+    ],
+)
+def test_mistake_is_an_error_with_its_place_and_what_was_meant(text: str, expected: str) -> None:
+    """Each kind of mistake refuses the file and says line, column, what is wrong and what to write."""
+    found = errors_of(text)
+    assert len(found) == 1
+    assert found[0].startswith(expected)
+
+
+def test_all_mistakes_are_reported_at_once() -> None:
+    """A file with many mistakes shows all of them in one go, in the order of the file."""
+    text = "[Groups]\na = 10.0.0\n[Nodes]\nx = a\n/y = b\n[Commands]\nfoo = a\n[Options]\ntakeover = no\n"
+    assert [line.split(":")[0] for line in errors_of(text)] == ["2", "4", "5", "7", "9"]
+
+
+def test_misspelt_section_is_one_mistake() -> None:
+    """[Group] for [Groups] is one error, not one more for each use of its groups."""
+    assert len(errors_of("[Group]\na = ::1\n[Nodes]\ndefault = a\n")) == 1
+
+
+def test_error_says_file_line_and_column_as_compilers_do() -> None:
+    """str() of a finding is file:line:column: error: text; the exception lists them all."""
+    with pytest.raises(PolicyError) as caught:
+        compile_policy("[Nodes]\nx = *\n", file="policies/p.ini")
+    assert str(caught.value).startswith("policies/p.ini:2:1: error: ")
+
+
+def test_file_beyond_the_limit_is_refused_by_name_of_the_limit() -> None:
+    """A file that is too long is refused unread, and the error says the limit."""
+    found = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
+    assert str(MAXIMUM_CHARACTERS) in found[0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x\n" * (MAXIMUM_CHARACTERS // 2),
+        "[Nodes]\n/a = " + "zz " * (MAXIMUM_CHARACTERS // 3 - 10),
+        "[Groups]\n"
+        + "".join(f"g{n} = g{n + 1}\n" for n in range(60_000))
+        + "g60000 = ::1\n[Nodes]\ndefault = g0\n",
+        "[Nodes]\n" + "".join(f"/*/a{n}* = *\n" for n in range(20_000)),
+        "[Nodes]\n" + "".join(f"/{'a/' * 400}b{n} = *\n" for n in range(2_000)),
+        "[Groups]\n"
+        + "".join(f"g{n} = 10.{n >> 8}.{n & 255}.1\n" for n in range(20_000))
+        + "[Nodes]\n/a = gg",
+    ],
+    ids=["garbage", "undefined", "chain", "stars", "deep", "many groups"],
+)
+def test_hostile_file_is_judged_in_bounded_time(text: str) -> None:
+    """The worst texts of the allowed length are loaded or refused within seconds, with a bounded list."""
+    start = time.monotonic()
+    try:
+        compile_policy(text, file="p.ini")
+    except PolicyError as error:
+        assert len(error.findings) <= 2 * MAXIMUM_FINDINGS + 1
+    assert time.monotonic() - start < 60
+
+
+WORDS = """
+    [Groups] [nodes] [Publishers] [Commands] [Parameters] [Ports] [Monitor] [Options] ] [ a b robot default /a
+    /a/* /*/a /** * = , # ; 10.0.0.1 10.0.0.0/8 fd00::/16 ::ffff:1.2.3.4 host:x host: ::1%x 1/2 read write
+    getParam range 19001-20000 topic takeover audit-only all é
+"""
+PIECES = st.sampled_from([*WORDS.split(), " ", "\n", "\r", "\t", "\x00", "\ufeff", "\u2028"])
+TEXTS = st.one_of(st.text(), *(st.lists(PIECES, max_size=60).map(glue.join) for glue in ("", " ")))
+
+
+@settings(max_examples=500, deadline=None)
+@given(TEXTS)
+@example("[Groups]\nrobot\n=")
+def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
+    """Whatever the text: a Policy, or a PolicyError with places inside the text; nothing else."""
+    try:
+        policy = compile_policy(text, file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")])
+    except PolicyError as error:
+        assert error.findings
+        lines = text.split("\n")
+        for finding in error.findings:
+            assert 1 <= finding.line <= len(lines)
+            assert 1 <= finding.column <= len(lines[finding.line - 1]) + 1
+            assert str(finding).isprintable()
+    else:
+        assert isinstance(policy, Policy)
+
+
+def test_options_and_ports_have_their_documented_defaults() -> None:
+    """Without [Ports] and [Options]: 19001-21000, takeover by the same host, no audit-only mode."""
+    policy = compile_policy("", file="p.ini")
+    assert policy.ports == range(19001, 21001)
+    assert policy.takeover == "same-host"
+    assert policy.monitored_services == frozenset()
+    assert compile_policy("[Options]\ntakeover = granted\n", file="p").takeover == "granted"
+
+
+def test_lines_may_end_as_on_windows() -> None:
+    """Carriage returns and a byte-order mark change nothing."""
+    policy = compile_policy("\ufeff[Groups]\r\na = ::1 # x\r\n[Nodes]\r\ndefault = a\r\n", file="p.ini")
+    assert policy.knows(ipaddress.ip_address("::1"))

@@ -1,0 +1,41 @@
+"""Comparing two policies on requests that were seen."""
+
+import ipaddress
+
+from appliance.policy import Category, Request, compile_policy, diff
+
+OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n"
+
+
+def request(host: str, resource: str, node: str = "/n") -> Request:
+    """A request to publish."""
+    return Request(ipaddress.ip_address(host), node, Category.PUBLISH, resource)
+
+
+def test_only_what_is_decided_differently_is_listed_once_with_its_count() -> None:
+    """The same request seen often is one difference with a count; what stays the same is left out."""
+    old = compile_policy(OLD, file="old.ini")
+    new = compile_policy(OLD.replace("/cmd = 10.0.0.5", "/cmd = 10.0.0.6"), file="new.ini")
+    seen = [request("10.0.0.5", "/cmd"), request("10.0.0.6", "/cmd"), request("10.0.0.1", "/x")]
+    found = diff(old, new, [*seen, seen[0]])
+    assert [(str(d.request.host), d.granted, d.count) for d in found] == [
+        ("10.0.0.5", False, 2),
+        ("10.0.0.6", True, 1),
+    ]
+    assert "new.ini:5" in found[0].new.reason
+
+
+def test_lost_node_name_is_a_difference() -> None:
+    """A publisher that loses its node name, not its topic, is listed as well."""
+    old = compile_policy(OLD, file="old.ini")
+    new = compile_policy(OLD.replace("default = *", "default = *\n/n = 10.0.0.9"), file="new.ini")
+    found = diff(old, new, [request("10.0.0.1", "/x"), request("10.0.0.1", "/x", node="/m")])
+    assert [d.request.caller_id for d in found] == ["/n"]
+
+
+def test_audit_only_is_between_allowed_and_denied() -> None:
+    """A policy that goes from audit-only to force turns what passed marked into denials."""
+    old = compile_policy(OLD + "[Options]\naudit-only = Publishers\n", file="old.ini")
+    new = compile_policy(OLD, file="new.ini")
+    found = diff(old, new, [request("10.0.0.9", "/cmd"), request("10.0.0.1", "/x")])
+    assert [(d.old.would_deny, d.new.allowed) for d in found] == [(True, False)]

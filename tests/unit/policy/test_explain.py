@@ -1,0 +1,74 @@
+"""Explaining a decision: the rule that decides, how it means the host, the rules that lost."""
+
+import ipaddress
+
+from appliance.policy import Category, Explanation, Request, compile_policy, explain
+from appliance.policy.explain import render
+
+POLICY = compile_policy(
+    """[Groups]
+ocu = 10.0.0.5
+[Nodes]
+/ocu = ocu
+[Publishers]
+default = 10.0.0.1
+/arm/** = ocu
+/arm/* = 10.0.0.0/8
+/arm/cmd = ocu
+[Commands]
+default = ocu
+listMethods = 10.0.0.1
+""",
+    file="p.ini",
+)
+
+
+def explained(host: str, category: Category, resource: str, node: str = "/ocu") -> Explanation:
+    """The explanation of one request."""
+    return explain(POLICY, Request(ipaddress.ip_address(host), node, category, resource))
+
+
+def test_rules_that_lost_are_named_most_specific_first() -> None:
+    """Every rule that matches the name is there once: the one that decides, the others with the reason."""
+    found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
+    assert found.decision.rule is not None
+    assert found.decision.rule.key == "/arm/cmd"
+    assert [(lost.rule.key, lost.grants) for lost in found.lost] == [
+        ("/arm/*", True),
+        ("/arm/**", True),
+        ("default", False),
+    ]
+    assert found.lost[0].why == "/arm/cmd is more specific"
+
+
+def test_word_that_means_the_host_is_shown() -> None:
+    """An allowed host is told through which group or network of the value it is meant."""
+    assert explained("10.0.0.5", Category.PUBLISH, "/arm/cmd").through == ("ocu",)
+    assert explained("10.0.0.7", Category.PUBLISH, "/arm/x").through == ("10.0.0.0/8",)
+
+
+def test_node_rule_is_part_of_the_answer() -> None:
+    """Publishing under a name the host may not use is denied although [Publishers] grants the topic."""
+    found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
+    assert found.decision.allowed
+    assert not found.allowed
+    assert POLICY.decide_with_node(found.request).allowed == found.allowed
+    assert any(line.startswith("together: denied") for line in render(found))
+
+
+def test_command_is_explained_under_its_wire_name_too() -> None:
+    """system.listMethods is explained by the key listMethods."""
+    found = explained("10.0.0.1", Category.COMMAND, "system.listMethods")
+    assert found.decision.allowed
+    assert found.decision.rule is not None
+    assert found.decision.rule.key == "listMethods"
+    assert [lost.rule.key for lost in found.lost] == ["default"]
+
+
+def test_text_says_decision_and_place() -> None:
+    """The rendered text has the sentence of the decision and the file and line of every rule."""
+    lines = list(render(explained("10.0.0.9", Category.COMMAND, "getPid")))
+    assert lines[0].startswith(
+        "denied: 10.0.0.9 is not among the hosts that may call getPid: only ocu (10.0.0.5)"
+    )
+    assert lines[1] == "  rule: [Commands] default (p.ini:11)"
