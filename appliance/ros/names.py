@@ -105,8 +105,10 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
         resolved = name
     else:
         if caller_id:
-            check_caller_id(caller_id)
+            check_tool_id(caller_id)
         resolved = f"{caller_id}/{name[1:]}" if first == "~" else namespace(caller_id) + name
+        if len(resolved) > MAX_NAME_LENGTH or grammar.match(resolved) is None:
+            raise InvalidNameError(f"name {_show(name)} of {_show(caller_id)}: {_refusal(resolved, grammar)}")
     if "//" in resolved:
         resolved = _SLASHES.sub("/", resolved)
     return resolved.rstrip("/") or "/"

@@ -14,7 +14,8 @@ from appliance.ros.errors import InvalidNameError, PeerError
 
 Oracle = Callable[[str, str], tuple[str, str | None]]
 
-CALLER_IDS = st.sampled_from(["", "/talker", "/ns/talker", "/a/b/c", "/_x/1y"])
+NODE_IDS = st.sampled_from(["", "/talker", "/ns/talker", "/a/b/c", "/_x/1y"])
+CALLER_IDS = st.one_of(NODE_IDS, st.just("/rosparam-4711"))
 NAME_LIKE = st.text(alphabet="aZ0_/~.- :\n\u00e9\u0430", max_size=12)
 
 
@@ -67,7 +68,7 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
 
 
 @settings(max_examples=500, deadline=None)
-@given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=CALLER_IDS)
+@given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """No name of the ROS grammar is refused but those that mean the global namespace."""
     resolved = rosmaster(name, caller_id)[0]
@@ -171,6 +172,27 @@ def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
         with pytest.raises(InvalidNameError):
             names.resolve(name, caller_id)
     assert names.resolve("/chatter", caller_id) == "/chatter"
+
+
+def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
+    """`/rosparam-4711` may use relative names; only a parameter may have its hyphen."""
+    assert names.check_tool_id("/rosparam-4711") == "/rosparam-4711"
+    assert names.resolve("chatter", "/rosparam-4711") == "/chatter"
+    assert names.resolve_parameter("~a", "/rosparam-4711") == "/rosparam-4711/a"
+    for caller_id in ("/rosparam-4711", "/a-b/tool"):
+        with pytest.raises(InvalidNameError, match=r"character .* is '-'"):
+            names.resolve("~a" if caller_id != "/a-b/tool" else "a", caller_id)
+    for caller_id in ("", "/", "tool-1", "/tool 1", "/tool-1/", "//tool-1", "/t-\u0430", "/" + "a-" * 600):
+        with pytest.raises(InvalidNameError):
+            names.check_tool_id(caller_id)
+
+
+def test_a_name_may_not_grow_too_long() -> None:
+    """The bound on the length holds for what a name resolves to."""
+    caller_id = "/" + "a" * 600
+    assert names.is_global_name(names.resolve("~" + "b" * 400, caller_id))
+    with pytest.raises(InvalidNameError, match="1202 characters; at most 1024"):
+        names.resolve("~" + "b" * 600, caller_id)
 
 
 def test_namespace_variant_allows_the_root() -> None:
