@@ -1,11 +1,13 @@
 """The `rosrv` command: one app, one module for each verb."""
 
 import sys
+import traceback
 
 import typer
 
 from appliance.cli import audit, config, demo, policy, up
 from appliance.config_sources import ConfigError
+from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
 
 app = typer.Typer(
@@ -25,9 +27,16 @@ def main() -> None:
     """Entry point of the command: errors are words, never a traceback."""
     try:
         app()
-    except (ConfigError, StartError) as error:
+    except (ConfigError, StartError, NetworkError) as error:
         sys.stderr.write(f"rosrv: {error}\n")
         sys.exit(1)
+    except Exception as error:  # noqa: BLE001  the last resort; what it was and where is still told
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{last.filename}:{last.lineno}"
+        sys.stderr.write(
+            f"rosrv: a defect of rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
+        )
+        sys.exit(70)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ import structlog
 import typer
 
 from appliance.config_sources import resolve
+from appliance.policy import PolicyError, compile_policy
+from appliance.policy.policy import DEFAULT_PORTS
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.run import run_appliance
@@ -52,7 +54,20 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
-    run_appliance(settings, roles_of(), partial(_announce, as_json=as_json))
+    run_appliance(
+        settings,
+        roles_of(),
+        partial(_announce, as_json=as_json),
+        node_ports=_node_ports(settings.policy),
+    )
+
+
+def _node_ports(file: Path) -> range:
+    """The ports that the policy gives to nodes. What is wrong with the policy is for control to say."""
+    try:
+        return compile_policy(file.read_text(encoding="utf-8", errors="replace"), file=str(file)).ports
+    except (OSError, PolicyError):
+        return DEFAULT_PORTS
 
 
 def _announce(said: ControlReady, state: Path, *, as_json: bool) -> None:

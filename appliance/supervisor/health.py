@@ -7,10 +7,11 @@ is made as that user.
 """
 
 import asyncio
+import ctypes
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 
 from appliance.supervisor.users import Account
 
@@ -24,34 +25,33 @@ _REQUEST = (
 ) + _BODY
 
 
-async def answers(port: int, account: Account, seconds: float) -> bool:
-    """Whether the ROSMaster on this loopback port answers a call within `seconds`."""
+async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
+    """Whether the ROSMaster on this loopback port answers a call within `seconds`.
+
+    `inside` is entered to be in its network namespace, for as long as it takes to make a socket.
+    """
     loop = asyncio.get_running_loop()
-    with _socket_of(account) as sock:
-        with suppress(OSError, TimeoutError):
-            async with asyncio.timeout(seconds):
-                await loop.sock_connect(sock, ("127.0.0.1", port))
-                await loop.sock_sendall(sock, _REQUEST)
-                return await loop.sock_recv(sock, 1) != b""
-        return False
-
-
-def _socket_of(account: Account) -> socket.socket:
-    with _effective_user(account):
+    with inside, _as_user(account):
         sock = socket.socket()
-    sock.setblocking(False)
-    return sock
+    with sock, suppress(OSError, TimeoutError):
+        sock.setblocking(False)
+        async with asyncio.timeout(seconds):
+            await loop.sock_connect(sock, ("127.0.0.1", port))
+            await loop.sock_sendall(sock, _REQUEST)
+            return await loop.sock_recv(sock, 1) != b""
+    return False
 
 
 @contextmanager
-def _effective_user(account: Account) -> Iterator[None]:
-    # No await inside: the whole (single-threaded) process is that user meanwhile.
-    before = os.geteuid()
-    if before == account.uid:
+def _as_user(account: Account) -> Iterator[None]:
+    # fsuid is what the owner match of the firewall looks at; it belongs to this thread alone (seteuid
+    # would, for a moment, take root from the threads that look after the firewall).
+    if os.geteuid() != 0:
         yield
         return
-    os.seteuid(account.uid)
+    setfsuid = ctypes.CDLL(None).setfsuid
+    setfsuid(account.uid)
     try:
         yield
     finally:
-        os.seteuid(before)
+        setfsuid(0)

@@ -77,9 +77,9 @@ class Life:
         self._channel.attach(self._loop, self._received, self._lifeline_closed, self._refused)
 
     @property
-    def has_lifeline(self) -> bool:
-        """Whether the process can be talked to."""
-        return self._channel is not None
+    def alive(self) -> bool:
+        """Whether its death has not been seen yet."""
+        return self._pidfd >= 0
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
         """Tell the process something; nothing happens when it is gone (its death is reported by itself)."""
@@ -117,6 +117,8 @@ class Life:
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
         """Send it a signal."""
+        if not self.alive:
+            return
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._pidfd, number)
 
@@ -146,6 +148,7 @@ class Life:
             channel.close()
         code = self._process.wait()
         os.close(self._pidfd)
+        self._pidfd = -1
         self._reports.died(self, code)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import structlog
 
 from appliance.config import Settings
+from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free
 from appliance.supervisor.privileges import raise_file_limit
@@ -21,11 +22,16 @@ log = structlog.get_logger()
 
 
 def run_appliance(
-    settings: Settings, roles: tuple[Role, ...], ready: Callable[[ControlReady, Path], None]
+    settings: Settings,
+    roles: tuple[Role, ...],
+    ready: Callable[[ControlReady, Path], None],
+    *,
+    node_ports: range,
 ) -> None:
     """Run the appliance until it is told to stop. Raises `StartError` when it cannot start or go on.
 
     `ready` is called once, with what control says and the state directory, when nodes may connect.
+    `node_ports` are those of the policy's `[Ports] range`: what the firewall limits and `netns` forwards.
     """
     if settings.isolation == "none":
         log.warning(
@@ -38,32 +44,51 @@ def run_appliance(
         )
     state = StateDirectory(settings.state)
     try:
-        _run(settings, roles, state, ready)
+        settings = _with_ports(settings)
+        master = settings.listen_address[1]
+        ports = Ports(master=master, rosmaster=settings.rosmaster_port, nodes=node_ports)
+        enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
+        state.prepare(roles)
+        state.write_config(settings.model_dump_json())
+        raise_file_limit(_FILES)
+        enclosure.build()
+        try:
+            _supervise(settings, roles, state, enclosure, ready)
+        finally:
+            enclosure.remove()
     finally:
         state.close()
 
 
-def _run(
+def _with_ports(settings: Settings) -> Settings:
+    """The settings with every port chosen that must be known before the first process starts."""
+    host, port = settings.listen_address
+    if port == 0 and settings.isolation != "none":
+        port = free_port()
+    rosmaster = settings.rosmaster_port or free_port()
+    shown = f"[{host}]" if ":" in host else host
+    return settings.model_copy(update={"listen": f"{shown}:{port}", "rosmaster_port": rosmaster})
+
+
+def _supervise(
     settings: Settings,
     roles: tuple[Role, ...],
     state: StateDirectory,
+    enclosure: Enclosure,
     ready: Callable[[ControlReady, Path], None],
 ) -> None:
-    require_free(*settings.listen_address)
-    port = settings.rosmaster_port or free_port()
-    require_free("127.0.0.1", port)
-    raise_file_limit(_FILES)
-    state.prepare(roles)
-    state.write_config(settings.model_copy(update={"rosmaster_port": port}).model_dump_json())
+    with enclosure.inside():
+        require_free(*settings.listen_address)
+        require_free("127.0.0.1", settings.rosmaster_port)
 
     async def supervise() -> None:
         await Supervisor(
             roles,
-            Facts(state=state.path, config=state.config, rosmaster_port=port),
+            Facts(state=state.path, config=state.config, rosmaster_port=settings.rosmaster_port),
             admin=state.open_admin_socket(),
             ready=lambda said: ready(said, state.path),
             relays=settings.relays,
-            isolation=settings.isolation,
+            enclosure=enclosure,
         ).run()
 
     asyncio.run(supervise())

@@ -15,7 +15,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -27,7 +27,6 @@ import structlog
 from appliance.channel.messages import (
     ApplianceStopRequested,
     Failed,
-    FirewallReported,
     Message,
     Pong,
     ProcessesChanged,
@@ -43,9 +42,11 @@ from appliance.channel.messages import (
 )
 from appliance.supervisor import health
 from appliance.supervisor.child import Plan
+from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.guard import Guard
 from appliance.supervisor.kept import KeptSockets, RefusedSocketError
-from appliance.supervisor.life import Life, Reports, link, program_environment
+from appliance.supervisor.life import ANSWER_SECONDS, Life, Reports, link, program_environment
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.users import account_of
 
@@ -96,7 +97,7 @@ class Supervisor:
         admin: socket.socket,
         ready: Callable[[ControlReady], None],
         relays: int = 1,
-        isolation: str = "none",
+        enclosure: Enclosure | None = None,
     ) -> None:
         """`admin` is handed to control; `ready` is called once, when nodes may connect."""
         self._facts = facts
@@ -105,12 +106,13 @@ class Supervisor:
         self._kept.keep(ADMIN, admin.detach())
         self._ready = ready
         self._is_ready = False
-        self._isolation = isolation
+        self._guard = Guard(enclosure or Enclosure(), self._tell_control)
         self._reports = Reports(self._received, self._violated, self._died)
         self._stopping = asyncio.Event()
         self._someone_died = asyncio.Event()
         self._failure: str | None = None
-        self._asking: set[asyncio.Task[None]] = set()
+        self._asking: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
@@ -122,14 +124,12 @@ class Supervisor:
         loop.set_exception_handler(_log_fault)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, self.stop)
-        watch = asyncio.create_task(self._watch())
+        self._spawn(self._watch())
         try:
             await self._start()
+            self._spawn(self._guard.run())
             await self._stopping.wait()
         finally:
-            watch.cancel()
-            with suppress(asyncio.CancelledError):
-                await watch
             await self._end()
             self._kept.close()
         if self._failure is not None:
@@ -149,6 +149,9 @@ class Supervisor:
                 self._fill(post)
                 if post.role.asks:
                     await self._until_answering(post)
+                    reason = await self._guard.look()
+                    if reason is not None:
+                        self.stop(reason)
         asyncio.get_running_loop().call_later(_START_SECONDS, self._check_started)
 
     async def _until_answering(self, post: Post) -> None:
@@ -173,9 +176,9 @@ class Supervisor:
             return
         here, there = socket.socketpair()
         try:
-            post.life = Life(
-                post.role.name, post.index, self._plan(post, there.fileno()), here, self._reports
-            )
+            plan = self._plan(post, there.fileno())
+            with self._guard.enclosure.inside():
+                post.life = Life(post.role.name, post.index, plan, here, self._reports)
         except OSError as error:
             here.close()
             log.error("process cannot be started", role=post.role.name, error=str(error))
@@ -215,7 +218,8 @@ class Supervisor:
         for name, descriptor in self._kept:
             life.send(SocketRestored(name), (descriptor,))
         life.send(SocketsRestored(len(self._kept)))
-        life.send(FirewallReported(isolation=self._isolation, report={}))
+        for message in self._guard.news():
+            life.send(message)
 
     def _link(self, post: Post) -> None:
         for other in self._posts:
@@ -245,7 +249,7 @@ class Supervisor:
                 if name != ADMIN:
                     self._kept.drop(name)
             case RouteWanted(host):
-                life.send(RouteFound(host, None))
+                self._spawn(self._route(life, host))
             case ApplianceStopRequested(reason):
                 log.warning("control asks to end the appliance", reason=reason)
                 self.stop()
@@ -271,12 +275,34 @@ class Supervisor:
             self._violated(life, f"said it is ready, but not where: {error}")
             return
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
+        self._spawn(self._control_ready(life, said))
+
+    async def _control_ready(self, life: Life, said: ControlReady) -> None:
+        reason = await self._guard.control_ready(said.inner_port)
+        if reason is not None and not self._is_ready:
+            self.stop(reason)
+        if self._stopping.is_set() or not life.alive:
+            return
         for post in self._posts:
             if post.role.after == life.role and post.life is None and post.due is None:
                 self._fill(post)
         if not self._is_ready:
             self._is_ready = True
             self._ready(said)
+
+    async def _route(self, life: Life, host: str) -> None:
+        life.send(RouteFound(host, await self._guard.route_to(host)))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
+        return task
+
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log_fault(task.get_loop(), {"message": "a task failed", "exception": error})
 
     def _violated(self, life: Life, what: str) -> None:
         log.critical("process is killed", role=life.role, pid=life.pid, reason=f"it {what}")
@@ -308,19 +334,16 @@ class Supervisor:
             life.kill()
 
     def _ask(self, life: Life) -> None:
-        if self._asking:
-            return
+        if self._asking is None or self._asking.done():
+            self._asking = self._spawn(self._listen_to(life))
 
-        async def ask() -> None:
-            if await self._answers(10.0):
-                life.heard()
-
-        task = asyncio.create_task(ask())
-        self._asking.add(task)
-        task.add_done_callback(self._asking.discard)
+    async def _listen_to(self, life: Life) -> None:
+        if await self._answers(2 * ANSWER_SECONDS):
+            life.heard()
 
     async def _answers(self, seconds: float) -> bool:
-        return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), seconds)
+        inside = self._guard.enclosure.inside()
+        return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
     def _died(self, life: Life, code: int) -> None:
         post = next(one for one in self._posts if one.life is life)
@@ -361,7 +384,7 @@ class Supervisor:
 
     async def _end(self) -> None:
         self._stopping.set()
-        for task in self._asking:
+        for task in self._tasks:
             task.cancel()
         for post in self._posts:
             if post.due is not None:

@@ -13,11 +13,22 @@ from pathlib import Path
 import setproctitle
 
 from appliance.config import Settings
+from appliance.supervisor import run
+from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import Role, roles_of
-from appliance.supervisor.run import run_appliance
 from appliance.supervisor.supervisor import ControlReady
+
+
+class Leaky(Enclosure):
+    """Surroundings that let others reach ROSMaster."""
+
+    probes = True
+
+    def probe(self) -> str | None:
+        """What a probe would say."""
+        return "ROSMaster can be reached by another user"
 
 
 def main() -> None:
@@ -28,11 +39,19 @@ def main() -> None:
     state = Path(sys.argv[1])
     actors = {role: role for role in ("control", "relay", "signer")}
     for one in sys.argv[2:]:
+        if one == "leaky":
+            run.enclosure_of = lambda *_asked: Leaky()
+            continue
         role, _, entry = one.partition("=")
         actors[role] = entry
     settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0)
     try:
-        run_appliance(settings, tuple(_played(role, actors) for role in roles_of()), _ready)
+        run.run_appliance(
+            settings,
+            tuple(_played(role, actors) for role in roles_of()),
+            _ready,
+            node_ports=range(19001, 19101),
+        )
     except StartError as error:
         _say(event="refused", reason=str(error))
         sys.exit(1)

@@ -230,6 +230,14 @@ def test_a_control_that_never_lives_is_an_error(start: Any) -> None:
     assert "control died 5 times (exit status 3)" in running.process.wait_for(event="refused")["reason"]
 
 
+def test_nothing_is_served_when_others_can_reach_the_hidden_master(start: Any) -> None:
+    """When the probe gets through at the start, the start fails, says what is open, and lets no node in."""
+    running = start("leaky")
+    assert running.process.wait() == 1
+    assert running.process.wait_for(event="refused")["reason"] == "ROSMaster can be reached by another user"
+    assert running.process.seen(event="process started", role="control") == []
+
+
 def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None:
     """As root: the ids of the design, no groups, no capability in any set, no way to gain one."""
     need_root()

@@ -1,0 +1,207 @@
+"""What surrounds the processes: the namespace they live in, the firewall around ROSMaster, the probe of it.
+
+Built before the first process starts and taken away after the last one ended. All calls block for as
+long as the kernel takes (tens of milliseconds; the probe up to some seconds), so a running supervisor
+makes them in a thread, one at a time.
+
+Invariants:
+
+1. No process starts before the firewall is in force.
+2. A port that another local user can reach, or a probe that cannot be made, counts as open: `probe` says why.
+3. Rules that somebody took away are put back, and that is said.
+"""
+
+import contextlib
+import ipaddress
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import structlog
+
+from appliance.network.firewall.firewall import Firewall
+from appliance.network.firewall.rules import FirewallSettings, PortRange
+from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.probe import probe_port
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.users import account_of
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Ports:
+    """The ports that the surroundings are about; `inner` is known when control is ready."""
+
+    master: int
+    rosmaster: int
+    nodes: range
+    inner: int | None = None
+
+
+class Enclosure:
+    """No isolation: the processes live where the supervisor lives, open to everybody there."""
+
+    kind = "none"
+    probes = False
+
+    @contextlib.contextmanager
+    def inside(self) -> Iterator[None]:
+        """Be where the processes live, for the length of a block that does not await."""
+        yield
+
+    def build(self) -> None:
+        """Make it. Raises `StartError`; nothing is left behind then."""
+
+    def remove(self) -> None:
+        """Take it away."""
+
+    def control_ready(self, inner_port: int) -> None:
+        """Control's inner face is at this port now. Raises `NetworkError` when others cannot be kept out."""
+
+    def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
+        """The machine's address by which `host` reaches the appliance; None: the one it used."""
+        return None
+
+    def report(self) -> dict[str, Any]:
+        """How it stands, for `rosrv status`."""
+        return {}
+
+    def probe(self) -> str | None:
+        """None when no other user can reach what must be hidden, else what was seen."""
+        return None
+
+
+class Contained(Enclosure):
+    """The namespace the supervisor was started in (a container's), with the firewall in force."""
+
+    kind = "container"
+    probes = True
+
+    def __init__(
+        self, ports: Ports, backend: Literal["auto", "iptables", "nft"], namespace: Namespace | None = None
+    ) -> None:
+        self._ports = ports
+        self._namespace = namespace or Namespace.own()
+        self._backend = backend
+        self._firewall: Firewall | None = None
+
+    def build(self) -> None:
+        """Install the firewall. Raises `StartError`."""
+        try:
+            self._firewall = Firewall(self._namespace, self._backend)
+            chosen = self._firewall.install(self._settings())
+        except NetworkError as error:
+            self.remove()
+            raise StartError(str(error)) from error
+        log.info("firewall is in force", backend=chosen, isolation=self.kind)
+
+    def remove(self) -> None:
+        """Take every rule away again."""
+        if self._firewall is None:
+            return
+        try:
+            self._firewall.remove()
+        except NetworkError as error:
+            log.error("rules of the firewall may be left", error=str(error))
+
+    def control_ready(self, inner_port: int) -> None:
+        """Close the inner face to everybody but rosmaster."""
+        if self._firewall is not None and inner_port != self._ports.inner:
+            self._ports = replace(self._ports, inner=inner_port)
+            self._firewall.update(self._settings())
+
+    def report(self) -> dict[str, Any]:
+        """Back end, rules with counters; rules that are gone are put back first."""
+        if self._firewall is None:
+            return {}
+        report = self._firewall.report()
+        if not report.intact:
+            gone = [rule.purpose for rule in report.rules if not rule.in_force]
+            log.critical("rules of the firewall were taken away and are put back", rules=gone)
+            self._firewall.install(self._settings())
+            report = self._firewall.report()
+        rules = [asdict(rule) for rule in report.rules]
+        return {"backend": report.backend, "not_used": list(report.not_used), "rules": rules}
+
+    def probe(self) -> str | None:
+        """Try to reach ROSMaster and the inner face as another local user."""
+        found = [self._probe("ROSMaster", self._ports.rosmaster)]
+        if self._ports.inner is not None:
+            found.append(self._probe("the inner node face", self._ports.inner))
+        return "; ".join(filter(None, found)) or None
+
+    def _probe(self, what: str, port: int) -> str | None:
+        try:
+            seen = probe_port(self._namespace, port)
+        except NetworkError as error:
+            return f"whether {what} is hidden cannot be told: {error}"
+        if not seen.closed:
+            return f"{what} can be reached by another user of this machine ({seen.describe()})"
+        if seen.listening_outside:
+            return f"{what} listens on {', '.join(seen.listening_outside)}, not on loopback only"
+        return None
+
+    def _settings(self) -> FirewallSettings:
+        nodes = self._ports.nodes
+        return FirewallSettings(
+            control_uid=account_of("rosrv").uid,
+            rosmaster_uid=account_of("rosmaster").uid,
+            rosmaster_port=self._ports.rosmaster,
+            inner_port=self._ports.inner,
+            master_port=self._ports.master,
+            node_ports=PortRange(nodes.start, nodes.stop - 1),
+        )
+
+
+class InNamespace(Contained):
+    """A namespace of its own on a bare host; RVMaster's port and the nodes' are forwarded to it."""
+
+    kind = "netns"
+
+    def __init__(self, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> None:
+        super().__init__(ports, backend)
+        nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
+        self._isolation = Isolation(
+            Namespace.own(), IsolationSettings(ports=(PortRange.one(ports.master), nodes))
+        )
+        self._namespace = self._isolation.namespace
+
+    @contextlib.contextmanager
+    def inside(self) -> Iterator[None]:
+        """Be in the namespace, with the calling thread."""
+        with self._namespace.entered():
+            yield
+
+    def build(self) -> None:
+        """Make the namespace, its way to the host's networks, and the firewall. Raises `StartError`."""
+        try:
+            self._isolation.up()
+        except NetworkError as error:
+            raise StartError(str(error)) from error
+        super().build()
+
+    def remove(self) -> None:
+        """Take firewall and namespace away and put the host's settings back."""
+        super().remove()
+        try:
+            self._isolation.down()
+        except NetworkError as error:
+            log.error("the namespace may be left; the next start clears it", error=str(error))
+
+    def route_to(self, host: str) -> str | None:
+        """The host's address by which the peer reaches it."""
+        ipaddress.ip_address(host)  # control says what it was told; only an address goes on from here
+        return self._isolation.host_address_for(host)
+
+    def report(self) -> dict[str, Any]:
+        """As in a container, and the rules on the host."""
+        return super().report() | {"forwarding": [asdict(rule) for rule in self._isolation.rules()]}
+
+
+def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:
+    """The surroundings that a configuration asks for; nothing is built yet."""
+    if isolation == "container":
+        return Contained(ports, backend)
+    return InNamespace(ports, backend) if isolation == "netns" else Enclosure()

@@ -1,0 +1,112 @@
+"""Looks after the enclosure while the appliance runs: probes it, keeps control informed of it.
+
+What the enclosure does takes time, so each call is made in a thread, one after the other; the
+supervisor's loop goes on meanwhile. The threads are daemons: one that hangs does not keep the appliance
+from ending.
+"""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+import structlog
+
+from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.network.namespaces import NetworkError
+from appliance.supervisor.enclosure import Enclosure
+
+PROBE_SECONDS = 60.0
+
+T = TypeVar("T")
+
+log = structlog.get_logger()
+
+
+class Guard:
+    """The enclosure as the supervisor sees it; `tell` gives a message to control."""
+
+    def __init__(
+        self, enclosure: Enclosure, tell: Callable[[Message], None], *, every: float = PROBE_SECONDS
+    ) -> None:
+        self.enclosure = enclosure
+        self._tell = tell
+        self._every = every
+        self._one_at_a_time = asyncio.Lock()
+        self._probe: Message | None = None
+        self._report = FirewallReported(isolation=enclosure.kind, report={})
+
+    def news(self) -> list[Message]:
+        """What a new control has to know."""
+        return [self._report] if self._probe is None else [self._report, self._probe]
+
+    async def look(self) -> str | None:
+        """Probe, look at the rules, tell control; the reason when something is open that must be hidden."""
+        async with self._one_at_a_time:
+            reason = await self._find_fault()
+        if self.enclosure.probes:
+            self._probe = ProbePassed() if reason is None else ProbeFailed(reason)
+        if reason is not None:
+            log.critical("the appliance must not serve", reason=reason)
+        for message in self.news():
+            self._tell(message)
+        return reason
+
+    async def control_ready(self, inner_port: int) -> str | None:
+        """Close control's inner face to others and look whether it is; the reason when it is not."""
+        try:
+            async with self._one_at_a_time:
+                await in_thread(lambda: self.enclosure.control_ready(inner_port))
+        except NetworkError as error:
+            return f"the inner node face cannot be closed to others: {error}"
+        return await self.look()
+
+    async def route_to(self, host: str) -> str | None:
+        """The machine's address by which `host` reaches the appliance; None when its own route is right."""
+        try:
+            return await in_thread(lambda: self.enclosure.route_to(host))
+        except (NetworkError, ValueError) as error:
+            log.warning("no route to a host", host=host, error=str(error))
+            return None
+
+    async def run(self) -> None:
+        """Look every minute."""
+        while True:
+            await asyncio.sleep(self._every)
+            await self.look()
+
+    async def _find_fault(self) -> str | None:
+        try:
+            report = await in_thread(self.enclosure.report)
+            self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
+            return await in_thread(self.enclosure.probe)
+        except NetworkError as error:
+            return f"the state of the firewall cannot be told: {error}"
+
+
+async def in_thread(function: Callable[[], T]) -> T:
+    """What `function` returns or raises, called in a daemon thread of its own."""
+    loop = asyncio.get_running_loop()
+    outcome: asyncio.Future[T] = loop.create_future()
+
+    def settle(result: T | None, error: BaseException | None) -> None:
+        if outcome.done():
+            return
+        if error is not None:
+            outcome.set_exception(error)
+        else:
+            outcome.set_result(result)  # type: ignore[arg-type]  no error: there is a result
+
+    def work() -> None:
+        result, failure = None, None
+        try:
+            result = function()
+        except BaseException as error:  # noqa: BLE001  handed to the caller, who waits for it
+            failure = error
+        try:
+            loop.call_soon_threadsafe(settle, result, failure)
+        except RuntimeError:
+            log.warning("finished after the appliance had ended", what=function.__qualname__)
+
+    threading.Thread(target=work, name="guard", daemon=True).start()
+    return await outcome

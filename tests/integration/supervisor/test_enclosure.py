@@ -1,0 +1,91 @@
+"""Tests of `appliance.supervisor.enclosure` on a host of the lab: the real kernel, the real firewall."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from appliance.supervisor.enclosure import Contained, Ports
+from tests.support.requirements import need_program, need_root
+
+NODES = range(19001, 19101)
+
+
+@pytest.fixture
+def host() -> Iterator[Host]:
+    """A host of its own."""
+    need_root()
+    need_program("nft", "nftables")
+    with Lab("rosrv-enclosure") as lab:
+        yield lab.host("appliance", "10.79.0.2/24")
+
+
+@pytest.fixture
+def hidden(host: Host) -> Iterator[int]:
+    """The port of something that listens on the host's loopback."""
+    with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as listener:
+        yield listener.getsockname()[1]
+
+
+@pytest.fixture
+def enclosure(host: Host, hidden: int) -> Iterator[Contained]:
+    """The surroundings of an appliance whose ROSMaster is the hidden port."""
+    made = Contained(Ports(master=11311, rosmaster=hidden, nodes=NODES), "auto", host.namespace)
+    yield made
+    made.remove()
+
+
+def reachable(host: Host, port: int) -> bool:
+    """Whether root of the host gets through to a port."""
+
+    def connect() -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+        except ConnectionRefusedError:
+            return False
+        return True
+
+    return host.run(connect)
+
+
+def test_what_is_enclosed_is_hidden_until_the_end(host: Host, enclosure: Contained, hidden: int) -> None:
+    """Open before, closed while the enclosure stands (root included), open afterwards; the probe agrees."""
+    assert "can be reached" in str(enclosure.probe())
+    assert reachable(host, hidden)
+    enclosure.build()
+    assert enclosure.probe() is None
+    assert not reachable(host, hidden)
+    enclosure.remove()
+    assert reachable(host, hidden)
+
+
+def test_the_inner_face_is_closed_once_it_is_known(host: Host, enclosure: Contained) -> None:
+    """Control's inner face is open to everybody until control says where it is, then to rosmaster only."""
+    enclosure.build()
+    with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as inner:
+        port = inner.getsockname()[1]
+        assert reachable(host, port)
+        enclosure.control_ready(port)
+        assert not reachable(host, port)
+        assert enclosure.probe() is None
+
+
+def test_rules_that_are_taken_away_come_back(host: Host, enclosure: Contained, hidden: int) -> None:
+    """Somebody flushes the rules: the next look puts them back, and they are reported in force."""
+    enclosure.build()
+    backend = enclosure.report()["backend"]
+    flush = ["nft", "flush", "ruleset"] if backend == "nft" else ["iptables", "-F"]
+    assert host.popen(flush).wait() == 0
+    assert reachable(host, hidden)
+    report = enclosure.report()
+    assert all(rule["in_force"] for rule in report["rules"])
+    assert not reachable(host, hidden)
+
+
+def test_what_listens_on_more_than_loopback_is_not_hidden(host: Host, enclosure: Contained) -> None:
+    """A port on every address is a finding, even while the firewall keeps others out."""
+    enclosure.build()
+    with host.run(lambda: socket.create_server(("0.0.0.0", 0))) as listener:
+        enclosure.control_ready(listener.getsockname()[1])
+        assert "not on loopback only" in str(enclosure.probe())

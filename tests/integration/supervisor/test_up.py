@@ -1,0 +1,171 @@
+"""`rosrv up` as a user or a script starts it, with the real processes."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Lab
+from appliance.supervisor.roles import ROSMASTER, ROSOUT
+from tests.support.processes import Process, ThisMachine
+from tests.support.requirements import need_root, needs
+
+ROSRV = str(Path(sys.executable).parent / "rosrv")
+POLICY = (
+    "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Subscribers]\ndefault = *\n[Commands]\ndefault = *\n"
+)
+ENVIRONMENT = {"PATH": os.environ["PATH"], "PYTHONUNBUFFERED": "1"}
+
+
+@pytest.fixture
+def directory() -> Iterator[Path]:
+    """A directory with a policy, open to the users of the roles."""
+    needs(ROSMASTER.exists() and ROSOUT.exists(), "rosmaster and rosout (run `make setup`)")
+    made = Path(tempfile.mkdtemp(prefix="rosrv-up-"))
+    made.chmod(0o755)
+    (made / "policy.ini").write_text(POLICY)
+    yield made
+    shutil.rmtree(made)
+
+
+def command(directory: Path, *more: str) -> list[str]:
+    """`rosrv up` on free loopback ports."""
+    fixed = ["--state", str(directory / "state"), "--policy", str(directory / "policy.ini")]
+    return [ROSRV, "up", *fixed, "--listen", "127.0.0.1:0", "--rosmaster-port", "0", *more]
+
+
+@contextlib.contextmanager
+def up(directory: Path, *more: str) -> Iterator[Process]:
+    """The appliance, ended with the block."""
+    process = Process(ThisMachine(), command(directory, *more), env=ENVIRONMENT, label="rosrv up")
+    try:
+        yield process
+    finally:
+        process.stop(with_signal=signal.SIGTERM)
+
+
+def refusal(directory: Path, *more: str) -> str:
+    """What a start that fails says on standard error; it says nothing on standard output."""
+    done = subprocess.run(
+        command(directory, *more), env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_one_line_says_that_nodes_may_connect(directory: Path) -> None:
+    """With `--json` it is the documented object, and the master named there answers."""
+    with up(directory, "--json") as running:
+        ready = running.wait_for(event="ready", timeout=60)
+        assert ready | {"master": "-"} == {"event": "ready", "master": "-", "api": None, "revision": 1}
+        with xmlrpc.client.ServerProxy(ready["master"]) as master:
+            assert master.getUri("/tester")[:1] == [1]
+    assert running.events == [ready]
+
+
+def test_a_person_gets_a_sentence(directory: Path) -> None:
+    """Without `--json` the line is for people: what to export, and where the state is."""
+    with up(directory) as running:
+        line = running.wait_for_text("Nodes may connect", timeout=60)
+    assert "ROS_MASTER_URI=http://127.0.0.1:" in line
+    assert str(directory / "state") in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_it_ends_cleanly_in_time(directory: Path, number: signal.Signals) -> None:
+    """Exit status 0 within five seconds, and the next start on the same state is served."""
+    with up(directory, "--json") as running:
+        running.wait_for(event="ready", timeout=60)
+        began = time.monotonic()
+        assert running.stop(with_signal=number) == 0
+        assert time.monotonic() - began < 5
+    with up(directory, "--json") as again:
+        again.wait_for(event="ready", timeout=60)
+
+
+def test_a_signal_before_it_is_ready_ends_it_as_well(directory: Path) -> None:
+    """An impatient user's Ctrl-C is obeyed while the processes are still starting."""
+    with up(directory, "--json") as running:
+        for _ in range(100):
+            if any("process started" in line for line in list(running.errors)):
+                break
+            running.popen.send_signal(0)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                running.popen.wait(0.05)
+        began = time.monotonic()
+        assert running.stop(with_signal=signal.SIGINT) == 0
+        assert time.monotonic() - began < 5
+
+
+def test_a_port_in_use_is_told_with_its_owner(directory: Path) -> None:
+    """The message names the port and who has it, for RVMaster's and for ROSMaster's."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for flags in (("--listen", f"127.0.0.1:{port}"), ("--rosmaster-port", str(port))):
+            said = refusal(directory, *flags)
+            assert f"port {port} (127.0.0.1) is in use by process {os.getpid()}" in said
+
+
+def test_every_finding_of_a_bad_policy_is_told(directory: Path) -> None:
+    """All of them, with file and line; and the appliance does not start without a policy."""
+    (directory / "policy.ini").write_text("[Nods]\na = b\n[Commands]\nnosuchcall = *\n")
+    said = refusal(directory)
+    assert "policy.ini:1" in said
+    assert "policy.ini:4" in said
+    (directory / "policy.ini").unlink()
+    assert "policy.ini" in refusal(directory)
+
+
+def test_wrong_configuration_is_told_before_anything_starts(directory: Path) -> None:
+    """A bad flag and a bad variable, both at once; no state directory is made."""
+    said = refusal(directory, "--isolation", "vm", "--listen", "nowhere")
+    assert "--isolation: " in said
+    assert "--listen: " in said
+    assert not (directory / "state").exists()
+
+
+def test_a_state_directory_nobody_may_enter_is_told(directory: Path) -> None:
+    """As root: the children's users must be able to reach their part, and the message says which cannot."""
+    need_root()
+    directory.chmod(0o700)
+    said = refusal(directory)
+    assert "cannot be used by user" in said
+    assert str(directory / "state") in said
+
+
+def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> None:
+    """As root, on a host of the lab: the firewall stands while the appliance runs; one set of rules
+    after a crash, none after the end."""
+    need_root()
+    with Lab("rosrv-up") as lab:
+        host = lab.host("appliance", "10.80.0.2/24")
+
+        def rules() -> list[str]:
+            listed = host.popen(["nft", "-j", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
+            entries = json.loads(listed.communicate()[0])["nftables"]
+            return [entry["rule"]["chain"] for entry in entries if "rule" in entry]
+
+        flags = ("--json", "--isolation", "container", "--listen", "10.80.0.2:11311")
+        lives = []
+        for number in (signal.SIGKILL, signal.SIGTERM):
+            running = Process(host, command(directory, *flags), env=ENVIRONMENT, label="rosrv up")
+            try:
+                running.wait_for(event="ready", timeout=60)
+                lives.append(sorted(rules()))
+            finally:
+                running.stop(with_signal=number)
+        assert lives[0] == lives[1] != []
+        assert rules() == []

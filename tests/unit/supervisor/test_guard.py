@@ -1,0 +1,130 @@
+"""Tests of `appliance.supervisor.guard`, with surroundings that do what a test says."""
+
+import asyncio
+import threading
+from typing import Any
+
+import pytest
+
+from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.network.namespaces import NetworkError
+from appliance.supervisor.enclosure import Enclosure
+from appliance.supervisor.guard import Guard
+
+
+class Surroundings(Enclosure):
+    """An enclosure of which a test decides what a probe finds."""
+
+    kind = "container"
+    probes = True
+
+    def __init__(self) -> None:
+        self.found: list[str | Exception | None] = []
+        self.closed: list[int] = []
+        self.looked = threading.Event()
+
+    def report(self) -> dict[str, Any]:
+        """A report that can be recognised."""
+        return {"backend": "nft"}
+
+    def probe(self) -> str | None:
+        """The next finding."""
+        self.looked.set()
+        finding = self.found.pop(0)
+        if isinstance(finding, Exception):
+            raise finding
+        return finding
+
+    def control_ready(self, inner_port: int) -> None:
+        """Fails for port 0."""
+        if inner_port == 0:
+            raise NetworkError("the kernel says no")
+        self.closed.append(inner_port)
+
+
+@pytest.fixture
+def surroundings() -> Surroundings:
+    """Surroundings without a finding yet."""
+    return Surroundings()
+
+
+def test_control_is_told_when_something_opens_and_closes(surroundings: Surroundings) -> None:
+    """A finding is told with its reason, its end as well; the report goes with both."""
+    told: list[Message] = []
+    surroundings.found = ["reached", None]
+
+    async def scene() -> None:
+        guard = Guard(surroundings, told.append)
+        assert await guard.look() == "reached"
+        assert await guard.look() is None
+
+    asyncio.run(scene())
+    report = FirewallReported("container", {"backend": "nft"})
+    assert told == [report, ProbeFailed("reached"), report, ProbePassed()]
+
+
+def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
+    """What cannot be told is not assumed to be right."""
+    told: list[Message] = []
+    surroundings.found = [NetworkError("no child")]
+
+    async def scene() -> None:
+        assert "no child" in str(await Guard(surroundings, told.append).look())
+
+    asyncio.run(scene())
+    assert isinstance(told[-1], ProbeFailed)
+
+
+def test_a_new_control_learns_how_things_stand(surroundings: Surroundings) -> None:
+    """The last finding is repeated to a control that was not there when it was made."""
+    surroundings.found = ["reached"]
+
+    async def scene() -> list[Message]:
+        guard = Guard(surroundings, lambda _message: None)
+        assert guard.news() == [FirewallReported("container", {})]
+        await guard.look()
+        return guard.news()
+
+    assert asyncio.run(scene())[-1] == ProbeFailed("reached")
+
+
+def test_the_inner_face_is_closed_and_then_probed(surroundings: Surroundings) -> None:
+    """The port is closed to others before it is probed; a failure to close it is a finding."""
+    surroundings.found = [None]
+
+    async def scene() -> None:
+        guard = Guard(surroundings, lambda _message: None)
+        assert await guard.control_ready(4711) is None
+        assert "the kernel says no" in str(await guard.control_ready(0))
+
+    asyncio.run(scene())
+    assert surroundings.closed == [4711]
+    assert surroundings.found == []
+
+
+def test_it_looks_again_and_again(surroundings: Surroundings) -> None:
+    """While the appliance runs the surroundings are looked at in turn, also after a finding."""
+    told: list[Message] = []
+    surroundings.found = [None, "reached", None]
+
+    async def scene() -> None:
+        running = asyncio.create_task(Guard(surroundings, told.append, every=0.001).run())
+        async with asyncio.timeout(20):
+            while len(told) < 6:
+                await asyncio.sleep(0)
+        running.cancel()
+
+    surroundings.found += [None] * 100_000
+    asyncio.run(scene())
+    assert [type(one) for one in told[1:6:2]] == [ProbePassed, ProbeFailed, ProbePassed]
+
+
+def test_without_isolation_nothing_is_probed() -> None:
+    """Isolation `none` has nothing to prove, and does not claim to have proven it."""
+    told: list[Message] = []
+
+    async def scene() -> None:
+        assert await Guard(Enclosure(), told.append).look() is None
+
+    asyncio.run(scene())
+    assert told == [FirewallReported("none", {})]
