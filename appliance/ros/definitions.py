@@ -51,7 +51,6 @@ class Definitions:
             self._messages[service.response.name] = service.response
         self._md5sums: dict[str, str] = {}
         self._layouts: dict[str, Layout] = {}
-        self._open: list[str] = []  # the types that are being worked out, outermost first
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
@@ -113,15 +112,12 @@ class Definitions:
 
     def md5sum(self, name: str) -> str:
         """Return the md5sum by which ROS compares the message type `name` between nodes."""
-        if name not in self._md5sums:
-            message = self.message(name)
-            self._md5sums[name] = self._inside(name, lambda: _fingerprint(self._md5_text(message)))
-        return self._md5sums[name]
+        return self._md5sum(name, ())
 
     def service_md5sum(self, name: str) -> str:
         """Return the md5sum by which ROS compares the service type `name` between nodes."""
         service = self.service(name)
-        return _fingerprint(self._md5_text(service.request) + self._md5_text(service.response))
+        return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
         """Return the text of a message type and of all types it is made of, as connection headers have it."""
@@ -139,18 +135,35 @@ class Definitions:
 
     def layout(self, name: str) -> Layout:
         """Return how messages of the type `name` lie in their bytes; raises `DefinitionError`."""
+        return self._layout(name, ())
+
+    # `outer` is always the types that are being worked out, outermost first.
+
+    def _md5sum(self, name: str, outer: tuple[str, ...]) -> str:
+        if name not in self._md5sums:
+            self._md5sums[name] = _fingerprint(self._md5_text(self.message(name), _inside(outer, name)))
+        return self._md5sums[name]
+
+    def _md5_text(self, message: MessageDefinition, outer: tuple[str, ...]) -> str:
+        lines = [f"{constant.type} {constant.name}={constant.text}" for constant in message.constants]
+        for field in message.fields:
+            nested = self._nested(message, field, outer, self._md5sum)
+            lines.append(f"{nested or field.notation} {field.name}")
+        return "\n".join(lines).strip()
+
+    def _layout(self, name: str, outer: tuple[str, ...]) -> Layout:
         if name not in self._layouts:
             message = self.message(name)
             try:
-                self._layouts[name] = self._inside(name, lambda: self._build_layout(message))
+                self._layouts[name] = self._build_layout(message, _inside(outer, name))
             except LayoutTooLargeError as error:
                 raise DefinitionError(str(error), name) from None
         return self._layouts[name]
 
-    def _build_layout(self, message: MessageDefinition) -> Layout:
+    def _build_layout(self, message: MessageDefinition, outer: tuple[str, ...]) -> Layout:
         builder = LayoutBuilder()
         for field in message.fields:
-            nested = self._nested(message, field, self.layout)
+            nested = self._nested(message, field, outer, self._layout)
             if field.type in PRIMITIVES and (field.length is not None or not field.is_array):
                 builder.add_primitive(field.name, field.type, field.length)
             elif field.is_array:
@@ -161,15 +174,12 @@ class Definitions:
                 builder.add_string(field.name)
         return builder.finish()
 
-    def _md5_text(self, message: MessageDefinition) -> str:
-        lines = [f"{constant.type} {constant.name}={constant.text}" for constant in message.constants]
-        for field in message.fields:
-            nested = self._nested(message, field, self.md5sum)
-            lines.append(f"{nested or field.notation} {field.name}")
-        return "\n".join(lines).strip()
-
     def _nested(
-        self, owner: MessageDefinition, field: Field, ask: Callable[[str], _Answer]
+        self,
+        owner: MessageDefinition,
+        field: Field,
+        outer: tuple[str, ...],
+        ask: Callable[[str, tuple[str, ...]], _Answer],
     ) -> _Answer | None:
         """Return the answer of `ask` for the type of a field, None if it is built in."""
         if field.type in BUILTINS:
@@ -178,18 +188,15 @@ class Definitions:
             raise DefinitionError(
                 f"field {field.name} has the type {field.type}, which is not defined", owner.name
             )
-        return ask(field.type)
+        return ask(field.type, outer)
 
-    def _inside(self, name: str, work: Callable[[], _Answer]) -> _Answer:
-        if name in self._open:
-            raise DefinitionError(f"{' contains '.join([*self._open[self._open.index(name) :], name])}", name)
-        if len(self._open) >= MAX_DEPTH:
-            raise DefinitionError(f"messages nested deeper than {MAX_DEPTH}", self._open[0])
-        self._open.append(name)
-        try:
-            return work()
-        finally:
-            self._open.pop()
+
+def _inside(outer: tuple[str, ...], name: str) -> tuple[str, ...]:
+    if name in outer:
+        raise DefinitionError(" contains ".join([*outer[outer.index(name) :], name]), name)
+    if len(outer) >= MAX_DEPTH:
+        raise DefinitionError(f"messages nested deeper than {MAX_DEPTH}", outer[0])
+    return (*outer, name)
 
 
 def _lookup(name: str, types: Mapping[str, _Answer], what: str) -> _Answer:

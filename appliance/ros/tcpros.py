@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from appliance.ros.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""Bytes in one connection header."""
+"""Bytes in one connection header; the largest message definitions of MoveIt fill about half of it."""
 
 MESSAGE_LIMIT = 256 << 20
 """Bytes in one message, request or response."""
