@@ -219,7 +219,7 @@ def _difference_lines(difference: Difference) -> Iterator[str]:
     request = difference.request
     who = f"{request.host} {request.caller_id}".strip()
     yield f"{'granted' if difference.granted else 'denied'}: {who}: {request.category} {request.resource}"
-    yield f"  seen {difference.count} times"
+    yield f"  seen in {difference.count} records"
     yield f"  old: {difference.old.reason}"
     yield f"  new: {difference.new.reason}"
 

@@ -8,6 +8,9 @@ from typing import Annotated
 
 import typer
 
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.query import Filter
+from appliance.audit.search import export
 from appliance.policy import Address, Category, Policy, Request, compile_policy
 from appliance.policy.actions import find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
@@ -82,5 +85,16 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
 
 
 def requests_of_audit_log(state: Path) -> Iterator[Request]:
-    """Every request that the audit log of a state directory has a decision on."""
-    raise usage_error(f"{state}: the audit log cannot be read here; use --requests")
+    """Every request that the audit log of a state directory has a decision on.
+
+    Works while the appliance runs. Records that sum up many different requests name none and are left out.
+    """
+    decided = Filter(decision=("allow", "deny", "would deny"))
+    try:
+        for entry in export(state / "control" / "audit.db", decided):
+            record = entry.record
+            if record.host is None or record.category not in set(Category) or record.resource is None:
+                continue
+            yield request_of(record.host, record.caller_id or "", record.category, record.resource)
+    except LogUnreadableError as error:
+        raise usage_error(str(error)) from error

@@ -9,7 +9,7 @@ from appliance.policy.policy import Policy
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One request that the two policies decide differently; `count` says how often it was seen."""
+    """One request that the two policies decide differently; `count` says how often it was given."""
 
     request: Request
     old: Decision

@@ -250,9 +250,8 @@ class Policy:
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
         if decider.extension:
-            return Decision(
-                True, None, f"no [{decider.name}] section: {_what(request, 'may')}, as every host"
-            )
+            deed = f"{PHRASES[request.category]} {_shortened(request.resource)}"
+            return Decision(True, None, f"no [{decider.name}] section: every host may {deed}")
         reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so nobody may"
         return _decided(False, None, reason, table.audit_only)
 

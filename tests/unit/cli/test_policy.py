@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from appliance.audit.log import AuditLog
+from appliance.audit.record import Record
 from appliance.cli.policy import app
 
 POLICIES = Path(__file__).parents[3] / "policies"
@@ -142,6 +144,29 @@ def test_diff_reads_requests_and_lists_what_changes(policy: Path, tmp_path: Path
     broken = rosrv("diff", policy, new, "--requests", requests)
     assert broken.exit_code == 2
     assert f"{requests}:1: not a request" in broken.stderr
+
+
+def test_diff_reads_the_audit_log(policy: Path, tmp_path: Path) -> None:
+    """Without a file of requests, diff decides anew what the audit log of the state directory has seen."""
+    new = tmp_path / "new.ini"
+    new.write_text(POLICY.replace("/cmd = ocu", "/cmd = 10.0.0.6"))
+    (tmp_path / "control").mkdir()
+    log = AuditLog(tmp_path / "control" / "audit.db")
+    seen = {"host": "10.0.0.5", "caller_id": "/ocu", "category": "publish"}
+    for number, resource in enumerate(["/cmd", "/cmd", "/other"]):
+        record = Record(
+            id=f"r{number}", time=number, event="decision", decision="allow", resource=resource, **seen
+        )
+        log.record(record)
+    log.record(Record(id="r9", time=9, event="policy reloaded"))
+    assert log.close() is None
+    result = rosrv("diff", policy, new, "--state", tmp_path, "--json")
+    assert [
+        (json.loads(line)["resource"], json.loads(line)["count"]) for line in result.stdout.splitlines()
+    ] == [("/cmd", 2)]
+    missing = rosrv("diff", policy, new, "--state", tmp_path / "none")
+    assert missing.exit_code == 2
+    assert "rosrv policy: " in missing.stderr
 
 
 def test_policy_with_errors_is_refused_by_every_verb(policy: Path) -> None:
