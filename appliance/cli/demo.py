@@ -33,6 +33,7 @@ from appliance.cli.landshark import (
 from appliance.network.lab import Lab
 from appliance.network.namespaces import NetworkError, has_privileges
 
+RIGHTFUL = "watch the battery"  # what the policy lets the attacker's host do
 ATTACKS = (
     "look around",
     "take over the operator",
@@ -79,7 +80,10 @@ class Show:
         operator = self.mission()
         self.explain_grants()
         before = operator.newest("position")
-        self.headline(f"An attacker on the same network ({ATTACKER})")
+        self.headline(
+            f"An attacker has taken over the visitors' tablet ({ATTACKER}), which may watch the battery"
+        )
+        self.permit(self.stage.attack(RIGHTFUL))
         for name in ATTACKS:
             self.refuse(self.stage.attack(name))
         self.aftermath(operator, before)
@@ -115,7 +119,7 @@ class Show:
 
     def explain_grants(self) -> None:
         """Why that was possible: four decisions out of the audit log."""
-        granted = [record for record in self.stage.audit() if record.get("decision") == "allow"]
+        granted = self.stage.audit("--allow", "--limit", "10000")
         for caller, topic in GRANTED:
             for record in granted:
                 if (record.get("caller_id"), record.get("resource")) == (caller, topic):
@@ -124,24 +128,34 @@ class Show:
             else:
                 self.results.append(Result(f"audit record: {caller} {topic}", good=False, remark="missing"))
 
+    def permit(self, deed: Attack) -> None:
+        """What the policy grants works, whoever it is that does it."""
+        self.decided("allowed" if deed.succeeded else "REFUSED", f"{deed.name}: {deed.tried}", deed.answer)
+        self.results.append(Result(deed.name, deed.succeeded, "granted by the policy"))
+
     def refuse(self, attack: Attack) -> None:
         """One attack and what became of it, with the rule from the audit log."""
-        denials = [
-            record
-            for record in self.stage.audit("--deny")
-            if record.get("host") == ATTACKER and record["sequence"] > self.last_sequence
-        ]
-        self.last_sequence = max([self.last_sequence, *(record["sequence"] for record in denials)])
         if attack.succeeded:
             self.decided("SUCCEEDED", f"{attack.name}: {attack.tried}", attack.answer)
             self.results.append(Result(f"attack: {attack.name}", good=False, remark=attack.answer))
             return
-        reason = denials[-1].get("reason", "") if denials else attack.answer
-        rule = rule_of(denials[-1]) if denials else ""
-        self.decided("refused", f"{attack.name}: {attack.tried}", rule or reason)
-        self.results.append(
-            Result(f"attack: {attack.name}", good=bool(denials), remark=rule or reason or "no audit record")
-        )
+        record = self.record_of(attack)
+        why = rule_of(record) if record else f"not in the audit log: {attack.answer}"
+        self.decided("refused", f"{attack.name}: {attack.tried}", why)
+        self.results.append(Result(f"attack: {attack.name}", good=record is not None, remark=why))
+
+    def record_of(self, attack: Attack) -> Record | None:
+        """The denial of this attack: a new record of what was tried, or the one that its answer repeats.
+
+        The same denial, a moment later, is counted and not recorded a second time.
+        """
+        denials = self.stage.audit("--deny", "--host", ATTACKER)  # newest first
+        before, self.last_sequence = self.last_sequence, max((one["sequence"] for one in denials), default=-1)
+        for one in denials:
+            new = one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried
+            if new or (one.get("reason") and one["reason"] in attack.answer):
+                return one
+        return None
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
         """The robot is as it was: every node lives, it still drives, and nobody else fired."""
@@ -170,7 +184,7 @@ class Show:
 
     def headline(self, text: str) -> None:
         """Begin an act."""
-        self.console.print(f"\n[bold]{escape(text)}[/]")
+        self.console.print(f"\n[bold]{escape(text)}[/]", soft_wrap=True)
 
     def say(self, text: str) -> None:
         """One line of an act."""

@@ -98,10 +98,15 @@ class Actor:
                     break
         return self.expect(event, seconds)
 
+    def interrupt(self) -> None:
+        """Ask the process to end."""
+        if self.running:
+            self.process.send_signal(signal.SIGTERM)
+
     def stop(self, seconds: float = 6.0) -> None:
         """End the process: SIGTERM, then SIGKILL."""
         if self.running:
-            self.process.send_signal(signal.SIGTERM)
+            self.interrupt()
             try:
                 self.process.wait(seconds)
             except subprocess.TimeoutExpired:
@@ -201,7 +206,9 @@ class Stage:
         return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
     def close(self) -> None:
-        """End everybody, newest first, and remove what they left."""
+        """End everybody, the appliance last, and remove what they left."""
+        for actor in self.actors[1:]:
+            actor.interrupt()  # all at once: each takes its second
         for actor in reversed(self.actors):
             actor.stop()
         self.actors.clear()

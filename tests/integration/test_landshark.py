@@ -11,6 +11,7 @@ from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 
 ATTACKS = [  # those that end a node come after those that need it
+    "watch the battery",
     "look around",
     "spy on the position",
     "forge the trigger",

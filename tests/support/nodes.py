@@ -131,6 +131,8 @@ class RosSession:
     def __exit__(self, *exc: object) -> None:
         for process in reversed(self.processes):
             process.stop()
+        deaf = [process.story() for process in self.processes if process.deaf]
+        assert not deaf, "did not end when interrupted:\n" + "\n".join(deaf)
 
 
 def roscpp_program(name: str) -> Path:

