@@ -8,6 +8,7 @@ from ending.
 import asyncio
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import structlog
@@ -89,22 +90,19 @@ async def in_thread(function: Callable[[], T]) -> T:
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
 
-    def settle(result: T | None, error: BaseException | None) -> None:
-        if outcome.done():
-            return
-        if error is not None:
-            outcome.set_exception(error)
-        else:
-            outcome.set_result(result)  # type: ignore[arg-type]  no error: there is a result
+    def settle(answer: Callable[[], None]) -> None:
+        if not outcome.done():
+            answer()
 
     def work() -> None:
-        result, failure = None, None
         try:
             result = function()
         except BaseException as error:  # noqa: BLE001  handed to the caller, who waits for it
-            failure = error
+            answer = partial(outcome.set_exception, error)
+        else:
+            answer = partial(outcome.set_result, result)
         try:
-            loop.call_soon_threadsafe(settle, result, failure)
+            loop.call_soon_threadsafe(settle, answer)
         except RuntimeError:
             log.warning("finished after the appliance had ended", what=function.__qualname__)
 

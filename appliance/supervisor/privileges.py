@@ -59,6 +59,40 @@ def leave_network() -> None:
         raise _last_error("unshare(CLONE_NEWNET)")
 
 
+# What the supervisor itself does with each; all others are given up before it starts anything.
+SUPERVISORS = {
+    "CHOWN": 0,  # give each role its part of the state directory
+    "DAC_OVERRIDE": 1,  # and look into it
+    "FOWNER": 3,
+    "KILL": 5,  # end the children
+    "SETGID": 6,  # start them as their users
+    "SETUID": 7,
+    "SETPCAP": 8,  # without any capability
+    "NET_ADMIN": 12,  # firewall
+    "NET_RAW": 13,  # its iptables back end
+    "SYS_PTRACE": 19,  # say who has a port, find what a crash left in the namespace
+    "SYS_ADMIN": 21,  # namespaces
+    "SYS_RESOURCE": 24,  # limit on open files
+}
+
+
+def keep_supervisors() -> None:
+    """Give up every capability that is not in `SUPERVISORS`; what is not held now is not gained."""
+    if os.geteuid() != 0:
+        return
+    kept = sum(1 << number for number in SUPERVISORS.values())
+    _empty_bounding_set(but=kept)
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then the same of the upper 32 numbers
+    if libc.capget(header, sets) != 0:
+        raise _last_error("capget")
+    for index, word in ((0, kept), (1, kept), (2, 0), (3, kept >> 32), (4, kept >> 32), (5, 0)):
+        sets[index] &= word & 0xFFFFFFFF
+    if libc.capset(header, sets) != 0:
+        raise _last_error("capset")
+
+
 def drop(account: Account, *, parent: int) -> None:
     """Become `account` for good; see the invariants above. Raises `OSError` when the kernel refuses."""
     os.umask(0o077)
@@ -72,12 +106,14 @@ def drop(account: Account, *, parent: int) -> None:
     die_with_parent(parent)
 
 
-def _empty_bounding_set() -> None:
+def _empty_bounding_set(*, but: int = 0) -> None:
     # Without CAP_SETPCAP (a container may withhold it) the bounding set stays. With no_new_privs it
     # gives nothing: it only ever limited what an execve may add.
     with open(_LAST_CAPABILITY_FILE) as file:  # noqa: PTH123  pathlib is not loaded in this early stage
         last = int(file.read())
     for capability in range(last + 1):
+        if but >> capability & 1:
+            continue
         try:
             prctl(_PR_CAPBSET_DROP, capability)
         except PermissionError:

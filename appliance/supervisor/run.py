@@ -11,7 +11,7 @@ from appliance.config import Settings
 from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free
-from appliance.supervisor.privileges import raise_file_limit
+from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.state import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
@@ -42,6 +42,7 @@ def run_appliance(
         raise StartError(
             f"isolation {settings.isolation} needs root (or use --isolation none, without a firewall)"
         )
+    keep_supervisors()
     state = StateDirectory(settings.state)
     try:
         settings = _with_ports(settings)

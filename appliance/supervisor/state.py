@@ -98,6 +98,7 @@ class StateDirectory:
         path = self.path / name
         try:
             path.mkdir(mode=0o700)
+            path.chmod(mode)  # before it is another's: afterwards that would take one more capability
             os.chown(path, uid, gid)
         except FileExistsError:
             found = path.lstat()
@@ -106,4 +107,5 @@ class StateDirectory:
                     f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
                     f"run it as that user, `chown -R {uid}:{gid} {path}`, or name another --state DIR"
                 ) from None
-        path.chmod(mode)
+            if stat.S_IMODE(found.st_mode) != mode:
+                path.chmod(mode)

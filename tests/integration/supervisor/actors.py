@@ -34,6 +34,7 @@ from appliance.channel.messages import (
 from appliance.config import load_resolved
 
 ECHO = "echo"
+CROWD = 2_000  # two for each node of a robot with a thousand
 
 
 def control(lifeline_fd: int, config: Path) -> None:
@@ -44,6 +45,11 @@ def control(lifeline_fd: int, config: Path) -> None:
 def relay(lifeline_fd: int, index: int, config: Path) -> None:
     """Stand-in for the relay. SIGUSR1 makes it send what only control may send."""
     asyncio.run(_Actor("relay", lifeline_fd, RelayLink).run())
+
+
+def crowded(lifeline_fd: int, config: Path) -> None:
+    """A control with as many ports as a large robot needs."""
+    asyncio.run(_Crowded(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
 def signer(lifeline_fd: int, directory: Path) -> None:
@@ -174,6 +180,14 @@ class _Control(_Actor):
         connection, _address = listener.accept()
         with connection:
             connection.sendall(str(os.getpid()).encode())
+
+
+class _Crowded(_Control):
+    def serve(self) -> None:
+        for number in range(CROWD if ECHO not in self.sockets else 0):
+            with socket.create_server(("127.0.0.1", 0)) as listener:
+                self.lifeline.send(SocketKept(f"port:{number}"), (listener.fileno(),))
+        super().serve()
 
 
 def _union_of(role: str) -> Any:

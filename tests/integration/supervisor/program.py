@@ -9,6 +9,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import setproctitle
 
@@ -40,7 +41,7 @@ def main() -> None:
     actors = {role: role for role in ("control", "relay", "signer")}
     for one in sys.argv[2:]:
         if one == "leaky":
-            run.enclosure_of = lambda *_asked: Leaky()
+            mock.patch.object(run, "enclosure_of", return_value=Leaky()).start()
             continue
         role, _, entry = one.partition("=")
         actors[role] = entry

@@ -16,7 +16,9 @@ from typing import Any
 
 import pytest
 
+from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import ROSMASTER, ROSOUT
+from tests.integration.supervisor.actors import CROWD
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 
@@ -144,6 +146,17 @@ def test_a_port_of_control_stays_open_while_control_is_dead(start: Any) -> None:
     assert restored["restored"] == ["admin", "echo"]
 
 
+def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
+    """Two ports for each of a thousand nodes are given back to the next control, all of them, at once."""
+    running = start("control=crowded").until_ready()
+    os.kill(running.pid("control"), signal.SIGKILL)
+    began = time.monotonic()
+    new = running.pid("control", restarts=1)
+    restored = running.process.wait_for(lambda event: "count" in event, actor="control", pid=new)
+    assert time.monotonic() - began < 2
+    assert restored["count"] == len(restored["restored"]) == CROWD + 2
+
+
 def test_the_admin_socket_survives_control(start: Any, state: Path) -> None:
     """The socket in the state directory stays one that control listens on, whichever control it is."""
     running = start().until_ready()
@@ -253,6 +266,16 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None
         assert {status[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
         assert status["NoNewPrivs"] == "1"
         assert status["Umask"] == "0077"
+
+
+def test_the_supervisor_keeps_few_capabilities(start: Any) -> None:
+    """As root: what it has no use for (kernel modules, raw memory, clock …) it cannot do."""
+    need_root()
+    running = start().until_ready()
+    allowed = sum(1 << number for number in SUPERVISORS.values())
+    status = _status(running.process.pid)
+    for name in ("CapEff", "CapPrm", "CapBnd", "CapInh", "CapAmb"):
+        assert int(status[name], 16) & ~allowed == 0
 
 
 def test_the_signer_has_no_network(start: Any) -> None:

@@ -72,7 +72,7 @@ def test_one_line_says_that_nodes_may_connect(directory: Path) -> None:
         ready = running.wait_for(event="ready", timeout=60)
         assert ready | {"master": "-"} == {"event": "ready", "master": "-", "api": None, "revision": 1}
         with xmlrpc.client.ServerProxy(ready["master"]) as master:
-            assert master.getUri("/tester")[:1] == [1]
+            assert str(master.getUri("/tester")).startswith("[1, ")
     assert running.events == [ready]
 
 
