@@ -1,0 +1,258 @@
+"""Tests of `rosrv protect` on hosts of a lab, with real listeners and a real scan from outside."""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.requirements import need_program, need_root
+
+COMMAND = (
+    "import sys, typer; from appliance.cli.protect import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
+)
+FEW = "40000-40099"  # a range that is scanned fast
+INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000
+
+
+@pytest.fixture(autouse=True)
+def _machine() -> None:
+    need_root()
+    need_program("nft", "nftables")
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """A lab of these tests."""
+    with Lab("rosrv-protect") as one:
+        yield one
+
+
+@pytest.fixture
+def robot(lab: Lab) -> Host:
+    """The machine that the nodes run on."""
+    return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
+
+
+@pytest.fixture
+def gateway(lab: Lab) -> Host:
+    """The appliance, as another machine."""
+    return lab.host("gateway", "10.77.0.2/24", "fd77::2/64")
+
+
+@pytest.fixture
+def attacker(lab: Lab) -> Host:
+    """Any other machine."""
+    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
+
+
+def protect(host: Host, *arguments: str, status: int = 0, **environment: str) -> str:
+    """Run `rosrv protect` on a host; return its standard output, or the error output when it is to fail."""
+    process = host.popen(
+        [sys.executable, "-c", COMMAND, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), **environment},
+    )
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == status, (out, err)
+    assert "Traceback" not in err
+    return str(err if status == 2 and not out else out)
+
+
+def close(robot: Host, gateway: Host, *more: str) -> None:
+    """Put the protection in force."""
+    addresses = ("--appliance", gateway.address, "--appliance", gateway.address6)
+    protect(robot, *addresses, "--ports", FEW, "--apply", *more)
+
+
+@contextlib.contextmanager
+def listening(host: Host, *ports: int) -> Iterator[None]:
+    """Listen on TCP ports of a host, on all its addresses."""
+    with contextlib.ExitStack() as stack:
+        for port in ports:
+            with host.entered():
+                stack.enter_context(
+                    socket.create_server(("::", port), family=socket.AF_INET6, dualstack_ipv6=True)
+                )
+        yield
+
+
+def reaches(host: Host, address: str, port: int) -> bool:
+    """Tell whether a TCP connection can be opened; a refusal must be a refusal, not silence."""
+    with host.entered():
+        try:
+            socket.create_connection((address, port), timeout=10).close()
+        except ConnectionRefusedError:
+            return False
+    return True
+
+
+def rules(host: Host) -> str:
+    """Return all nftables rules of a host, without counters."""
+    process = host.popen(["nft", "-s", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
+    return str(process.communicate(timeout=30)[0])
+
+
+def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attacker: Host) -> None:
+    """Node ports are refused to other machines; to the appliance and the machine itself they stay open."""
+    with listening(robot, INSIDE, KEPT, OUTSIDE):
+        assert reaches(attacker, robot.address, INSIDE)
+        close(robot, gateway, "--open", f"tcp/{KEPT}")
+        for address in (robot.address, robot.address6):
+            assert not reaches(attacker, address, INSIDE)
+            assert reaches(gateway, address, INSIDE)
+            assert reaches(robot, address, INSIDE)
+            assert reaches(attacker, address, KEPT)
+            assert reaches(attacker, address, OUTSIDE)
+        assert reaches(robot, "127.0.0.1", INSIDE)
+        protect(robot, "--remove")
+        assert reaches(attacker, robot.address, INSIDE)
+
+
+def test_the_check_from_outside_sees_what_is_open(robot: Host, gateway: Host, attacker: Host) -> None:
+    """The scan finds the listeners before, none after, and its exit status and JSON say so."""
+    arguments = ("--check", robot.address, "--ports", FEW, "--json")
+    with listening(robot, INSIDE, KEPT):
+        before = json.loads(protect(attacker, *arguments, status=1))
+        assert before["state"] == "open"
+        assert before["addresses"][0]["open"] == [INSIDE, KEPT]
+        close(robot, gateway, "--open", f"tcp/{KEPT}")
+        after = json.loads(protect(attacker, *arguments, "--open", f"tcp/{KEPT}"))
+        assert (after["state"], after["addresses"][0]["refused"]) == ("closed", 99)
+        forgotten = protect(attacker, "--check", robot.address6, "--ports", FEW, status=1)
+        assert forgotten == f"{robot.address6}: OPEN: TCP {KEPT} of {FEW}\n"
+
+
+def test_the_whole_local_port_range_is_closed_and_checked(robot: Host, gateway: Host, attacker: Host) -> None:
+    """By default the range is the kernel's, and a full scan of it from outside finds nothing."""
+    first, last = (int(word) for word in robot.namespace.sysctl("net.ipv4.ip_local_port_range").split())
+    with listening(robot, first, last):
+        before = json.loads(protect(attacker, "--check", robot.address, "--json", status=1))
+        assert before["addresses"][0]["open"] == [first, last]
+        protect(robot, "--appliance", gateway.address, "--apply")
+        after = json.loads(protect(attacker, "--check", robot.address, "--json"))
+        assert after["addresses"][0]["refused"] == last - first + 1
+
+
+def test_what_the_machine_does_itself_goes_on(robot: Host, gateway: Host, attacker: Host) -> None:
+    """Old connections, connections out and answers to its own UDP questions pass; new UDP does not."""
+    with robot.entered():
+        server = socket.create_server((robot.address, INSIDE))
+        node = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        node.bind((robot.address, INSIDE))
+    with attacker.entered():
+        old = socket.create_connection((robot.address, INSIDE), timeout=10)
+        answering = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        answering.bind((attacker.address, 53))
+        stray = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    accepted, _ = server.accept()
+    with server, node, old, answering, stray, accepted, listening(attacker, 8080):
+        for one in (node, answering, accepted, old):
+            one.settimeout(10)
+        close(robot, gateway)
+        accepted.sendall(b"still here")
+        assert old.recv(10) == b"still here"
+        old.sendall(b"me too")
+        assert accepted.recv(6) == b"me too"
+        assert reaches(robot, attacker.address, 8080)
+        stray.sendto(b"forged", (robot.address, INSIDE))
+        node.sendto(b"question", (attacker.address, 53))
+        assert answering.recvfrom(100)[0] == b"question"
+        answering.sendto(b"answer", (robot.address, INSIDE))
+        assert node.recv(100) == b"answer", "the stray packet came first but was dropped"
+
+
+def test_applying_twice_leaves_one_set_and_removing_nothing(robot: Host, gateway: Host) -> None:
+    """A second --apply replaces the first; --remove leaves exactly the rules of others; twice is fine."""
+    robot.popen(["nft", "add", "table", "inet", "filter"]).wait(timeout=20)
+    before = rules(robot)
+    close(robot, gateway)
+    once = rules(robot)
+    close(robot, gateway)
+    assert rules(robot) == once
+    close(robot, gateway, "--open", "udp/40001")
+    assert rules(robot).count("udp dport 40001 accept") == 1
+    assert "open again" in protect(robot, "--remove")
+    assert rules(robot) == before
+    assert "nothing to remove" in protect(robot, "--remove")
+
+
+def test_printing_changes_nothing_and_the_file_can_be_loaded(
+    robot: Host, gateway: Host, tmp_path: Path
+) -> None:
+    """Without a verb the file is printed only; `nft -f` on it does what --apply does, time and again."""
+    text = protect(robot, "--appliance", gateway.address, "--ports", FEW)
+    assert rules(robot) == ""
+    file = tmp_path / "rosrv-protect.nft"
+    file.write_text(text, encoding="utf-8")
+    for _ in range(2):
+        assert robot.popen(["nft", "-f", str(file)]).wait(timeout=20) == 0
+    loaded = rules(robot)
+    protect(robot, "--appliance", gateway.address, "--ports", FEW, "--apply")
+    assert rules(robot) == loaded
+
+
+def test_a_machine_that_does_not_answer_is_not_called_closed(lab: Lab, robot: Host, attacker: Host) -> None:
+    """When nothing answers, the check says that it does not know, with another exit status."""
+    lab.unplug(robot)
+    arguments = ("--check", robot.address, "--ports", "40000-40010", "--seconds", "0.2")
+    assert "is not known" in protect(attacker, *arguments, status=2)
+    assert json.loads(protect(attacker, *arguments, "--json", status=2))["state"] == "unknown"
+
+
+def test_a_check_of_itself_is_refused(robot: Host) -> None:
+    """From the machine itself everything is open by design, so a check there is an error, not a finding."""
+    for address in (robot.address, robot.address6, "localhost"):
+        assert "run the check on another machine" in protect(robot, "--check", address, status=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "--appliance 192.168.1.20"),
+        (("--appliance", "robot.local"), "'robot.local' is no IP address"),
+        (("--appliance", "127.0.0.1"), "127.0.0.1 cannot be the address of an appliance"),
+        (("--appliance", "10.0.0.1", "--open", "tcp/22,ssh"), "--open 'ssh' is no service"),
+        (("--appliance", "10.0.0.1", "--open", "tcp/99999"), "--open 'tcp/99999' is no service"),
+        (("--appliance", "10.0.0.1", "--ports", "9-3"), "9-3 is no range of ports"),
+        (("--apply", "--remove"), "exclude one another"),
+        (("--check", "no-such-host.invalid"), "the host 'no-such-host.invalid' is not known"),
+    ],
+)
+def test_wrong_arguments_are_named(robot: Host, arguments: tuple[str, ...], words: str) -> None:
+    """Each wrong argument is an error that names it, and nothing is changed."""
+    assert words in protect(robot, *arguments, status=2)
+    assert rules(robot) == ""
+
+
+def test_without_nft_the_error_names_the_package(robot: Host) -> None:
+    """On a machine without nftables, --apply says what to install."""
+    words = protect(robot, "--appliance", "10.77.0.2", "--apply", status=2, PATH="/nonexistent")
+    assert "sudo apt install nftables" in words
+
+
+def test_without_root_the_error_says_so(robot: Host) -> None:
+    """Started by an ordinary user, --apply changes nothing and says that root is needed."""
+    program = (
+        "import os; os.setgroups([]); os.setgid(61099); os.setuid(61099)\n"
+        "from appliance.network.namespaces import NetworkError\n"
+        "from appliance.network import protect\n"
+        "try: protect.apply('table inet x { }')\n"
+        "except NetworkError as error: print(error)\n"
+    )
+    process = robot.popen(
+        [sys.executable, "-c", "import appliance.network.protect\n" + program],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )
+    assert "run it as root" in process.communicate(timeout=30)[0]
+    assert rules(robot) == ""

@@ -1,0 +1,58 @@
+"""Tests of what the iptables back end makes of a rule, without a kernel."""
+
+from appliance.network.firewall.iptables import RenderedRule, render_rule
+from appliance.network.firewall.rules import Chain, Interface, PortRange, RateLimit, Rule, Verdict, inner_port
+
+SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
+
+
+def test_the_owner_rule_in_words_of_xtables() -> None:
+    """The owner match comes with the SYN and the port, once for each family."""
+    _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    attributes = (("protocol", "tcp"), ("out_interface", "lo"))
+    assert render_rule(owner) == [
+        RenderedRule(
+            "ROSRV-OUT",
+            family,
+            attributes,
+            (
+                ("tcp", (("dport", "11312"), SYN)),
+                ("owner", (("uid-owner", "61011"),)),
+                ("comment", (("comment", "ROSMaster port: control may"),)),
+            ),
+            ("RETURN", ()),
+        )
+        for family in (4, 6)
+    ]
+    assert render_rule(others)[1].target == ("REJECT", (("reject-with", "tcp-reset"),))
+
+
+def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
+    """Rules of the same limit name the same table of buckets, whatever their ports; ranges have a colon."""
+    rules = [
+        Rule(
+            chain=Chain.IN,
+            purpose="p",
+            verdict=Verdict.DROP,
+            arrives_on=Interface("lo", other=True),
+            tcp_ports=ports,
+            opening=True,
+            above=RateLimit(10, 20),
+        )
+        for ports in (PortRange(1, 1), PortRange(5, 9))
+    ]
+    first, second = (dict(render_rule(rule)[0].matches) for rule in rules)
+    assert first["hashlimit"] == second["hashlimit"]
+    assert ("hashlimit-name", "rosrv-10-20") in first["hashlimit"]
+    assert second["tcp"] == (("dport", "5:9"), SYN)
+    assert ("in_interface", "!lo") in render_rule(rules[0])[0].attributes
+
+
+def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
+    """Clear text is `--pol none`, of the direction of the chain; an address makes the rule of one family."""
+    for chain, direction in ((Chain.IN, "in"), (Chain.OUT, "out")):
+        rule = Rule(chain=chain, purpose="p", verdict=Verdict.DROP, source="fd77::1", clear_text=True)
+        (rendered,) = render_rule(rule)
+        assert rendered.family == 6
+        assert rendered.attributes == (("src", "fd77::1"),)
+        assert rendered.matches[0] == ("policy", (("dir", direction), ("pol", "none")))

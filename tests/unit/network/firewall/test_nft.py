@@ -1,0 +1,100 @@
+"""Tests of what the nft back end makes of rules, without a kernel."""
+
+from appliance.network.firewall.nft import render, render_rule
+from appliance.network.firewall.rules import (
+    Chain,
+    FirewallSettings,
+    PortRange,
+    RateLimit,
+    Rule,
+    Verdict,
+    appliance_rules,
+    inner_port,
+)
+
+PORT = {"match": {"op": "==", "left": {"payload": {"protocol": "tcp", "field": "dport"}}, "right": 11312}}
+SYN = {
+    "match": {
+        "op": "==",
+        "left": {"&": [{"payload": {"protocol": "tcp", "field": "flags"}}, {"|": ["syn", "ack"]}]},
+        "right": "syn",
+    }
+}
+
+
+def test_the_owner_rule_in_libnftables_json() -> None:
+    """One rule serves both families: interface, port, SYN, user, counter, verdict."""
+    _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    assert render_rule(owner) == [
+        {
+            "chain": "ROSRV-OUT",
+            "expr": [
+                {"match": {"op": "==", "left": {"meta": {"key": "oifname"}}, "right": "lo"}},
+                PORT,
+                SYN,
+                {"match": {"op": "==", "left": {"meta": {"key": "skuid"}}, "right": 61011}},
+                {"counter": None},
+                {"return": None},
+            ],
+            "comment": "ROSMaster port: control may",
+        }
+    ]
+    assert render_rule(others)[0]["expr"][-1] == {"reject": {"type": "tcp reset"}}
+
+
+def test_each_chain_is_jumped_to_from_its_hooks() -> None:
+    """Every chain with rules is reached from a base chain with the policy accept; no other is made."""
+    commands = render(appliance_rules(FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=11312)))
+    added = [one["add"] for one in commands]
+    chains = {body["chain"]["name"]: body["chain"] for body in added if "chain" in body}
+    assert set(chains) == {"ROSRV-IN", "ROSRV-OUT", "filter-INPUT", "filter-OUTPUT"}
+    assert {chain["policy"] for chain in chains.values() if "hook" in chain} == {"accept"}
+    jumps = [
+        part["jump"]["target"]
+        for one in commands
+        if "rule" in one["add"]
+        for part in one["add"]["rule"]["expr"]
+        if "jump" in part
+    ]
+    assert sorted(jumps) == ["ROSRV-IN", "ROSRV-OUT"]
+
+
+def test_translation_is_hooked_for_the_network_and_for_the_host_itself() -> None:
+    """ROSRV-NAT is reached from prerouting and from output; the address is of the rule's family."""
+    rule = Rule(chain=Chain.NAT, purpose="p", verdict=Verdict.DNAT, tcp_ports=PortRange(5, 9), to="fd00::2")
+    commands = render((rule,))
+    hooks = {one["add"]["chain"]["hook"] for one in commands if "hook" in one["add"].get("chain", {})}
+    assert hooks == {"prerouting", "output"}
+    (body,) = render_rule(rule)
+    assert body["expr"][-1] == {"dnat": {"family": "ip6", "addr": "fd00::2"}}
+    assert body["expr"][0]["match"]["right"] == "ipv6"
+
+
+def test_a_rate_limit_has_one_set_for_each_family() -> None:
+    """Two rules of the same limit share their buckets, kept apart by family, with a bound on their number."""
+    rules = tuple(
+        Rule(
+            chain=Chain.IN,
+            purpose=f"p{port}",
+            verdict=Verdict.DROP,
+            tcp_ports=PortRange.one(port),
+            opening=True,
+            above=RateLimit(10, 20),
+        )
+        for port in (1, 2)
+    )
+    sets = [one["add"]["set"] for one in render(rules) if "set" in one["add"]]
+    assert [(one["name"], one["type"], one["size"]) for one in sets] == [
+        ("new-ipv4-10-20", "ipv4_addr", 65535),
+        ("new-ipv6-10-20", "ipv6_addr", 65535),
+    ]
+
+
+def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
+    """Arriving packets are asked for their security path, leaving ones for their route's."""
+    keys = []
+    for chain in (Chain.IN, Chain.OUT):
+        rule = Rule(chain=chain, purpose="p", verdict=Verdict.DROP, source="10.9.9.1", clear_text=True)
+        (body,) = render_rule(rule)
+        keys.append(body["expr"][2]["match"]["left"])
+    assert keys == [{"meta": {"key": "ipsec"}}, {"rt": {"key": "ipsec"}}]

@@ -1,0 +1,139 @@
+"""Tests of the list of rules, without a kernel."""
+
+import pytest
+
+from appliance.network.firewall.backend import RuleCounter
+from appliance.network.firewall.firewall import statuses
+from appliance.network.firewall.rules import (
+    Chain,
+    FirewallSettings,
+    Interface,
+    PortRange,
+    RateLimit,
+    Rule,
+    Verdict,
+    appliance_rules,
+    family_of,
+    inner_port,
+)
+
+FULL = FirewallSettings(
+    control_uid=61011,
+    rosmaster_uid=61012,
+    rosmaster_port=11312,
+    inner_port=4444,
+    node_ports=PortRange(20000, 20099),
+    api_port=8443,
+    api_networks=("10.0.0.0/8", "fd00::/8"),
+    tunnel_only=("10.9.9.1", "fd77::1"),
+)
+
+
+def test_the_rules_only_ever_refuse() -> None:
+    """No rule of the appliance's namespace accepts a packet over the head of another firewall."""
+    assert {rule.verdict for rule in appliance_rules(FULL)} == {Verdict.RETURN, Verdict.RESET, Verdict.DROP}
+
+
+def test_the_one_user_is_let_pass_before_all_others_are_refused() -> None:
+    """For an inner port the owner's RETURN stands before the refusal of everyone, at the first packet."""
+    outside, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    assert (outside.chain, outside.arrives_on, outside.verdict) == (
+        Chain.IN,
+        Interface("lo", other=True),
+        Verdict.RESET,
+    )
+    assert (owner.chain, owner.uid, owner.verdict) == (Chain.OUT, 61011, Verdict.RETURN)
+    assert (others.chain, others.uid, others.verdict) == (Chain.OUT, None, Verdict.RESET)
+    assert all(
+        rule.opening and rule.tcp_ports == PortRange(11312, 11312) for rule in (outside, owner, others)
+    )
+
+
+def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
+    """A port that is not known yet, and a REST port or rate limit that is off, leave no rule behind."""
+    bare = FirewallSettings(control_uid=1, rosmaster_uid=2, new_connections=None)
+    assert appliance_rules(bare) == ()
+
+
+def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
+    """The rules of tunnelled hosts come first, by IPsec policy or by the tunnel's interface."""
+    first, second = appliance_rules(FULL)[:2]
+    assert (first.source, first.clear_text, first.verdict) == ("10.9.9.1", True, Verdict.DROP)
+    assert (second.destination, second.clear_text, second.chain) == ("10.9.9.1", True, Chain.OUT)
+    on_interface = FirewallSettings(
+        control_uid=1, rosmaster_uid=2, tunnel_only=("10.9.9.1",), tunnel_interface="ipsec0"
+    )
+    first, second = appliance_rules(on_interface)[:2]
+    assert (first.arrives_on, first.clear_text) == (Interface("ipsec0", other=True), False)
+    assert (second.leaves_on, second.clear_text) == (Interface("ipsec0", other=True), False)
+
+
+def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
+    """The REST port's rate limit stands before the RETURN of the networks, its refusal after."""
+    purposes = [rule.purpose for rule in appliance_rules(FULL) if rule.purpose.startswith("REST")]
+    assert purposes == [
+        "REST port: new connections per host",
+        "REST port: 10.0.0.0/8 may",
+        "REST port: fd00::/8 may",
+        "REST port: no other network",
+    ]
+
+
+def test_purposes_tell_rules_of_a_chain_apart() -> None:
+    """No two rules of a chain have the same purpose, for the counters are joined by it."""
+    keys = [(rule.chain, rule.purpose) for rule in appliance_rules(FULL)]
+    assert len(keys) == len(set(keys))
+
+
+def test_families_follow_the_addresses() -> None:
+    """A rule with an address is of that address's family, any other of both."""
+    assert Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP, source="fd00::/8").families() == (6,)
+    assert Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP).families() == (4, 6)
+    assert family_of("10.0.0.0/8") == 4
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: PortRange(0, 5), "0-5 is no range"),
+        (lambda: PortRange(9, 5), "9-5 is no range"),
+        (lambda: PortRange(1, 65536), "1-65536 is no range"),
+        (lambda: RateLimit(0, 5), "1 to 100000"),
+        (lambda: FirewallSettings(control_uid=-1, rosmaster_uid=2), "control_uid -1"),
+        (lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=70000), "70000"),
+        (
+            lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, api_networks=("ten",)),
+            "'ten' is no address",
+        ),
+        (
+            lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, tunnel_only=("10.0.0.1/8",)),
+            "'10.0.0.1/8' is no address",
+        ),
+        (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.RESET), "only TCP can be reset"),
+        (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP, uid=5), "has an owner"),
+        (lambda: Rule(chain=Chain.NAT, purpose="x", verdict=Verdict.DNAT), "DNAT and its address"),
+    ],
+)
+def test_wrong_values_are_named(make: object, words: str) -> None:
+    """A setting or rule that cannot be meant is an error that names it."""
+    assert callable(make)
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_rule_is_in_force_only_with_all_its_families() -> None:
+    """Counters of both families are added up; a rule that one family has lost is not in force."""
+    rule = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP)
+    four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
+    six = RuleCounter("ROSRV-IN", 6, "p", 1, 100)
+    (status,) = statuses((rule,), (four, six))
+    assert (status.packets, status.octets, status.in_force) == (4, 400, True)
+    assert not statuses((rule,), (four,))[0].in_force
+    assert statuses((rule,), (RuleCounter("ROSRV-IN", None, "p", 0, 0),))[0].in_force
+    assert not statuses((rule,), (RuleCounter("ROSRV-OUT", None, "p", 0, 0),))[0].in_force
+
+
+def test_a_rule_describes_itself() -> None:
+    """The description has the matches and the verdict in words of netfilter."""
+    _, owner, _ = inner_port("ROSMaster port", 11312, "control", 61011)
+    assert owner.describe() == "out lo, tcp 11312, uid 61011, syn -> RETURN"

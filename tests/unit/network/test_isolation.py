@@ -1,0 +1,52 @@
+"""Tests of the isolation's rules on the host, without a kernel."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.network.firewall.rules import Chain, Family, PortRange, Verdict
+from appliance.network.isolation import Ends, IsolationSettings, isolation_rules
+
+ENDS: dict[Family, Ends] = {
+    4: Ends("10.111.0.0/30", "10.111.0.1", "10.111.0.2"),
+    6: Ends("fd52::/64", "fd52::1", "fd52::2"),
+}
+SETTINGS = IsolationSettings(ports=(PortRange.one(11311), PortRange(20000, 20099)), directory=Path("/run/x"))
+
+
+def test_each_range_is_forwarded_on_both_families() -> None:
+    """Each range of ports has one DNAT rule for each family, for addresses of the host only."""
+    rules = [rule for rule in isolation_rules(SETTINGS, ENDS, ()) if rule.verdict is Verdict.DNAT]
+    assert [(str(rule.tcp_ports), rule.to, rule.local_destination) for rule in rules] == [
+        ("11311", "10.111.0.2", True),
+        ("20000-20099", "10.111.0.2", True),
+        ("11311", "fd52::2", True),
+        ("20000-20099", "fd52::2", True),
+    ]
+
+
+def test_a_host_that_routed_before_is_not_cut_off() -> None:
+    """The refusal to route for others is left out for the families for which the host was a router."""
+    purposes = [rule.purpose for rule in isolation_rules(SETTINGS, ENDS, (4,)) if rule.chain is Chain.FORWARD]
+    assert "the host is no IPv6 router" in purposes
+    assert "the host is no IPv4 router" not in purposes
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"ports": ()}, "no port"),
+        ({"subnet": "10.0.0.0/31"}, "10.0.0.0/31"),
+        ({"subnet": "fd00::/64"}, "fd00::/64"),
+        ({"subnet6": "banana"}, "banana"),
+    ],
+)
+def test_wrong_settings_are_named(values: dict[str, object], words: str) -> None:
+    """A subnet without room, of the wrong family or that is none, and no ports at all, are errors."""
+    with pytest.raises(ValueError, match=words):
+        IsolationSettings(**{"ports": SETTINGS.ports, **values})  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_the_interface_name_fits() -> None:
+    """A long name of the appliance still gives an interface name that the kernel takes."""
+    assert len(IsolationSettings(ports=SETTINGS.ports, name="a-rather-long-name").link) <= 15
