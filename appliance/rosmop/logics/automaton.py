@@ -1,0 +1,194 @@
+"""Finite automata as tables: exploring, minimising and walking them.
+
+States and events are numbers. ``verdicts[s]`` are the categories a property is in after a step *into*
+``s``; those of the initial state are told only if it is entered again.
+"""
+
+from collections import deque
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+MAX_STATES = 10_000
+"""How many states a monitor may have before it is minimised."""
+
+State = TypeVar("State", bound=Hashable)
+
+
+class TooManyStatesError(Exception):
+    """An automaton outgrew its limit."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"more than {limit} states")
+        self.limit = limit
+
+
+@dataclass(frozen=True)
+class Automaton:
+    """A complete deterministic automaton with outputs. ``names`` label the states for people."""
+
+    initial: int
+    table: tuple[tuple[int, ...], ...]
+    verdicts: tuple[tuple[str, ...], ...]
+    names: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def name(self, state: int) -> str:
+        """What to call a state."""
+        return self.names[state] if self.names else f"q{state}"
+
+
+def explore(
+    initial: State,
+    letters: int,
+    step: Callable[[State, int], State],
+    verdict: Callable[[State], tuple[str, ...]],
+    limit: int = MAX_STATES,
+) -> Automaton:
+    """The automaton of all states reachable from ``initial``, minimised. Raises TooManyStatesError."""
+    numbers: dict[State, int] = {initial: 0}
+    states = [initial]
+    table: list[tuple[int, ...]] = []
+    for state in states:
+        row = []
+        for letter in range(letters):
+            target = step(state, letter)
+            number = numbers.get(target)
+            if number is None:
+                number = numbers[target] = len(states)
+                states.append(target)
+                if len(states) > limit:
+                    raise TooManyStatesError(limit)
+            row.append(number)
+        table.append(tuple(row))
+    return minimise(Automaton(0, tuple(table), tuple(verdict(state) for state in states)))
+
+
+def minimise(automaton: Automaton) -> Automaton:
+    """The smallest automaton with the same verdicts on every trace; states numbered in order of discovery."""
+    block_of = _coarsest_partition(automaton)
+    numbers = {block_of[automaton.initial]: 0}
+    order = [automaton.initial]
+    table = []
+    for state in order:
+        row = []
+        for target in automaton.table[state]:
+            number = numbers.get(block_of[target])
+            if number is None:
+                number = numbers[block_of[target]] = len(order)
+                order.append(target)
+            row.append(number)
+        table.append(tuple(row))
+    return Automaton(0, tuple(table), tuple(automaton.verdicts[state] for state in order))
+
+
+def _coarsest_partition(automaton: Automaton) -> list[int]:
+    """Hopcroft's algorithm: the number of the block of states that no trace tells apart, per state."""
+    size, letters = len(automaton), len(automaton.table[0])
+    sources: list[list[list[int]]] = [[[] for _ in range(size)] for _ in range(letters)]
+    for state, row in enumerate(automaton.table):
+        for letter, target in enumerate(row):
+            sources[letter][target].append(state)
+    by_verdict: dict[tuple[str, ...], set[int]] = {}
+    for state, verdict in enumerate(automaton.verdicts):
+        by_verdict.setdefault(verdict, set()).add(state)
+    blocks = list(by_verdict.values())
+    block_of = [0] * size
+    for number, block in enumerate(blocks):
+        for state in block:
+            block_of[state] = number
+    waiting = deque((number, letter) for number in range(len(blocks)) for letter in range(letters))
+    queued = set(waiting)
+    while waiting:
+        splitter = waiting.popleft()
+        queued.discard(splitter)
+        number, letter = splitter
+        touched: dict[int, list[int]] = {}
+        for target in blocks[number]:
+            for state in sources[letter][target]:
+                touched.setdefault(block_of[state], []).append(state)
+        for cut, members in touched.items():
+            if len(members) < len(blocks[cut]):
+                _split(blocks, block_of, cut, members)
+                entries = _smaller_halves(blocks, cut, queued, letters)
+                waiting.extend(entries)
+                queued.update(entries)
+    return block_of
+
+
+def _smaller_halves(
+    blocks: list[set[int]], cut: int, queued: set[tuple[int, int]], letters: int
+) -> list[tuple[int, int]]:
+    """What to look at again after block ``cut`` lost its members to the last block."""
+    fresh = len(blocks) - 1
+    small = fresh if len(blocks[fresh]) <= len(blocks[cut]) else cut
+    return [(fresh if (cut, letter) in queued else small, letter) for letter in range(letters)]
+
+
+def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[int]) -> None:
+    """Move ``members`` out of block ``cut`` into a new last block."""
+    number = len(blocks)
+    blocks[cut].difference_update(members)
+    blocks.append(set(members))
+    for state in members:
+        block_of[state] = number
+
+
+def reachable(automaton: Automaton) -> list[int]:
+    """The states a trace can lead to, nearest first; the initial state only if it can be entered again."""
+    seen: dict[int, None] = {}
+    frontier = [automaton.initial]
+    while frontier:
+        found: dict[int, None] = {}
+        for state in frontier:
+            found.update((target, None) for target in automaton.table[state] if target not in seen)
+        seen.update(found)
+        frontier = list(found)
+    return list(seen)
+
+
+def shortest_trace(automaton: Automaton, wanted: Callable[[int], bool]) -> tuple[int, ...] | None:
+    """The events of a shortest trace (of one event or more) into a wanted state, or None if there is none."""
+    came_from: dict[int, tuple[int, int] | None] = {}
+    frontier: deque[int] = deque([automaton.initial])
+    visited = {automaton.initial}
+    while frontier:
+        state = frontier.popleft()
+        for event, target in enumerate(automaton.table[state]):
+            if wanted(target):
+                return _trace_back(came_from, state, event)
+            if target not in visited:
+                visited.add(target)
+                came_from[target] = (state, event)
+                frontier.append(target)
+    return None
+
+
+def _trace_back(came_from: dict[int, tuple[int, int] | None], state: int, last: int) -> tuple[int, ...]:
+    trace = [last]
+    step = came_from.get(state)
+    while step is not None:
+        state, event = step
+        trace.append(event)
+        step = came_from.get(state)
+    return tuple(reversed(trace))
+
+
+def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Group events that a formula cannot tell apart: those it does not name are one class.
+
+    Returns the class of each event, and for each class the index into ``named`` (-1: none of them). Classes
+    are numbered in order of first event.
+    """
+    position = {name: index for index, name in enumerate(named)}
+    classes: dict[int, int] = {}
+    of_event = [classes.setdefault(position.get(event, -1), len(classes)) for event in events]
+    return of_event, list(classes)
+
+
+def spread(automaton: Automaton, of_event: Sequence[int]) -> Automaton:
+    """An automaton over events, from one over their classes."""
+    table = tuple(tuple(row[letter] for letter in of_event) for row in automaton.table)
+    return Automaton(automaton.initial, table, automaton.verdicts, automaton.names)

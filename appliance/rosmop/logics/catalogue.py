@@ -1,0 +1,48 @@
+"""The logics there are, by name. Another logic is one more file and one more row here."""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from appliance.rosmop.logics.cfg import compile_cfg
+from appliance.rosmop.logics.ere import compile_ere
+from appliance.rosmop.logics.fsm import compile_fsm
+from appliance.rosmop.logics.interface import CompiledProperty, Compiler, FormulaError, Source
+from appliance.rosmop.logics.lexer import suggestion
+from appliance.rosmop.logics.ltl import compile_ltl
+from appliance.rosmop.logics.mtl import compile_mtl
+from appliance.rosmop.logics.pattern import compile_pattern
+from appliance.rosmop.logics.ptltl import compile_ptltl
+from appliance.rosmop.logics.tfsm import compile_tfsm
+from appliance.rosmop.positions import Finding, Position
+
+LOGICS: Mapping[str, Compiler] = MappingProxyType(
+    {
+        "fsm": compile_fsm,
+        "tfsm": compile_tfsm,
+        "ere": compile_ere,
+        "ltl": compile_ltl,
+        "ptltl": compile_ptltl,
+        "cfg": compile_cfg,
+        "mtl": compile_mtl,
+        "pattern": compile_pattern,
+    }
+)
+
+
+def compile_property(
+    logic: str, formula: str, events: Sequence[str], origin: Position, logic_position: Position | None = None
+) -> CompiledProperty:
+    """Compile the formula of a property.
+
+    ``logic`` in any case; ``events`` in source order, each name once; ``origin`` is where the formula
+    begins and ``logic_position`` where the name of the logic stands (``origin`` if not given). Raises
+    FormulaError.
+    """
+    compiler = LOGICS.get(logic.lower())
+    if compiler is None:
+        text = f"there is no logic `{logic}`{suggestion(logic.lower(), list(LOGICS))}"
+        raise FormulaError([Finding(logic_position or origin, "error", text)])
+    source = Source(logic.lower(), formula, tuple(events), origin)
+    if not events:
+        raise source.error(0, "a property needs at least one event in its specification")
+    return compiler(source)

@@ -1,0 +1,155 @@
+"""What every logic offers to the compiler of ``.rv`` files and to the relay.
+
+A logic turns a formula and the events of its specification into a ``CompiledProperty``. The property names
+the *categories* that may have handlers, and starts *runs*; a run is stepped with one event after the other
+and says after each step which categories the property is in, so that the caller runs their handlers.
+
+Theory of operation for the caller of a run:
+
+1. ``property.start(now)`` gives a fresh run. ``now`` is when monitoring begins, or when ``__RESET;`` took
+   effect.
+2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call
+   ``run.expire()``. A bound is closed: an event exactly at the deadline is in time, so an expiry happens
+   only once it is certain that no event at or before the deadline will come. It takes effect at the
+   deadline.
+3. ``run.step(event, t)`` returns the categories after the event, in the order in which they are to be told.
+   After ``expire()`` handlers of the first category named run first (``timeout`` before the state entered).
+4. Times are integer nanoseconds and never run backwards; a time before the last one counts as the last one.
+
+A ``FiniteProperty`` offers its tables as well, so that generated code can step it inline.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from appliance.rosmop.logics.automaton import Automaton
+from appliance.rosmop.positions import Finding, Position
+
+Categories = tuple[str, ...]
+
+
+class FormulaError(Exception):
+    """A formula that cannot be accepted: what is wrong with it, where, and what to write instead."""
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        super().__init__("; ".join(str(finding) for finding in findings))
+        self.findings = tuple(findings)
+
+
+class RunFaultError(Exception):
+    """A run cannot go on, because the trace asks for more memory than a run may have."""
+
+
+class Run(Protocol):
+    """One run of a property over a trace; see the head of this module for the contract."""
+
+    @property
+    def deadline(self) -> int | None:
+        """The last instant (ns) at which an event is in time, or None if the run waits for nothing."""
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event with this index, received at ``time_ns``; return the categories the property is
+        in."""
+
+    def expire(self) -> Categories:
+        """Let the deadline pass; return the categories that follow. Only while ``deadline`` is not None."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A formula as it stands in the file, and the events (its alphabet) in the order of the specification."""
+
+    logic: str
+    text: str
+    events: tuple[str, ...]
+    origin: Position
+
+    def finding(self, offset: int, text: str) -> Finding:
+        """An error at the given character of the formula."""
+        return Finding(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
+
+    def error(self, offset: int, text: str) -> FormulaError:
+        """The refusal of this formula for one reason."""
+        return FormulaError([self.finding(offset, text)])
+
+
+class CompiledProperty(ABC):
+    """A property ready to run. ``categories`` are the names that may have handlers."""
+
+    def __init__(self, source: Source, categories: Sequence[str]) -> None:
+        self.source = source
+        self.logic = source.logic
+        self.formula = source.text
+        self.events = source.events
+        self.categories: Categories = tuple(categories)
+
+    @property
+    def timed(self) -> bool:
+        """Whether verdicts depend on the time of events (a run that is not timed never has a deadline)."""
+        return False
+
+    @abstractmethod
+    def start(self, time_ns: int) -> Run:
+        """A fresh run that begins at ``time_ns``."""
+
+    def categories_after(self, event: int) -> frozenset[str]:
+        """The categories a step with this event can lead to; may name too many, never too few."""
+        return frozenset(self.categories) if 0 <= event < len(self.events) else frozenset()
+
+    def blocking_refused(self, category: str) -> str | None:
+        """Why a handler of this category may not drop the message, or None if it may (it is enforceable)."""
+        if category not in self.categories:
+            raise KeyError(category)
+        return None
+
+
+class FiniteProperty(CompiledProperty):
+    """A property whose monitor is a finite automaton.
+
+    ``automaton.table[state][event]`` is the next state, ``automaton.verdicts[state]`` the categories after
+    a step into ``state``, ``automaton.initial`` the state of a fresh run.
+    """
+
+    def __init__(self, source: Source, categories: Sequence[str], automaton: Automaton) -> None:
+        super().__init__(source, categories)
+        self.automaton = automaton
+
+    def start(self, time_ns: int) -> Run:
+        """A fresh run; the time plays no part."""
+        del time_ns
+        return FiniteRun(self.automaton)
+
+    def categories_after(self, event: int) -> frozenset[str]:
+        """The categories of the states this event leads to."""
+        verdicts = self.automaton.verdicts
+        return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
+
+
+class FiniteRun:
+    """A run over the tables of an automaton."""
+
+    __slots__ = ("_automaton", "state")
+
+    def __init__(self, automaton: Automaton) -> None:
+        self._automaton = automaton
+        self.state = automaton.initial
+
+    @property
+    def deadline(self) -> int | None:
+        """None: nothing is waited for."""
+        return None
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event; the time plays no part."""
+        del time_ns
+        self.state = self._automaton.table[self.state][event]
+        return self._automaton.verdicts[self.state]
+
+    def expire(self) -> Categories:
+        """Never right: there is no deadline."""
+        raise ValueError("this run has no deadline")
+
+
+Compiler = Callable[[Source], CompiledProperty]
