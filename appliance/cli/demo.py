@@ -163,13 +163,15 @@ class Show:
         after = operator.newest("position")
         dead = [actor.name for actor in [*self.robot, operator] if not actor.running]
         moved = after["x"] != before["x"]
-        self.results += [
+        place = f"now at {after['latitude']:.6f} {after['longitude']:.6f}"
+        results = [
             Result("every node lives", not dead, ", ".join(dead) or f"{len(self.robot) + 1} nodes"),
-            Result(
-                "the robot still drives", moved, f"now at {after['latitude']:.6f} {after['longitude']:.6f}"
-            ),
+            Result("the robot still drives", moved, place),
             Result("nobody else fired", after["shots"] == 1, f"{after['shots']} shot in all"),
         ]
+        for result in results:
+            self.say(f"{'' if result.good else 'NOT: '}{result.what}: {result.remark}")
+        self.results += results
 
     def summary(self) -> None:
         """The table at the end."""
