@@ -19,7 +19,15 @@ from appliance.cli.policy_input import (
     requests_of_file,
     usage_error,
 )
-from appliance.cli.policy_output import decision_fields, printable, request_fields, say, say_finding, say_json
+from appliance.cli.policy_output import (
+    counted,
+    decision_fields,
+    printable,
+    request_fields,
+    say,
+    say_finding,
+    say_json,
+)
 from appliance.policy import (
     Category,
     Difference,
@@ -57,8 +65,11 @@ def check(file: _File, robot: Robot = None, enrolled: Enrolled = None, as_json: 
         say_finding(finding, as_json=as_json)
     if not as_json:
         warnings = len(findings) - errors
-        verdict = f"{errors} errors: the file is refused" if errors else f"{file} is right"
-        say(f"{verdict}, {warnings} warnings" if warnings else verdict, "red" if errors else "green")
+        verdict = f"{counted(errors, 'error')}: the file is refused" if errors else f"{file} is right"
+        say(
+            f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
+            "red" if errors else "green",
+        )
     raise typer.Exit(1 if errors else 0)
 
 
@@ -204,7 +215,7 @@ def compare(
             for line in _difference_lines(difference):
                 say(line, "yellow" if difference.granted else "red")
     if not as_json:
-        say(f"{len(differences)} requests would be decided differently")
+        say(f"{counted(len(differences), 'request')} would be decided differently")
     raise typer.Exit(1 if differences else 0)
 
 
@@ -219,7 +230,7 @@ def _difference_lines(difference: Difference) -> Iterator[str]:
     request = difference.request
     who = f"{request.host} {request.caller_id}".strip()
     yield f"{'granted' if difference.granted else 'denied'}: {who}: {request.category} {request.resource}"
-    yield f"  seen in {difference.count} records"
+    yield f"  seen in {counted(difference.count, 'record')}"
     yield f"  old: {difference.old.reason}"
     yield f"  new: {difference.new.reason}"
 

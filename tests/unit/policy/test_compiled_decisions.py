@@ -107,6 +107,33 @@ def test_compiled_decisions_are_those_of_the_naive_decider(
         assert len(decision.reason) < 300
 
 
+BELOW = [
+    f"/{a}{b}{c}"
+    for a in (*NAMES, "zz")
+    for b in ("", *(f"/{n}" for n in (*NAMES, "z")))
+    for c in ("", "/a", "/zz")
+]
+
+
+@settings(max_examples=300, deadline=None)
+@given(policies(), HOSTS, st.sampled_from(["/", "/a", "/b", "/arm", "/a/b", "/a/arm"]))
+def test_namespace_may_be_touched_only_if_everything_in_it_may(
+    policy: tuple[Rules, dict[str, list[str]]], host: str, key: str
+) -> None:
+    """A call on a namespace passes only if every key that can be in it may be touched; without stars before
+    the end of keys, it passes whenever that is so."""
+    rules, groups = policy
+    text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
+    text += "[Parameters]\n" + "".join(f"write {key} = {', '.join(words)}\n" for _, key, words in rules)
+    request = Request(ipaddress.ip_address(host), "/n", Category.WRITE, key)
+    allowed = compile_policy(text, file="p.ini").decide_parameter(request, namespace=True).allowed
+    inside = [key + below if key != "/" else below for below in BELOW]
+    wanted = all(decide_slowly(rules, groups, "Publishers", host, name) for name in [key, *inside])
+    star_before_the_end = any(re.search(r"\*(?!\**$)", rule_key) for _, rule_key, _ in rules)
+    if allowed or not star_before_the_end:
+        assert allowed == wanted
+
+
 @settings(max_examples=400, deadline=None)
 @given(st.lists(KEYS, min_size=2, max_size=2, unique=True), st.lists(NAME, max_size=30))
 def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) -> None:
