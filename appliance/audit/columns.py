@@ -16,6 +16,13 @@ LARGEST_DETAIL = 65_536
 LONGEST_TEXT = 4_096
 _DEEPEST = 16
 _MOST_ITEMS = 256
+_LARGEST_INTEGER = (1 << 63) - 1
+_NONE = type(None)
+_KINDS: tuple[tuple[type, ...], ...] = (
+    (int,), (str,), (int,), (int,), (str,), (str,), (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE),
+    (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE), (int, _NONE), (int, _NONE), (str,), (int, _NONE),
+    (bytes,),
+)  # fmt: skip
 _encoder = msgspec.json.Encoder(order="deterministic")
 _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
 
@@ -24,9 +31,13 @@ def to_columns(record: Record, sequence: int) -> StoredColumns:
     """The columns of a record that takes the place `sequence`. Never fails, whatever the record holds."""
     try:
         columns = _columns(record, sequence)
-        if len(columns.detail) <= LARGEST_DETAIL and _short(columns):
+        if (
+            isinstance(record.detail, dict)
+            and len(columns.detail) <= LARGEST_DETAIL
+            and all(map(_storable, columns, _KINDS))
+        ):
             return columns
-    except (TypeError, ValueError, OverflowError, RecursionError):
+    except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
         pass
     return _columns(_plain_record(record), sequence)
 
@@ -42,14 +53,17 @@ def _columns(record: Record, sequence: int) -> StoredColumns:
     )  # fmt: skip
 
 
-def _short(columns: StoredColumns) -> bool:
-    for value in columns:
-        if type(value) is str:
-            if len(value) > LONGEST_TEXT:
-                return False
-            if not value.isascii():
-                value.encode()
-    return True
+def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
+    kind = type(value)
+    if kind not in kinds:
+        return False
+    if kind is str:
+        return len(value) <= LONGEST_TEXT and (value.isascii() or _is_unicode(value))
+    return kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER
+
+
+def _is_unicode(text: str) -> bool:
+    return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def from_columns(columns: StoredColumns) -> Record:
@@ -68,26 +82,39 @@ def from_columns(columns: StoredColumns) -> Record:
 
 
 def _plain_record(record: Record) -> Record:
-    fields = {name: _plain(getattr(record, name)) for name in record.__struct_fields__ if name not in _TYPED}
     rule = record.rule
     if rule is not None:
-        rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), rule.line)
+        rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), _integer(rule.line) or 0)
     detail = _plain(record.detail)
+    if not isinstance(detail, dict):
+        detail = {"value": detail}
     if len(_encoder.encode(detail)) > LARGEST_DETAIL:
-        detail = {"cut": "the details were too large to keep", "keys": sorted(detail)[:_MOST_ITEMS]}
-        if len(_encoder.encode(detail)) > LARGEST_DETAIL:
-            del detail["keys"]
-    return Record(**{**fields, "severity": record.severity, "rule": rule, "detail": detail})
+        detail = {"cut": "the details were too large to keep", "keys": [key[:64] for key in detail]}
+    return Record(
+        id=_text(record.id), time=_integer(record.time) or 0, event=_text(record.event),
+        severity=record.severity if isinstance(record.severity, Severity) else Severity.NOTICE,
+        decision=_optional(record.decision), host=_optional(record.host),
+        caller_id=_optional(record.caller_id), category=_optional(record.category),
+        resource=_optional(record.resource), rule=rule, revision=_integer(record.revision),
+        reason=_text(record.reason), duration_us=_integer(record.duration_us), detail=detail,
+    )  # fmt: skip
 
 
-_TYPED = ("severity", "rule", "detail")
+def _optional(value: object) -> str | None:
+    return None if value is None else _text(value)
+
+
+def _integer(value: object) -> int | None:
+    if not isinstance(value, int):
+        return None
+    return max(-_LARGEST_INTEGER, min(int(value), _LARGEST_INTEGER))
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
     if value is None or isinstance(value, bool | float):
         plain: Any = value
     elif isinstance(value, int):
-        plain = value if -(1 << 63) <= value < 1 << 63 else _text(hex(value))
+        plain = value if abs(value) <= _LARGEST_INTEGER else _text(hex(value))
     elif isinstance(value, str):
         plain = _text(value)
     elif isinstance(value, bytes | bytearray):
@@ -107,13 +134,14 @@ def _plain(value: Any, depth: int = 0) -> Any:
 
 def _plain_dict(value: dict[Any, Any], depth: int) -> dict[str, Any]:
     pairs = list(value.items())[:_MOST_ITEMS]
-    plain = {_text(str(key)): _plain(item, depth + 1) for key, item in pairs}
+    plain = {_text(key): _plain(item, depth + 1) for key, item in pairs}
     if len(value) > len(pairs):
         plain["..."] = f"{len(value) - len(pairs)} more"
     return plain
 
 
-def _text(value: str) -> str:
+def _text(value: object) -> str:
+    value = value if type(value) is str else str(value)
     if len(value) > LONGEST_TEXT:
         value = f"{value[: LONGEST_TEXT - 64]}... ({len(value)} characters)"
     return value.encode("utf-8", "backslashreplace").decode()

@@ -41,6 +41,8 @@ _CLOSE_SECONDS = 10.0
 _REMOVED_AT_ONCE = 512
 _RETENTION_SECONDS = 5.0
 _AGE_SECONDS = 3600.0
+_HOUSE_SECONDS = 10.0
+_ASK_AGAIN_SECONDS = 30.0
 _WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
 
 
@@ -115,6 +117,9 @@ class AuditLog:
         self._writer: ChainWriter | None = None
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
+        self._degraded: str | None = None
+        self._house_at = 0.0
+        self._asked_at = 0.0
         self._caught_up = time.monotonic()
         self._unsealed = 0
         self._sealed_at = time.monotonic()
@@ -160,6 +165,11 @@ class AuditLog:
     def failed(self) -> str | None:
         """Why the log cannot be written now; None when it can."""
         return self._failed
+
+    @property
+    def degraded(self) -> str | None:
+        """Why checkpoints, the full-text index or retention are behind; None when they are not."""
+        return self._degraded
 
     @property
     def lag(self) -> Lag:
@@ -231,7 +241,7 @@ class AuditLog:
         self._held.extend(self._folder.finish())
         self._unsealed += len(self._held)
         if self._attempt(self._write) and self._unsealed:
-            self._attempt(self._seal)
+            self._keep_house(self._seal)
         self._answer_barriers()
         self._unwritten = self._failed
         if self._writer is not None:
@@ -246,13 +256,13 @@ class AuditLog:
             written = self._attempt(self._write)
             self._answer_barriers()
             if written and self._seal_is_due():
-                written = self._attempt(self._seal)
+                self._keep_house(self._seal)
             if not more or not written:
                 break
         if self._writer is not None and not self._queue:
-            self._attempt(self._index)
+            self._keep_house(self._index)
         if self._writer is not None and time.monotonic() >= self._retained_at:
-            self._attempt(self._retain)
+            self._keep_house(self._retain)
 
     def _wait(self) -> None:
         if self._failed is not None:
@@ -274,10 +284,10 @@ class AuditLog:
         now = time.monotonic()
         due = self._folder.next_due()
         waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
-        if not self._retained_at:
-            return 0.001
-        if self._unsealed:
-            waits.append(self._sealed_at + self._checkpoint_seconds - now)
+        if now >= self._house_at:
+            waits.append(self._retained_at - now)
+            if self._unsealed:
+                waits.append(self._sealed_at + self._checkpoint_seconds - now)
         return max(0.001, min(waits))
 
     def _drain(self) -> bool:
@@ -291,11 +301,11 @@ class AuditLog:
             if isinstance(item, Record):
                 self._held.extend(offer(item, now))
             elif isinstance(item, _Signature):
-                self._attempt(partial(self._keep_signature, item))
+                self._keep_house(partial(self._keep_signature, item))
             elif isinstance(item, _Refusal):
                 self._refused(item.number, item.reason)
             elif isinstance(item, _AskSignatures):
-                self._attempt(self._ask_signatures)
+                self._keep_house(self._ask_signatures)
             else:
                 self._barriers.append(item)
         return bool(queue)
@@ -310,6 +320,18 @@ class AuditLog:
             self._fail(error)
             return False
         return True
+
+    def _keep_house(self, action: Callable[[], None]) -> None:
+        """Do what can wait; when it fails it is tried again later; only writing records decides `failed`."""
+        if time.monotonic() < self._house_at:
+            return
+        try:
+            action()
+        except _WRITE_ERRORS as error:
+            self._degraded = f"{self.path}: {error}"
+            self._house_at = time.monotonic() + _HOUSE_SECONDS
+        else:
+            self._degraded = None
 
     def _fail(self, error: Exception) -> None:
         if self._failed_since == 0:
@@ -379,7 +401,11 @@ class AuditLog:
         detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
         writer.append([self._own("checkpoint", Severity.DEBUG, "", detail)])
         self._unsealed = 0
-        self._signatures.sealed(checkpoint.number, text)
+        if self._sealed_at - self._asked_at > _ASK_AGAIN_SECONDS:
+            # An answer may have been lost on the way; asking twice for the same is harmless.
+            self._ask_signatures()
+        else:
+            self._signatures.sealed(checkpoint.number, text)
 
     def _retain(self) -> None:
         """Remove one step of old records if they must go; the next step follows at once."""
@@ -413,6 +439,7 @@ class AuditLog:
         self._held.append(self._own("signature refused", Severity.ALARM, reason, {"number": number}))
 
     def _ask_signatures(self) -> None:
+        self._asked_at = time.monotonic()
         if self._writer is not None:
             self._signatures.ask(self._writer)
 

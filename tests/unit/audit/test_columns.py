@@ -1,0 +1,67 @@
+"""Tests of storing whatever a stranger can make a record hold."""
+
+from typing import Any
+
+import pytest
+
+from appliance.audit.columns import LARGEST_DETAIL, LONGEST_TEXT, from_columns, to_columns
+from appliance.audit.record import Record, RuleReference, Severity
+
+
+def make(**fields: Any) -> Record:
+    """A record with these fields."""
+    return Record(**{"id": "0" * 20, "time": 1, "event": "decision", **fields})
+
+
+def test_round_trip() -> None:
+    """What is stored is what comes back, to the last field and character."""
+    record = make(
+        severity=Severity.ALARM, decision="deny", host="10.0.0.1", caller_id="/\x1b[2J\u202e\0é",
+        category="call", resource="/a", rule=RuleReference("Clients", "/a", "p.ini", 7), revision=2,
+        reason="no", duration_us=9,
+        detail={"list": [1, 2.5, None, {"deep": "ü"}]},
+    )  # fmt: skip
+    assert from_columns(to_columns(record, 1)) == record
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "\udc80", {"\udc80": 1}, 2**70, -(2**4000), float("nan"), b"\xff\x00", object(), {1: 2}, {(1, 2): 3},
+        {1, 2}, "x" * 1_000_000, ["y" * 5000] * 1000, {str(n): n for n in range(10_000)},
+        __import__("functools").reduce(lambda inner, _: [inner], range(5000), []),
+    ],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_nothing_a_record_holds_stops_the_log(value: Any) -> None:
+    """Any value in `detail` is stored, cut or escaped where it must be, and bounded in size."""
+    columns = to_columns(make(detail={"value": value}), 1)
+    assert len(columns.detail) <= LARGEST_DETAIL
+    assert from_columns(columns).detail
+
+
+@pytest.mark.parametrize("field", ["host", "caller_id", "category", "resource", "reason", "event"])
+def test_texts_are_bounded_and_storable(field: str) -> None:
+    """Texts that cannot be stored are escaped; long ones are cut and say how long they were."""
+    assert getattr(from_columns(to_columns(make(**{field: "a\udcffb"}), 1)), field) == "a\\udcffb"
+    cut = getattr(from_columns(to_columns(make(**{field: "z" * 100_000}), 1)), field)
+    assert len(cut) <= LONGEST_TEXT
+    assert cut.endswith("(100000 characters)")
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"time": 2**70}, {"revision": 2**70}, {"duration_us": -(2**70)}, {"host": ["10.0.0.1"]},
+        {"severity": "odd"}, {"caller_id": 7}, {"resource": b"/a"}, {"detail": None},
+        {"rule": RuleReference("a", "b", "c", 2**70)},
+        {"time": None}, {"revision": 1.5},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
+    """A record with fields of a wrong type (a defect of ours) is stored as well as it can be."""
+    columns = to_columns(make(**fields), 1)
+    assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
+    assert abs(columns.time) < 1 << 63
+    assert from_columns(columns).id == "0" * 20

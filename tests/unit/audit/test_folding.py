@@ -1,0 +1,117 @@
+"""Tests of folding repeated denials, with a clock that the test moves."""
+
+import itertools
+from typing import Any
+
+from appliance.audit.folding import Folder, FoldSettings
+from appliance.audit.record import Record
+
+_numbers = itertools.count(1)
+
+
+def make_folder(**settings: Any) -> Folder:
+    """A folder whose summaries are called s1, s2, ..."""
+    ids = itertools.count(1)
+    return Folder(FoldSettings(**settings), lambda: f"s{next(ids)}", lambda: 1)
+
+
+def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> Record:
+    """A denial with an id of its own."""
+    fields = {"decision": "deny", "caller_id": "/n", "category": "call", "reason": "no"} | fields
+    made = f"r{next(_numbers)}"
+    return Record(id=made, time=1, event="decision", host=host, resource=resource, **fields)
+
+
+def offer(folder: Folder, *records: Record, now: float = 0) -> list[Record]:
+    """What is written for these records."""
+    return [written for record in records for written in folder.offer(record, now)]
+
+
+def test_first_in_full_then_counted() -> None:
+    """The first denial is recorded as it is; its repetitions are one summary with count, first and last."""
+    folder = make_folder(seconds=10)
+    same = [denial() for _ in range(100)]
+    assert offer(folder, *same) == same[:1]
+    assert list(folder.expire(9.9)) == []
+    (summary,) = folder.expire(10)
+    assert summary.event == "denials folded"
+    assert summary.decision == "deny"
+    assert (summary.host, summary.caller_id, summary.resource) == ("10.0.0.1", "/n", "/a")
+    assert summary.detail["count"] == 99
+    assert summary.detail["recorded_id"] == same[0].id
+    assert (summary.detail["first_id"], summary.detail["last_id"]) == (same[1].id, same[99].id)
+
+
+def test_summaries_go_on_while_it_repeats() -> None:
+    """A denial that goes on repeating has a summary every period, and is in full again after a quiet one."""
+    folder = make_folder(seconds=10)
+    offer(folder, denial(), denial(), now=0)
+    assert [one.detail["count"] for one in folder.expire(10)] == [1]
+    assert offer(folder, denial(), denial(), now=11) == []
+    assert [one.detail["count"] for one in folder.expire(20)] == [2]
+    assert list(folder.expire(30)) == []
+    assert len(folder) == 0
+    again = denial()
+    assert offer(folder, again, now=31) == [again]
+
+
+def test_what_differs_is_not_folded() -> None:
+    """Another host, caller, resource, reason or policy revision is another kind, recorded in full."""
+    folder = make_folder()
+    kinds = [
+        denial(), denial(host="10.0.0.2"), denial(caller_id="/other"), denial("/b"), denial(reason="other"),
+        denial(revision=9), denial(category="read"), denial(decision="would deny"),
+    ]  # fmt: skip
+    assert offer(folder, *kinds) == kinds
+
+
+def test_an_allow_ends_the_folding_it_contradicts() -> None:
+    """The summary of denials comes before the allow of the same request, and the next denial is in full."""
+    folder = make_folder()
+    offer(folder, denial(), denial())
+    allowed = denial(decision="allow")
+    written = offer(folder, allowed)
+    assert [one.event for one in written] == ["denials folded", "decision"]
+    assert written[1] is allowed
+    again = denial()
+    assert offer(folder, again) == [again]
+
+
+def test_allows_are_never_folded() -> None:
+    """Every allow is recorded in full."""
+    folder = make_folder()
+    allows = [denial(decision="allow") for _ in range(50)]
+    assert offer(folder, *allows) == allows
+
+
+def test_varied_names_are_folded_per_host() -> None:
+    """Who varies names costs bounded memory and records, every denial is counted, others are not hit."""
+    folder = make_folder(keys_per_host=16, keys=64)
+    flood = offer(folder, *(denial(f"/{number}") for number in range(10_000)))
+    assert len(flood) == 17
+    assert len(folder) == 17
+    victim = denial(host="10.0.0.9")
+    assert offer(folder, victim) == [victim]
+    summaries = list(folder.finish())
+    assert sum(one.detail["count"] for one in summaries) == 10_000 - 17
+    (host,) = [one for one in summaries if one.detail["scope"] == "host"]
+    assert host.host == "10.0.0.1"
+    assert host.resource is None
+    assert 0 < len(host.detail["resources"]) <= 8
+
+
+def test_varied_addresses_are_folded_together() -> None:
+    """Even with an address for each denial memory is bounded and every denial is counted."""
+    folder = make_folder(keys=64)
+    written = offer(folder, *(denial(host=f"10.1.{n // 256}.{n % 256}") for n in range(20_000)))
+    assert len(folder) <= 65
+    summaries = list(folder.finish())
+    assert len(written) + sum(one.detail["count"] for one in summaries) == 20_000
+    assert len(folder) == 0
+
+
+def test_zero_seconds_records_everything() -> None:
+    """With folding off every denial is recorded in full."""
+    folder = make_folder(seconds=0)
+    same = [denial() for _ in range(10)]
+    assert offer(folder, *same) == same

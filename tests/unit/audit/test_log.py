@@ -1,0 +1,339 @@
+"""Tests of the log as its owner uses it, on real files; also on a full disk, and with the process killed."""
+
+import asyncio
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.folding import FoldSettings
+from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.search import export, search
+from appliance.audit.verify import verify
+from tests.support.audit import decision, settle
+from tests.support.requirements import need_root
+
+_LIMIT_SECONDS = 30
+
+
+def events(path: Path) -> Counter[str]:
+    """How many records of each event the log has."""
+    return Counter(entry.record.event for entry in export(path, Filter()))
+
+
+def await_state(log: AuditLog, *, failed: bool) -> None:
+    """Wait until the log says that it failed, or that it works."""
+    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
+    while (log.failed is not None) != failed:
+        assert time.monotonic() < end, f"failed is still {log.failed!r}"
+        tick.wait(0.01)
+
+
+@pytest.mark.parametrize("durability", ["strict", "batched"])
+def test_what_was_waited_for_is_on_disk(make_log, path, durability) -> None:
+    """After `wait_durable` a reader finds the records, in the order they were recorded."""
+    log = make_log(durability=durability)
+    sent = [decision(log, number) for number in range(500)]
+    for one in sent:
+        log.record(one)
+    assert settle(log) is None
+    stored = [entry.record for entry in export(path, Filter(event="decision"))]
+    assert stored == sent
+    assert log.lag.records == 0
+
+
+def test_batched_is_on_disk_soon_without_being_asked(make_log, path) -> None:
+    """A record is on disk soon after it was recorded though nobody waits for it."""
+    log = make_log()
+    log.record(decision(log))
+    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
+    while not search(path, Filter(event="decision")).entries:
+        assert time.monotonic() < end
+        tick.wait(0.01)
+
+
+def test_flushed_calls_back(make_log) -> None:
+    """`flushed` calls its function with None once the records are on disk."""
+    log = make_log()
+    called: list[str | None] = []
+    done = threading.Event()
+    log.record(decision(log))
+    log.flushed(lambda reason: (called.append(reason), done.set()))
+    assert done.wait(_LIMIT_SECONDS)
+    assert called == [None]
+
+
+def test_many_waiters_share_commits(make_log, path) -> None:
+    """A hundred concurrent requests in strict mode are each answered after their own record is on disk."""
+    log = make_log(durability="strict")
+
+    async def request(number: int) -> None:
+        record = decision(log, number)
+        log.record(record)
+        assert await log.wait_durable() is None
+
+    async def all_of_them() -> None:
+        await asyncio.gather(*(request(number) for number in range(100)))
+
+    asyncio.run(asyncio.wait_for(all_of_them(), _LIMIT_SECONDS))
+    assert events(path)["decision"] == 100
+
+
+def test_log_goes_on_after_a_clean_stop(make_log, path) -> None:
+    """A log that is opened again continues its chain, and its ids, though the clock was set back."""
+    first = make_log(clock=lambda: 2_000_000_000_000_000_000)
+    first.record(decision(first))
+    assert first.close() is None
+    second = make_log(clock=lambda: 1_000_000_000_000_000_000)
+    second.record(decision(second))
+    assert second.close() is None
+    ids = [entry.record.id for entry in export(path, Filter(event="decision"))]
+    assert ids[0][:16] < ids[1][:16]
+    result = verify(path)
+    assert result.ok, result.findings
+    assert events(path)["log begun"] == 1
+
+
+def test_killed_writer(path) -> None:
+    """After SIGKILL in the middle of writing the chain goes on, and all that was confirmed is there."""
+    script = (
+        "import asyncio, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
+        "from tests.support.audit import decision\n"
+        "log = AuditLog(Path(sys.argv[1]), durability='strict')\n"
+        "async def work():\n"
+        "    number = 0\n"
+        "    while True:\n"
+        "        for _ in range(50):\n"
+        "            number += 1; log.record(decision(log, number))\n"
+        "        assert await log.wait_durable() is None\n"
+        "        print(number, flush=True)\n"
+        "asyncio.run(work())\n"
+    )
+    confirmed = 0
+    for _life in range(3):
+        with subprocess.Popen(
+            [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
+        ) as process:
+            assert process.stdout is not None
+            lines = [process.stdout.readline() for _ in range(20)]
+            process.send_signal(signal.SIGKILL)
+            rest = process.stdout.read().splitlines()
+        confirmed += int([line for line in lines + rest if line.strip()][-1])
+    assert events(path)["decision"] >= confirmed
+    result = verify(path)
+    assert result.ok, result.findings
+    log = AuditLog(path)
+    assert log.failed is None
+    log.record(decision(log))
+    assert log.close() is None
+    assert verify(path).ok
+
+
+def test_counted_denials_survive_a_kill(path) -> None:
+    """Repetitions that were counted but not summarised when the process was killed are not forgotten."""
+    script = (
+        "import asyncio, os, signal, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
+        "from appliance.audit.folding import FoldSettings; from tests.support.audit import decision\n"
+        "log = AuditLog(Path(sys.argv[1]), fold=FoldSettings(seconds=3600))\n"
+        "for _ in range(100): log.record(decision(log, decision='deny'))\n"
+        "asyncio.run(log.wait_durable()); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", script, str(path)], cwd=Path.cwd(), timeout=60, check=False)
+    AuditLog(path).close()
+    (entry,) = export(path, Filter(event="denials folded"))
+    assert entry.record.detail["count"] == 99
+    assert entry.record.detail["recovered"] is True
+
+
+def test_flood_of_denials(make_log, path) -> None:
+    """A hundred thousand identical denials leave a handful of records that count every one of them."""
+    log = make_log(fold=FoldSettings(seconds=0.2), queue_limit=200_000)
+    before = decision(log, decision="deny", resource="/evidence")
+    log.record(before)
+    for _ in range(100_000):
+        log.record(decision(log, decision="deny"))
+    assert log.close() is None
+    records = [entry.record for entry in export(path, Filter(decision=("deny",)))]
+    assert records[0] == before
+    assert len(records) < 200
+    folded = sum(one.detail["count"] for one in records if one.event == "denials folded")
+    assert folded + sum(one.event == "decision" for one in records) == 100_001
+    assert verify(path).ok
+
+
+def fill(path: Path) -> None:
+    """Write a file until the disk is full."""
+    with path.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
+        while True:
+            file.write(b"x" * 512)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 2 MiB."""
+    need_root()
+    place = tmp_path / "disk"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "rosrv-audit-test", place], check=True)
+    yield place
+    subprocess.run(["umount", "--lazy", place], check=True)
+
+
+def test_full_disk(small_disk: Path) -> None:
+    """With the disk full the log says so, keeps what it is given, and writes it when there is room."""
+    path = small_disk / "audit.db"
+    filler = small_disk / "filler"
+    log = AuditLog(path)
+    log.record(decision(log))
+    assert settle(log) is None
+    fill(filler)
+    count = 0
+    while log.failed is None:
+        count += 1
+        log.record(decision(log, count))
+        settle(log)
+        assert count < 100_000
+    assert "full" in log.failed
+    assert str(path) in log.failed
+    assert settle(log) == log.failed
+    log.record(decision(log, count, resource="/while-failed"))
+    filler.unlink()
+    await_state(log, failed=False)
+    assert settle(log) is None
+    assert events(path)["decision"] == count + 2
+    assert len(search(path, Filter(resource="/while-failed")).entries) == 1
+    reports = search(path, Filter(event="log failed")).entries
+    assert reports
+    assert all("full" in report.record.reason for report in reports)
+    assert log.close() is None
+    assert verify(path).ok
+
+
+def test_queue_is_bounded_and_says_what_was_lost(small_disk: Path) -> None:
+    """What does not fit into the queue while the disk is full is counted, and the count is recorded."""
+    path = small_disk / "audit.db"
+    log = AuditLog(path, queue_limit=100)
+    assert settle(log) is None
+    filler = small_disk / "filler"
+    fill(filler)
+    sent = 0
+    while log.failed is None:
+        sent += 1
+        log.record(decision(log, sent))
+        settle(log)
+    for number in range(1000):
+        sent += 1
+        log.record(decision(log, number))
+    assert log.lag.records <= 101
+    assert log.lag.seconds > 0
+    filler.unlink()
+    await_state(log, failed=False)
+    assert log.close() is None
+    (lost,) = search(path, Filter(event="records lost")).entries
+    assert events(path)["decision"] + lost.record.detail["count"] == sent
+    assert verify(path).ok
+
+
+@pytest.mark.parametrize("content", [b"", b"not a database" * 1000, b"SQLite format 3\0" + b"\0" * 5000])
+def test_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
+    """A file that is no log is told with its name, and is left as it is."""
+    path.write_bytes(content)
+    log = AuditLog(path)
+    assert log.failed is not None
+    assert str(path) in log.failed
+    log.record(decision(log))
+    assert settle(log) is not None
+    assert log.close() is not None
+    assert path.read_bytes() == content
+
+
+def test_another_kind_of_database_is_an_error(path: Path) -> None:
+    """A database of another program is not written to."""
+    with closing(sqlite3.connect(path)) as other:
+        other.execute("CREATE TABLE something (x)")
+    log = AuditLog(path)
+    assert log.failed is not None
+    assert "not an audit log" in log.failed
+    log.close()
+
+
+def test_changed_end_stops_writing(make_log, path) -> None:
+    """A log whose last records were changed while it was closed is not continued."""
+    log = make_log()
+    log.record(decision(log))
+    log.close()
+    with closing(sqlite3.connect(path)) as attacker:
+        attacker.execute("UPDATE record SET host = '10.9.9.9' WHERE event = 'decision'")
+        attacker.commit()
+    log = AuditLog(path)
+    assert log.failed is not None
+    assert "record 2" in log.failed
+    assert "rosrv audit verify" in log.failed
+    log.close()
+
+
+def test_removed_file_is_noticed(make_log, path) -> None:
+    """A log file that is removed or replaced while it is written stops the log, and is told."""
+    log = make_log()
+    assert settle(log) is None
+    path.rename(path.with_name("stolen.db"))
+    log.record(decision(log))
+    assert "removed or replaced" in (settle(log) or "")
+
+
+def test_second_writer_is_refused(make_log, path) -> None:
+    """Two processes cannot write one log; the second says why and takes over when the first ends."""
+    first = make_log()
+    second = AuditLog(path)
+    assert second.failed is not None
+    assert "another process" in second.failed
+    second.record(decision(second))
+    first.close()
+    await_state(second, failed=False)
+    assert second.close() is None
+    assert events(path)["decision"] == 1
+    assert verify(path).ok
+
+
+def test_no_state_directory(tmp_path: Path) -> None:
+    """A directory that does not exist is a failure with its name, and the log works once it is there."""
+    path = tmp_path / "missing" / "audit.db"
+    log = AuditLog(path)
+    assert str(path) in (log.failed or "")
+    log.record(decision(log))
+    path.parent.mkdir()
+    await_state(log, failed=False)
+    assert log.close() is None
+    assert events(path)["decision"] == 1
+
+
+def test_missing_earlier_log_is_an_alarm(make_log, path) -> None:
+    """If a signed log was here before and is gone, the first record of the new one says so."""
+    log = make_log(checkpoint_every=1)
+    log.record(decision(log))
+    assert settle(log) is None
+    log.close()
+    assert path.with_name("audit.pub").exists()
+    for one in path.parent.glob("audit.db*"):
+        one.unlink()
+    make_log().close()
+    (begun,) = search(path, Filter(event="log begun")).entries
+    assert begun.record.severity == "alarm"
+    assert begun.record.detail["earlier_log_missing"] is True
+
+
+def test_closed_log_answers(make_log) -> None:
+    """Whoever waits on a closed log is told so instead of waiting for ever."""
+    log = make_log()
+    log.close()
+    log.record(decision(log))
+    assert "closed" in (settle(log) or "")
