@@ -5,7 +5,7 @@ import traceback
 
 import typer
 
-from appliance.cli import audit, config, demo, policy, up
+from appliance.cli import audit, config, demo, policy, protect, up
 from appliance.config_sources import ConfigError
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
@@ -18,6 +18,7 @@ app = typer.Typer(
 )
 app.command()(up.up)
 app.command()(demo.demo)
+app.command()(protect.protect)
 app.add_typer(audit.app, name="audit")
 app.add_typer(policy.app, name="policy")
 app.add_typer(config.app, name="config")

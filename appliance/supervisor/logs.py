@@ -8,6 +8,9 @@ import sys
 
 import structlog
 
+# Never the values of local variables: a token or a key might be among them.
+_transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
+
 
 def configure_logs(process: str) -> None:
     """Log to standard error; every line says which process wrote it."""
@@ -18,9 +21,9 @@ def configure_logs(process: str) -> None:
         structlog.processors.TimeStamper(fmt="%H:%M:%S" if human else "iso", utc=not human),
     ]
     renderer: list[structlog.typing.Processor] = (
-        [structlog.dev.ConsoleRenderer()]
+        [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
         if human
-        else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
+        else [structlog.processors.ExceptionRenderer(_transform), structlog.processors.JSONRenderer()]
     )
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
