@@ -9,6 +9,7 @@ Run as a program it serves until its standard input ends, for measurements:
 """
 
 import argparse
+import itertools
 import os
 import re
 import select
@@ -34,6 +35,7 @@ from appliance.channel.messages import (
     LinkOpened,
     Message,
     NodePlaced,
+    NodeWithdrawn,
     Ping,
     Pong,
     PublicationPlaced,
@@ -77,6 +79,7 @@ class ChannelPeer:
         self._lock = threading.Lock()
         self.messages: list[Any] = []
         self.ended = threading.Event()
+        self._closed = False
         self._wake, self._woken = socket.socketpair()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -104,6 +107,9 @@ class ChannelPeer:
 
     def close(self) -> None:
         """End the channel as the death of a process would."""
+        if self._closed:
+            return
+        self._closed = True
         self.ended.set()
         self._wake.send(b"x")
         self._thread.join(5)
@@ -191,7 +197,7 @@ class Face:
         self.driver = driver
         self.name = name
         self.real_uri = uri
-        self.key = f"{name}-{len(driver.faces)}"
+        self.key = f"{name}-{next(driver.numbers)}"
         self.publications: dict[str, str] = {}
         self.services: dict[str, int] = {}
         self.grants: set[tuple[str, str]] = set()
@@ -212,7 +218,7 @@ class Face:
                 self.grants.add((topic, caller_id))
                 self.driver.link.send(GrantInstalled(self.key, topic, LOOPBACK, caller_id))
             return [1, "ready", ["TCPROS", LOOPBACK, self.port]]
-        return getattr(xmlrpc.client.ServerProxy(self.real_uri), method)(*parameters)
+        return call(self.real_uri, method, *parameters)
 
     def statements(self) -> list[tuple[Message, tuple[int, ...]]]:
         """Everything control says about this incarnation."""
@@ -238,6 +244,8 @@ class RelayDriver:
     def __init__(self, port: int = 0, rosmaster_port: int = 0, limits: str = "None") -> None:
         self.granting = True
         self.faces: dict[str, Face] = {}
+        self.numbers = itertools.count()
+        self._gone: list[Face] = []
         self._lock = threading.RLock()
         self._rosmaster_port = rosmaster_port or free_port()
         self.rosmaster = subprocess.Popen(
@@ -266,7 +274,7 @@ class RelayDriver:
         self.link.close()
         self._server.shutdown()
         self._server.server_close()
-        for face in self.faces.values():
+        for face in [*self.faces.values(), *self._gone]:
             face.close()
         self.rosmaster.terminate()
         self.rosmaster.wait(10)
@@ -291,6 +299,9 @@ class RelayDriver:
         with self._lock:
             face = self.faces.get(name)
             if face is None or face.real_uri != uri:
+                if face is not None:
+                    self.link.send(NodeWithdrawn(face.key))
+                    self._gone.append(face)
                 face = Face(self, name, uri)
                 self.faces[name] = face
                 self.link.send(*face.statements()[0])
@@ -327,18 +338,18 @@ class RelayDriver:
             arguments[2] = f"rosrpc://{LOOPBACK}:{face.port}"
         elif method == "subscribeParam":
             arguments[1] = self._face(arguments[0], arguments[1]).uri
-        return getattr(xmlrpc.client.ServerProxy(self._master_uri, allow_none=True), method)(*arguments)
+        return call(self._master_uri, method, *arguments)
 
     def _received(self, message: Any) -> None:
         if isinstance(message, UpstreamWanted):
             threading.Thread(target=self._find_upstream, args=(message,), daemon=True).start()
 
     def _find_upstream(self, message: UpstreamWanted) -> None:
-        face = next(face for face in self.faces.values() if face.key == message.key)
+        face = next((face for face in self.faces.values() if face.key == message.key), None)
+        if face is None:
+            return
         try:
-            node = xmlrpc.client.ServerProxy(face.real_uri)
-            answer: Any = node.requestTopic("/rosrv", message.topic, [["TCPROS"]])
-            _code, text, where = answer
+            _code, text, where = call(face.real_uri, "requestTopic", "/rosrv", message.topic, [["TCPROS"]])
         except OSError as error:
             self.link.send(UpstreamRefused(message.key, message.topic, str(error)))
             return
@@ -346,6 +357,12 @@ class RelayDriver:
             self.link.send(UpstreamFound(message.key, message.topic, LOOPBACK, int(where[2])))
         else:
             self.link.send(UpstreamRefused(message.key, message.topic, str(text)))
+
+
+def call(uri: str, method: str, *arguments: Any) -> Any:
+    """One XML-RPC call on a connection of its own."""
+    with xmlrpc.client.ServerProxy(uri, allow_none=True) as proxy:
+        return getattr(proxy, method)(*arguments)
 
 
 def free_port() -> int:

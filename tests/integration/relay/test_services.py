@@ -1,0 +1,153 @@
+"""Services through the relay, between unmodified rospy and roscpp nodes and the stock tools."""
+
+import socket
+
+import pytest
+
+from appliance.channel.messages import ClientRevoked, ConnectionClosed, ConnectionOpened, ConnectionRefused
+from appliance.ros.tcpros import HeaderParser, encode_header
+from tests.support.nodes import Client, RosSession
+from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
+
+BOTH: tuple[Client, Client] = ("rospy", "roscpp")
+
+
+def ask_header(face: Face, fields: dict[str, str]) -> dict[str, str]:
+    """The header a relay port answers this one with."""
+    with socket.create_connection((LOOPBACK, face.port), timeout=20) as sock:
+        sock.sendall(encode_header(fields))
+        parser = HeaderParser()
+        while True:
+            data = sock.recv(4096)
+            assert data, "closed without a header"
+            header = parser.feed(data)
+            if header is not None:
+                return header
+
+
+@pytest.mark.parametrize("options", [(), ("--persistent",)], ids=["one-by-one", "persistent"])
+@pytest.mark.parametrize("caller", BOTH)
+@pytest.mark.parametrize("server", BOTH)
+def test_calls_are_answered(
+    driver: RelayDriver, ros: RosSession, server: Client, caller: Client, options: tuple[str, ...]
+) -> None:
+    """Every pair of client libraries, on a connection per call and on one for all calls."""
+    service = ros.service_server(server, "/mode", name="server")
+    client = ros.service_client(caller, "/mode", *options, name="client")
+    for count, value in enumerate(("true", "false", "true"), start=1):
+        client.send(value)
+        answers = client.wait_for_count(count, event="answered")
+        assert answers[-1]["success"] is (value == "false")
+    assert service.seen(event="called")[0]["client"] == "/client"
+    opened = [m for m in driver.link.messages if isinstance(m, ConnectionOpened) and m.caller_id == "/client"]
+    assert len(opened) == (1 if options else 3)
+    assert {m.kind for m in opened} == {"service"}
+
+
+@pytest.mark.parametrize("server", BOTH)
+def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession, server: Client) -> None:
+    """rosservice probes the service for its type before it calls."""
+    ros.service_server(server, "/mode", name="server")
+    assert ros.run("/usr/bin/rosservice", "type", "/mode").stdout.strip() == "std_srvs/SetBool"
+    assert "negated" in ros.run("/usr/bin/rosservice", "call", "/mode", "data: true").stdout
+
+
+@pytest.mark.parametrize("server", BOTH)
+def test_a_probe_is_answered_with_the_services_header(
+    driver: RelayDriver, ros: RosSession, server: Client
+) -> None:
+    """As a client that waits for a service sends it, with an open md5sum."""
+    ros.service_server(server, "/mode", name="server")
+    fields = {"callerid": "/probe", "service": "/mode", "md5sum": "*", "probe": "1"}
+    header = ask_header(driver.faces["/server"], fields)
+    assert header["type"] == "std_srvs/SetBool"
+
+
+@pytest.mark.parametrize("server", BOTH)
+def test_a_service_of_another_type_says_so_itself(
+    driver: RelayDriver, ros: RosSession, server: Client
+) -> None:
+    """The service's own error header comes back."""
+    ros.service_server(server, "/mode", name="server")
+    fields = {"callerid": "/client", "service": "/mode", "md5sum": "0" * 32}
+    assert "md5sum" in ask_header(driver.faces["/server"], fields)["error"]
+
+
+def test_a_failed_call_fails_with_the_services_words(driver: RelayDriver, ros: RosSession) -> None:
+    """A service that raises: its error reply reaches the caller."""
+    program = (
+        "import rospy\n"
+        "from std_srvs.srv import SetBool\n"
+        "rospy.init_node('server')\n"
+        "def fail(request): raise rospy.ServiceException('no such bolt')\n"
+        "rospy.Service('/mode', SetBool, fail)\n"
+        'print(\'{"event": "ready"}\', flush=True)\n'
+        "rospy.spin()\n"
+    )
+    ros.start(["/usr/bin/python3", "-c", program], label="server").wait_for(event="ready")
+    client = ros.service_client("rospy", "/mode")
+    client.send("true")
+    assert "no such bolt" in client.wait_for(event="failed")["reason"]
+
+
+def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSession) -> None:
+    """With an error header, and control is told; services that are not there likewise."""
+    ros.service_server("rospy", "/mode", name="server")
+    face = driver.faces["/server"]
+    driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK))
+    for service, reason in (("/mode", "no grant"), ("/other", "not a provider")):
+        fields = {"callerid": "/client", "service": service, "md5sum": "*"}
+        assert reason in ask_header(face, fields)["error"]
+        driver.link.wait_for(
+            lambda message, service=service: (
+                isinstance(message, ConnectionRefused) and message.resource == service
+            )
+        )
+
+
+def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, ros: RosSession) -> None:
+    """The next call fails; the service sees the end of the connection."""
+    ros.service_server("rospy", "/mode", name="server")
+    client = ros.service_client("rospy", "/mode", "--persistent", name="client")
+    client.send("true")
+    client.wait_for(event="answered")
+    driver.link.send(ClientRevoked(driver.faces["/server"].key, "/mode", LOOPBACK))
+    driver.link.wait_for(
+        lambda message: isinstance(message, ConnectionClosed) and "revoked" in message.reason
+    )
+    client.send("true")
+    client.wait_for(event="failed")
+
+
+def test_a_service_that_never_answers_holds_its_client_only(driver: RelayDriver, ros: RosSession) -> None:
+    """Others of the same service are answered, and the caller that gives up frees everything."""
+    program = (
+        "import rospy, threading\n"
+        "from std_srvs.srv import SetBool, SetBoolResponse\n"
+        "rospy.init_node('server')\n"
+        "stuck = threading.Event()\n"
+        "def answer(request):\n"
+        "    if request.data: stuck.wait()\n"
+        "    return SetBoolResponse(success=True)\n"
+        "rospy.Service('/mode', SetBool, answer)\n"
+        'print(\'{"event": "ready"}\', flush=True)\n'
+        "rospy.spin()\n"
+    )
+    ros.start(["/usr/bin/python3", "-c", program], label="server").wait_for(event="ready")
+    stuck = ros.service_client("roscpp", "/mode", name="stuck")
+    stuck.send("true")
+    opened = driver.link.wait_for(lambda m: isinstance(m, ConnectionOpened) and m.caller_id == "/stuck")
+    well = ros.service_client("roscpp", "/mode", name="well")
+    well.send("false")
+    well.wait_for(event="answered")
+    stuck.kill()
+    driver.link.wait_for(lambda m: isinstance(m, ConnectionClosed) and m.number == opened.number)
+
+
+def test_a_service_whose_node_has_died_is_an_error_not_a_hang(driver: RelayDriver, ros: RosSession) -> None:
+    """The caller is told at once that nobody is there."""
+    server = ros.service_server("rospy", "/mode", name="server")
+    server.kill()
+    client = ros.service_client("rospy", "/mode")
+    client.send("true")
+    assert "connection to the service" in client.wait_for(event="failed")["reason"]

@@ -1,0 +1,254 @@
+"""Topics through the relay, between unmodified rospy and roscpp nodes and the stock tools."""
+
+import resource
+import signal
+import socket
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from appliance.channel.messages import (
+    ConnectionClosed,
+    ConnectionOpened,
+    ConnectionRefused,
+    GrantInstalled,
+    GrantRevoked,
+    TrafficReported,
+    UpstreamLost,
+)
+from appliance.ros.tcpros import HeaderParser, encode_header
+from tests.support.nodes import Client, RosSession
+from tests.support.relay_driver import LOOPBACK, Face, RelayDriver, wait_until
+
+BOTH: tuple[Client, Client] = ("rospy", "roscpp")
+STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
+
+
+def rss(pid: int) -> int:
+    """Resident bytes of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def subscribe(face: Face, fields: dict[str, str]) -> tuple[socket.socket, dict[str, str]]:
+    """Connect to a relay port by hand and read the header of the answer."""
+    sock = socket.create_connection((LOOPBACK, face.port), timeout=20)
+    sock.sendall(encode_header(fields))
+    parser = HeaderParser()
+    while True:
+        data = sock.recv(1)
+        assert data, "closed without a header"
+        header = parser.feed(data)
+        if header is not None:
+            return sock, header
+
+
+def read_frame(stream: BinaryIO) -> bytes:
+    """The next frame's body."""
+    (length,) = struct.unpack("<I", stream.read(4))
+    return stream.read(length)
+
+
+@pytest.mark.parametrize("subscriber", BOTH)
+@pytest.mark.parametrize("publisher", BOTH)
+def test_messages_arrive_with_the_publishers_name(
+    driver: RelayDriver, ros: RosSession, publisher: Client, subscriber: Client
+) -> None:
+    """Every pair of client libraries talks through the relay as it does without, and nothing is dropped."""
+    ros.talker(publisher, "/chatter", name="talker")
+    listener = ros.listener(subscriber, "/chatter", name="listener")
+    events = listener.wait_for_count(5, event="received")
+    assert {event["publisher"] for event in events} == {"/talker"}
+    numbers = [int(event["data"].split()[1]) for event in events]
+    assert numbers == list(range(numbers[0], numbers[0] + 5))
+    opened = driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened))
+    assert (opened.resource, opened.kind, opened.caller_id) == ("/chatter", "topic", "/listener")
+    listener.stop()
+    closed = driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
+    assert closed == ConnectionClosed(opened.number, "")
+
+
+@pytest.mark.parametrize("publisher", BOTH)
+def test_a_latched_message_reaches_early_and_late_subscribers_once(
+    driver: RelayDriver, ros: RosSession, publisher: Client
+) -> None:
+    """The first gets it from the publisher, the later ones from the relay's memory."""
+    talker = ros.talker(publisher, "/map", "--latch")
+    first = ros.listener("rospy", "/map")
+    first.wait_for(event="received")
+    second = ros.listener("roscpp", "/map")
+    second.wait_for(event="received")
+    assert len(talker.seen(event="connected")) == 1, "the publisher sees one connection"
+    third = ros.listener("rospy", "/map")
+    third.wait_for(event="received")
+    for listener in (first, second, third):
+        assert [event["data"] for event in listener.seen(event="received")] == ["hello 1"]
+
+
+def test_a_stopped_subscriber_delays_nobody_and_grows_nothing(driver: RelayDriver, ros: RosSession) -> None:
+    """Its messages are dropped and counted; the other gets all, in order; the relay's memory stays flat."""
+    ros.talker("roscpp", "/chatter", "--rate", "200", "--text", "x" * 60_000)
+    stuck = ros.listener("roscpp", "/chatter", name="stuck")
+    stuck.wait_for(event="received")
+    stuck.popen.send_signal(signal.SIGSTOP)
+    try:
+        well = ros.listener("roscpp", "/chatter", name="well")
+        dropped = driver.link.wait_for(
+            lambda message: (
+                isinstance(message, TrafficReported)
+                and any(row.resource == "/chatter" and row.dropped for row in message.rows)
+            ),
+            seconds=60,
+        )
+        assert dropped
+        assert rss(driver.relay.process.pid) < 300 << 20
+        mark = well.mark()
+        well.wait_for(lambda event: True, since=mark, event="received")
+        numbers = [int(event["data"].split()[1]) for event in well.seen(event="received")]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    finally:
+        stuck.popen.send_signal(signal.SIGCONT)
+    mark = stuck.mark()
+    stuck.wait_for(since=mark, event="received")
+    numbers = [int(event["data"].split()[1]) for event in stuck.seen(event="received")]
+    assert numbers == sorted(numbers), "what it got is in order"
+
+
+def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosSession) -> None:
+    """Large messages pass in both directions of small-large-small."""
+    program = (
+        "import rospy, sys\n"
+        "from std_msgs.msg import String\n"
+        "rospy.init_node('big')\n"
+        "p = rospy.Publisher('/big', String, queue_size=10)\n"
+        'print(\'{"event": "ready"}\', flush=True)\n'
+        "while p.get_num_connections() < 1 and not rospy.is_shutdown(): rospy.sleep(0.02)\n"
+        "for n in (5, 10_000_000, 5, 3_000_000, 3_000_000, 0):\n"
+        "    p.publish(chr(97 + n % 7) * n)\n"
+        "rospy.spin()\n"
+    )
+    node = ros.start(["/usr/bin/python3", "-c", program], label="big")
+    node.wait_for(event="ready")
+    face = driver.faces["/big"]
+    driver.link.send(GrantInstalled(face.key, "/big", LOOPBACK, "/raw"))
+    wait_until(lambda: "/big" in face.publications, "the topic is registered")
+    sock, _header = subscribe(face, {"callerid": "/raw", "topic": "/big", **STRING})
+    with sock, sock.makefile("rb") as stream:
+        for size in (5, 10_000_000, 5, 3_000_000, 3_000_000, 0):
+            body = read_frame(stream)
+            assert struct.unpack_from("<I", body)[0] == size
+            assert body[4:] == bytes([97 + size % 7]) * size
+
+
+def test_without_a_grant_nobody_is_served(driver: RelayDriver, ros: RosSession) -> None:
+    """Another caller_id, another topic of the same publisher: an error header, and control is told."""
+    ros.talker("rospy", "/chatter", name="talker")
+    face = driver.faces["/talker"]
+    driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
+    for fields, reason in (
+        ({"callerid": "/stranger", "topic": "/chatter"}, "no grant"),
+        ({"callerid": "/listener", "topic": "/rosout"}, "no grant"),
+        ({"callerid": "/listener", "topic": "/nothing"}, "not a publisher"),
+    ):
+        sock, header = subscribe(face, fields | {"md5sum": "*", "type": "*"})
+        sock.close()
+        assert reason in header["error"]
+        refused = driver.link.wait_for(
+            lambda message, fields=fields: (
+                isinstance(message, ConnectionRefused)
+                and (message.resource, message.caller_id) == (fields["topic"], fields["callerid"])
+            )
+        )
+        assert (refused.host, refused.count) == (LOOPBACK, 1)
+
+
+def test_a_subscriber_of_another_type_is_told_so(driver: RelayDriver, ros: RosSession) -> None:
+    """As by a publisher of ROS: an error header that names both types."""
+    ros.talker("rospy", "/chatter", name="talker")
+    face = driver.faces["/talker"]
+    driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
+    fields = {"callerid": "/listener", "topic": "/chatter", "type": "std_msgs/Int32", "md5sum": "0" * 32}
+    sock, header = subscribe(face, fields)
+    sock.close()
+    assert header == {"error": "topic types do not match: [std_msgs/Int32] vs. [std_msgs/String]"}
+
+
+def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> None:
+    """A served subscriber that sends a header for another topic is cut."""
+    ros.talker("rospy", "/chatter", name="talker")
+    face = driver.faces["/talker"]
+    driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
+    sock, header = subscribe(face, {"callerid": "/listener", "topic": "/chatter", **STRING})
+    assert header["type"] == "std_msgs/String"
+    with sock:
+        sock.sendall(encode_header({"callerid": "/listener", "topic": "/rosout", "md5sum": "*", "type": "*"}))
+        driver.link.wait_for(
+            lambda message: isinstance(message, ConnectionRefused) and "one topic" in message.reason
+        )
+        driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
+
+
+def test_traffic_goes_on_without_control_and_through_its_restart(
+    driver: RelayDriver, ros: RosSession
+) -> None:
+    """Control's death interrupts nobody; the next one is told who is connected."""
+    ros.talker("roscpp", "/chatter", "--rate", "50")
+    listener = ros.listener("roscpp", "/chatter", name="listener")
+    listener.wait_for(event="received")
+    driver.link.close()
+    mark = listener.mark()
+    listener.wait_for(since=mark, event="received")
+    driver.restart_control()
+    opened = driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened))
+    assert opened.caller_id == "/listener"
+    listener.wait_for_count(50, event="received")
+    numbers = [int(event["data"].split()[1]) for event in listener.seen(event="received")]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_what_a_new_control_does_not_restate_is_cut(driver: RelayDriver, ros: RosSession) -> None:
+    """A grant that is gone after the restatement takes its connection with it; others stay."""
+    ros.talker("rospy", "/chatter")
+    out, stays = (
+        ros.listener("rospy", "/chatter", name="out"),
+        ros.listener("roscpp", "/chatter", name="stays"),
+    )
+    for listener in (out, stays):
+        listener.wait_for(event="received")
+    driver.restart_control(
+        leave_out=lambda message: isinstance(message, GrantInstalled) and message.caller_id == "/out"
+    )
+    closed = driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
+    assert "grant" in closed.reason
+    count, mark = len(out.seen(event="received")), stays.mark()
+    stays.wait_for_count(len(stays.seen(event="received")) + 5, event="received")
+    stays.wait_for(since=mark, event="received")
+    assert len(out.seen(event="received")) <= count + 1
+
+
+def test_a_revoked_grant_cuts_its_connection(driver: RelayDriver, ros: RosSession) -> None:
+    """And only its own."""
+    ros.talker("rospy", "/chatter", name="talker")
+    face = driver.faces["/talker"]
+    ros.listener("roscpp", "/chatter", name="listener").wait_for(event="received")
+    driver.link.send(GrantRevoked(face.key, "/chatter", LOOPBACK, "/listener"))
+    closed = driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
+    assert closed.reason == "its grant is revoked"
+
+
+def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSession) -> None:
+    """A publisher that was killed and started again is another incarnation; its old subscribers are cut."""
+    first = ros.talker("rospy", "/chatter", name="talker")
+    listener = ros.listener("rospy", "/chatter", name="listener")
+    listener.wait_for(event="received")
+    first.kill()
+    driver.link.wait_for(lambda message: isinstance(message, UpstreamLost))
+    ros.talker("rospy", "/chatter", "--text", "again", name="talker")
+    listener.wait_for(lambda event: str(event.get("data", "")).startswith("again"), event="received")
+
+
+def test_the_stock_tools_read_through_the_relay(driver: RelayDriver, ros: RosSession) -> None:
+    """rostopic echo and rostopic hz need no grant beyond requestTopic's."""
+    ros.talker("roscpp", "/chatter")
+    assert "hello" in ros.run("/usr/bin/rostopic", "echo", "-n", "2", "/chatter").stdout
