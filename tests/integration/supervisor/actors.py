@@ -15,6 +15,7 @@ from typing import Any
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import (
+    ApplianceStopRequested,
     Failed,
     Lifeline,
     LinkOpened,
@@ -38,7 +39,7 @@ CROWD = 2_000  # two for each node of a robot with a thousand
 
 
 def control(lifeline_fd: int, config: Path) -> None:
-    """Stand-in for control: in service as soon as its sockets are back."""
+    """Stand-in for control. SIGUSR1: it plays supervisor; SIGUSR2: it asks for the end of the appliance."""
     asyncio.run(_Control(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
@@ -142,10 +143,13 @@ class _Control(_Actor):
         self.sockets: dict[str, socket.socket] = {}
 
     def started(self) -> None:
-        pass
+        asyncio.get_running_loop().add_signal_handler(signal.SIGUSR2, self.ask_for_the_end)
 
     def misbehave(self) -> None:
         self.lifeline.send(SocketsRestored(1))
+
+    def ask_for_the_end(self) -> None:
+        self.lifeline.send(ApplianceStopRequested("shutdown by /rosnode"))
 
     def received(self, message: Message, descriptors: tuple[int, ...]) -> None:
         match message:

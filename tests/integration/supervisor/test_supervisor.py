@@ -209,6 +209,14 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.process.seen(event="process did not end") == []
 
 
+def test_control_may_end_the_appliance(start: Any) -> None:
+    """The `shutdown` call of the Master API, once granted, ends it as SIGTERM would."""
+    running = start().until_ready()
+    os.kill(running.pid("control"), signal.SIGUSR2)
+    assert running.process.wait() == 0
+    assert running.children() == []
+
+
 def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
     """What ends neither when asked nor by SIGTERM is killed; the end still comes within five seconds."""
     running = start("relay=stubborn").until_ready()
