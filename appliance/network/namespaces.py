@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 DIRECTORY = Path("/run/netns")
+_HERE = Path("/proc/thread-self/ns/net")  # of the thread that looks
 _CLONE_NEWNET = 0x40000000
 _MS_BIND, _MS_REC, _MS_SHARED, _MNT_DETACH = 0x1000, 0x4000, 0x100000, 2
 _CAP_NET_ADMIN, _CAP_SYS_ADMIN = 12, 21
@@ -44,8 +45,20 @@ class PrivilegeError(NetworkError):
 
 
 def has_privileges() -> bool:
-    """Tell whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which all of this needs."""
-    wanted = 1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN
+    """Tell whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
+    return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
+
+
+def require_network_admin(what: str) -> None:
+    """Raise PrivilegeError, naming `what` is wanted, unless this process may change its own network."""
+    if not _has_capabilities(1 << _CAP_NET_ADMIN):
+        raise PrivilegeError(
+            f"{what} needs CAP_NET_ADMIN: run it as root, give it to the container (cap_add: [NET_ADMIN]), "
+            "or choose `isolation: none`"
+        )
+
+
+def _has_capabilities(wanted: int) -> bool:
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
     return found is not None and int(found[1], 16) & wanted == wanted
@@ -112,7 +125,7 @@ class Namespace:
         libc = _libc()
         if libc.unshare(_CLONE_NEWNET) != 0:
             raise _os_failure("unshare", self.name)
-        _mount("/proc/thread-self/ns/net", self.path, _MS_BIND)
+        _mount(_HERE, self.path, _MS_BIND)
 
     def delete(self) -> None:
         """Take the name away (if it is there); the namespace itself ends with the last process in it."""
@@ -128,13 +141,14 @@ class Namespace:
 
         For short synchronous work (open a socket, start a program); never await inside the block.
         """
-        home = os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+        home = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
         try:
             self._enter()
             try:
                 yield
             finally:
-                _setns(home, "the thread's own namespace")
+                if not os.path.samestat(os.fstat(home), _HERE.stat()):
+                    _setns(home, "the thread's own namespace")
         finally:
             os.close(home)
 
@@ -208,6 +222,11 @@ class _OwnNamespace(Namespace):
 
     def exists(self) -> bool:
         return True
+
+    def _enter(self) -> None:
+        """A thread that is there already stays: a container may not use setns, not even to where it is."""
+        if not os.path.samestat(_HERE.stat(), self.path.stat()):
+            super()._enter()
 
     def create(self) -> Namespace:
         raise NetworkError("the namespace of this process exists already")

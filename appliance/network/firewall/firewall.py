@@ -14,7 +14,7 @@ from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.proof import prove
 from appliance.network.firewall.rules import FirewallSettings, Rule, appliance_rules
-from appliance.network.namespaces import Namespace, require_privileges
+from appliance.network.namespaces import Namespace, require_network_admin
 
 BackendChoice = Literal["auto", "nft", "iptables"]
 
@@ -60,7 +60,7 @@ class Firewall:
 
         Raises: PrivilegeError; FirewallError when no back end works, with the reason of each.
         """
-        require_privileges("the firewall")
+        require_network_admin("the firewall")
         rules = appliance_rules(settings)
         backend = self._backend or self._choose()
         backend.install(rules)

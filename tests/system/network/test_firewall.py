@@ -332,6 +332,49 @@ def test_auto_takes_what_the_kernel_enforces(
         Firewall(protected.namespace, "nft").install(settings(11312))
 
 
+CONFINED = """
+import sys
+from appliance.network.firewall.firewall import Firewall
+from appliance.network.firewall.rules import FirewallSettings
+from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.probe import probe_port
+firewall = Firewall(Namespace.own(), sys.argv[2])
+try:
+    port = int(sys.argv[1])
+    print(firewall.install(FirewallSettings(control_uid=61011, rosmaster_uid=61012, rosmaster_port=port)))
+    print(probe_port(Namespace.own(), port).closed, firewall.report().intact)
+except NetworkError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("backend", "capabilities", "words"),
+    [
+        ("nft", "+net_admin,+setuid,+setgid", "nft\nTrue True\n"),
+        ("iptables", "+net_admin,+net_raw,+setuid,+setgid", "iptables\nTrue True\n"),
+        ("auto", "+net_admin,+setuid,+setgid", "nft\nTrue True\n"),
+        ("auto", "+setuid", "the firewall needs CAP_NET_ADMIN"),
+    ],
+)
+def test_a_container_needs_no_more_than_it_is_given(
+    protected: Host, backend: str, capabilities: str, words: str
+) -> None:
+    """The firewall and the probe work with few capabilities; without those the error names one."""
+    need_program("setpriv", "util-linux")
+    with listening(protected) as port:
+        process = protected.popen(
+            [
+                *("setpriv", f"--bounding-set=-all,{capabilities}", f"--inh-caps=-all,{capabilities}"),
+                *(sys.executable, "-c", CONFINED, str(port), backend),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+        )
+        assert str(process.communicate(timeout=60)[0]).startswith(words)
+
+
 def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch: pytest.MonkeyPatch) -> None:
     """With no nft program and no libiptc, installing fails and says what to install."""
     monkeypatch.setenv("PATH", "/nonexistent")
