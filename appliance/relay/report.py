@@ -52,7 +52,7 @@ class Reporter:
     def opened(self, key: str, resource: str, kind: str, host: str, caller_id: str) -> int:
         """A connection is served; its number."""
         self._number += 1
-        message = ConnectionOpened(self._number, key, resource, kind, host, caller_id)
+        message = ConnectionOpened(self._number, key, resource, kind, host, caller_id[:_TEXT])
         self._open[self._number] = message
         self.send(message)
         return self._number

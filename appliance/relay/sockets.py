@@ -43,7 +43,7 @@ def begin_connect(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.inet_pton(family, host)
-    except OSError:
+    except (OSError, ValueError):
         raise OSError(errno.EINVAL, f"{host!r} is not an IP address") from None
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:

@@ -1,6 +1,7 @@
 """Services through the relay, between unmodified rospy and roscpp nodes and the stock tools."""
 
 import socket
+from functools import partial
 
 import pytest
 
@@ -23,6 +24,10 @@ def ask_header(face: Face, fields: dict[str, str]) -> dict[str, str]:
             header = parser.feed(data)
             if header is not None:
                 return header
+
+
+def _refused(message: object, resource: str) -> bool:
+    return isinstance(message, ConnectionRefused) and message.resource == resource
 
 
 @pytest.mark.parametrize("options", [(), ("--persistent",)], ids=["one-by-one", "persistent"])
@@ -98,11 +103,7 @@ def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSessio
     for service, reason in (("/mode", "no grant"), ("/other", "not a provider")):
         fields = {"callerid": "/client", "service": service, "md5sum": "*"}
         assert reason in ask_header(face, fields)["error"]
-        driver.link.wait_for(
-            lambda message, service=service: (
-                isinstance(message, ConnectionRefused) and message.resource == service
-            )
-        )
+        driver.link.wait_for(partial(_refused, resource=service))
 
 
 def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, ros: RosSession) -> None:

@@ -4,6 +4,7 @@ import resource
 import signal
 import socket
 import struct
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -42,6 +43,13 @@ def subscribe(face: Face, fields: dict[str, str]) -> tuple[socket.socket, dict[s
         header = parser.feed(data)
         if header is not None:
             return sock, header
+
+
+def _refused(message: object, resource: str, caller_id: str) -> bool:
+    return isinstance(message, ConnectionRefused) and (message.resource, message.caller_id) == (
+        resource,
+        caller_id,
+    )
 
 
 def read_frame(stream: BinaryIO) -> bytes:
@@ -155,10 +163,7 @@ def test_without_a_grant_nobody_is_served(driver: RelayDriver, ros: RosSession) 
         sock.close()
         assert reason in header["error"]
         refused = driver.link.wait_for(
-            lambda message, fields=fields: (
-                isinstance(message, ConnectionRefused)
-                and (message.resource, message.caller_id) == (fields["topic"], fields["callerid"])
-            )
+            partial(_refused, resource=fields["topic"], caller_id=fields["callerid"])
         )
         assert (refused.host, refused.count) == (LOOPBACK, 1)
 

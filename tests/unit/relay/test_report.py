@@ -1,0 +1,116 @@
+"""What control is told."""
+
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import (
+    ConnectionClosed,
+    ConnectionOpened,
+    ConnectionRefused,
+    RelayLink,
+    TopicTraffic,
+    TrafficReported,
+)
+from appliance.relay.limits import Limits
+from appliance.relay.links import Link
+from appliance.relay.loop import Loop
+from appliance.relay.report import Reporter
+
+ROW = TopicTraffic("k", "/chatter", 1, 2, 0, 1)
+
+
+class Control:
+    """The other end of a reporter's link."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.loop = Loop()
+        self.ended: list[str] = []
+        self.link = Link(self.loop, Channel(theirs, RelayLink), lambda *_: None, self.ended.append)
+        self._channel = Channel(ours, RelayLink)
+
+    def heard(self) -> list[Any]:
+        """What has come."""
+        return [message for message, _fds in self._channel.receive()]
+
+    def close(self) -> None:
+        """End both."""
+        self.link.close()
+        self._channel.close()
+        self.loop.close()
+
+
+@pytest.fixture
+def control() -> Iterator[Control]:
+    """Somebody who listens."""
+    control = Control()
+    yield control
+    control.close()
+
+
+@pytest.fixture
+def reporter(control: Control) -> Reporter:
+    """A reporter that tells at most three refusals one by one."""
+    reporter = Reporter(replace(Limits(), refusals=3))
+    reporter.attach(control.link)
+    return reporter
+
+
+def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: Reporter) -> None:
+    """The first at once, the rest with the next tick."""
+    for _ in range(5):
+        reporter.refused("k", "/chatter", "10.0.0.2", "/x", "no grant")
+    assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
+    reporter.tick([])
+    assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 4)]
+    reporter.tick([])
+    assert control.heard() == []
+
+
+def test_many_different_refusals_are_bounded(control: Control, reporter: Reporter) -> None:
+    """Beyond the bound they are counted together, and none is lost from the count."""
+    for number in range(1000):
+        reporter.refused("k", "/chatter", "10.0.0.2", f"/x{number}", "no grant")
+    reporter.tick([])
+    heard = control.heard()
+    assert len(heard) == 4
+    assert sum(message.count for message in heard) == 1000
+
+
+def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:
+    """What a stranger writes into a header does not fill the link."""
+    reporter.refused("k", "/" + "t" * 60_000, "10.0.0.2", "/" + "c" * 60_000, "r" * 60_000)
+    (message,) = control.heard()
+    assert max(len(message.resource), len(message.caller_id), len(message.reason)) <= 300
+
+
+def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Reporter) -> None:
+    """With the numbers it was opened with."""
+    first = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
+    second = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/b")
+    reporter.closed(first, "")
+    control.heard()
+    reporter.attach(None)
+    third = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/c")
+    reporter.attach(control.link)
+    reporter.repeat_connections()
+    heard = control.heard()
+    assert [(type(message), message.number) for message in heard] == [
+        (ConnectionOpened, second),
+        (ConnectionOpened, third),
+    ]
+    reporter.closed(second, "gone")
+    reporter.closed(second, "again")
+    assert control.heard() == [ConnectionClosed(second, "gone")]
+
+
+def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -> None:
+    """And none when nothing has moved."""
+    reporter.tick([ROW, ROW])
+    reporter.tick([])
+    assert control.heard() == [TrafficReported([ROW, ROW])]
