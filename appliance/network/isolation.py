@@ -18,7 +18,7 @@ Invariants:
 3. Whatever is changed is recorded first, so that `down`, or `up` after a crash, puts it back. Nothing
    without a record is taken for ours: a namespace or interface of the same name is an error, not a
    leftover.
-4. One appliance at a time: a lock that the kernel releases with the process says whether a record is a
+4. One appliance on a host: a lock that the kernel releases with the process says whether a record is a
    leftover.
 """
 
@@ -58,7 +58,7 @@ class IsolationSettings:
     name: str = "rosrv"
     subnet: str | None = None  # at least two addresses, such as 10.111.0.0/30
     subnet6: str | None = None
-    directory: Path = Path("/run/rosrv")  # of the record and the lock
+    directory: Path = Path("/run/rosrv")  # of the record and the lock, the same for all appliances of a host
 
     def __post_init__(self) -> None:
         if not self.ports:
@@ -148,6 +148,11 @@ class Isolation:
             for chain in self._backend.foreign_forward_drops()
         )
 
+    def put_rules_back(self) -> None:
+        """Install the rules on the host again, when somebody took them away."""
+        if self._rules:
+            self._backend.install(self._rules)
+
     def rules(self) -> tuple[RuleStatus, ...]:
         """Return the rules on the host with their counters."""
         return statuses(self._rules, self._backend.counters())
@@ -201,19 +206,29 @@ class Isolation:
         if self._lock is not None:
             raise NetworkError(f"isolation {self.settings.name} is up already")
         self.settings.directory.mkdir(mode=0o755, parents=True, exist_ok=True)
-        lock = os.open(self._record.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        lock = os.open(
+            self.settings.directory / "isolation.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
+        )
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(lock)
             raise NetworkError(
-                f"another appliance is running in the namespace {self.settings.name}: stop it first"
+                "another appliance with isolation netns is running on this host "
+                f"({self._recorded_name()}): stop it first"
             ) from None
         self._lock = lock
 
     @property
     def _record(self) -> Path:
-        return self.settings.directory / f"isolation-{self.settings.name}.json"
+        return self.settings.directory / "isolation.json"
+
+    def _recorded_name(self) -> str:
+        """Return the namespace of the appliance that is running, for a message."""
+        try:
+            return f"namespace {json.loads(self._record.read_text(encoding='utf-8'))['namespace']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            return "still starting"
 
     def _write_record(self) -> None:
         """Write what will have to be put back, before anything is changed."""
@@ -230,21 +245,19 @@ class Isolation:
         """Undo what the record says, if there is one."""
         try:
             record = json.loads(self._record.read_text(encoding="utf-8"))
-            link, settings = (
-                str(record["link"]),
-                {str(key): str(value) for key, value in record["settings"].items()},
-            )
+            leftover, link = Namespace(record["namespace"]), str(record["link"])
+            settings = {str(key): str(value) for key, value in record["settings"].items()}
         except FileNotFoundError:
             return
-        except (ValueError, KeyError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise NetworkError(
                 f"{self._record} cannot be read ({error}): look at it and delete it"
             ) from error
         self._forwarding.restore(settings)  # before the chain that keeps the host from being a router goes
         self._backend.remove()
         links.delete_link(self._host, link)
-        end_processes(self.namespace.processes())
-        self.namespace.delete()
+        end_processes(leftover.processes())
+        leftover.delete()
         with contextlib.suppress(FileNotFoundError):
             self._record.unlink()
 

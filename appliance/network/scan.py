@@ -8,6 +8,7 @@ carries nothing.
 import contextlib
 import errno
 import os
+import resource
 import selectors
 import socket
 import struct
@@ -17,7 +18,8 @@ from dataclasses import dataclass
 
 from appliance.network.namespaces import NetworkError
 
-AT_ONCE = 256  # connections
+AT_ONCE = 256  # connections, fewer where the process may not open as many files
+_OTHER_FILES = 32
 _REFUSED = (errno.ECONNREFUSED, errno.ECONNRESET)
 _SILENT = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EACCES, errno.EPERM)
 
@@ -90,8 +92,9 @@ def _fill(
     seconds: float,
 ) -> bool:
     """Start connections until AT_ONCE are under way; tell whether there are any."""
+    at_once = max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES))
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    while len(pending) < AT_ONCE and (port := next(ports, None)) is not None:
+    while len(pending) < at_once and (port := next(ports, None)) is not None:
         client = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         pending[client] = (port, time.monotonic() + seconds)

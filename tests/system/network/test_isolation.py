@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -115,6 +116,10 @@ def test_hosts_reach_the_appliance_with_their_own_address(bare: Host, node: Host
         with serving(isolation.namespace, LAST) as last:
             assert source_seen(last, node, bare.address, LAST) == node.address
         assert all(rule.in_force for rule in isolation.rules())
+        assert bare.popen(["nft", "flush", "ruleset"]).wait(timeout=20) == 0
+        assert not any(rule.in_force for rule in isolation.rules())
+        isolation.put_rules_back()
+        assert source_seen(server, node, bare.address, MASTER) == node.address
 
 
 def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> None:
@@ -231,8 +236,8 @@ def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp
     assert crashed.stdout is not None
     with crashed.stdout:
         orphan = int(crashed.stdout.readline())
-        with pytest.raises(NetworkError, match="another appliance is running"):
-            Isolation(bare.namespace, wanted).up()
+        with pytest.raises(NetworkError, match=f"another appliance .*namespace {wanted.name}"):
+            Isolation(bare.namespace, replace(wanted, name="second")).up()
         crashed.send_signal(signal.SIGKILL)
         crashed.wait(timeout=20)
     during = state(bare)
@@ -298,7 +303,7 @@ def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path
 def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:
     """A damaged record is an error that says which file; nothing is guessed."""
     wanted = settings(tmp_path)
-    record = tmp_path / f"isolation-{wanted.name}.json"
+    record = tmp_path / "isolation.json"
     record.write_text(json.dumps({"link": "eth0"}), encoding="utf-8")
     with pytest.raises(NetworkError, match=record.name):
         Isolation(bare.namespace, wanted).up()

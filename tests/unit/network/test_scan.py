@@ -1,6 +1,8 @@
 """Tests of the port scan on loopback."""
 
+import resource
 import socket
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +17,19 @@ def test_open_and_refused_ports_are_told_apart() -> None:
         listening, bound = server.getsockname()[1], closed.getsockname()[1]
         result = scan("127.0.0.1", [listening, bound], seconds=10)
     assert (result.open, result.refused, result.silent, result.answered) == ((listening,), 1, 0, True)
+
+
+def test_few_files_make_a_scan_slower_and_no_error() -> None:
+    """A process that may open few files scans with fewer connections at once."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    open_now = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+    with socket.create_server(("127.0.0.1", 0), backlog=500) as server:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (open_now + 40, hard))
+        try:
+            result = scan("127.0.0.1", [server.getsockname()[1]] * 300, seconds=10)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert len(result.open) == 300
 
 
 def test_a_scan_of_no_ports_ends() -> None:
