@@ -86,6 +86,8 @@ default = 10.0.0.1
 /arm/* = 10.0.0.5
 /arm/joint = 10.0.0.6
 /*/state = 10.0.0.7
+/hand*/** = 10.0.0.8
+/hand*/x/* = 10.0.0.9
 """
 
 
@@ -101,12 +103,15 @@ default = 10.0.0.1
         ("/arm/joint", "/arm/joint"),
         ("/leg/state", "/*/state"),
         ("/arm/state", "/arm/*"),
+        ("/hand2/x/y", "/hand*/x/*"),
+        ("/hand2/x", "/hand*/**"),
+        ("/hand2", "/hand*/**"),
     ],
 )
 def test_most_specific_key_decides_alone(name: str, key: str) -> None:
     """Exact beats pattern, a longer literal beginning a shorter, `*` beats `**`; the others are mute."""
     policy = compiled(PATTERNS)
-    granted = [n for n in range(1, 8) if ask(policy, f"10.0.0.{n}", "publish", name).allowed]
+    granted = [n for n in range(1, 10) if ask(policy, f"10.0.0.{n}", "publish", name).allowed]
     decision = ask(policy, "10.9.9.9", "publish", name)
     assert decision.rule is not None
     assert decision.rule.key == key
@@ -254,6 +259,14 @@ def test_call_on_a_namespace_needs_the_right_on_everything_in_it() -> None:
     assert ask_parameter(policy, "10.0.0.1", "/").rule is not None
 
 
+def test_subtree_key_counts_against_the_exact_one() -> None:
+    """With `write /a` for two hosts and `write /a/**` for one, the other may not touch /a as a whole."""
+    policy = compiled("[Parameters]\nwrite /a = 10.0.0.1 10.0.0.2\nwrite /a/** = 10.0.0.1\n")
+    assert ask(policy, "10.0.0.2", "write", "/a").allowed
+    assert not ask_parameter(policy, "10.0.0.2", "/a").allowed
+    assert ask_parameter(policy, "10.0.0.1", "/a").allowed
+
+
 def test_exact_key_says_nothing_of_what_is_below() -> None:
     """`write /leg` grants the parameter /leg; of a namespace /leg, the keys are decided by default."""
     policy = compiled(PARAMETERS.replace("write /*/secret = 10.0.0.1\n", ""))
@@ -335,5 +348,8 @@ def test_memory_does_not_grow_with_requests() -> None:
     for number in range(20_000):
         ask(policy, "10.0.0.1", "publish", f"/topic{number}")
     ask(policy, "10.0.0.1", "publish", "/" + "x" * 900)
+    for number in range(5_000):
+        ask(policy, f"10.1.{number >> 8}.{number & 255}", "publish", "/topic")
     assert len(policy._kept) <= 8192
+    assert len(policy._hosts._kept) <= 1024
     assert max(len(key[-1]) for key in policy._kept) <= 256
