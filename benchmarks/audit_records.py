@@ -1,7 +1,7 @@
 """How fast the audit log takes, proves and finds records: python benchmarks/audit_records.py [RECORDS]
 
 Measured: the time `record()` costs its caller; records a second in both kinds of durability, with an idle
-event loop and next to one that is busy all the time; how long a busy loop is held up; searches over RECORDS (by
+event loop and next to a thread that is always busy; how long a loop is held up; searches over RECORDS (by
 default a million) records; verification. Everything on one directory (TMPDIR) and its disk.
 """
 

@@ -1,0 +1,75 @@
+"""Tests of what leaves the log: JSON and text for people."""
+
+import json
+
+import pytest
+
+from appliance.audit.output import Entry, as_json, as_object, printable, rfc3339
+from appliance.audit.record import Record, RuleReference, Severity
+
+_RECORD = Record(
+    id="0" * 20, time=1_772_366_400_000_000_007, event="decision", severity=Severity.WARNING, decision="deny",
+    host="10.0.0.1", caller_id="/n", category="publish", resource="/\x1b]0;x\x07é", revision=3,
+    rule=RuleReference("Publishers", "/**", "a.ini", 4), reason="no", duration_us=5,
+    detail={"call": "registerPublisher"},
+)  # fmt: skip
+
+
+def test_object_is_the_documented_one() -> None:
+    """A record's JSON has exactly the documented fields with the documented values."""
+    assert as_object(Entry(9, _RECORD)) == {
+        "schema": 1, "id": "0" * 20, "time": "2026-03-01T12:00:00.000000007Z", "sequence": 9,
+        "event": "decision",
+        "severity": "warning", "decision": "deny", "host": "10.0.0.1", "caller_id": "/n",
+        "category": "publish",
+        "resource": "/\x1b]0;x\x07é",
+        "rule": {"section": "Publishers", "key": "/**", "file": "a.ini", "line": 4},
+        "revision": 3, "reason": "no", "duration_us": 5, "detail": {"call": "registerPublisher"},
+    }  # fmt: skip
+
+
+def test_no_decision_no_rule() -> None:
+    """Where nothing was decided `decision` is absent and `rule` is null."""
+    shown = as_object(Entry(1, Record(id="0" * 20, time=0, event="appliance started")))
+    assert "decision" not in shown
+    assert shown["rule"] is None
+
+
+def test_json_is_one_line_of_ascii() -> None:
+    """NDJSON has no byte that a terminal acts on, and gives the stranger's text back unchanged."""
+    text = as_json(Entry(1, _RECORD))
+    assert text.isascii()
+    assert text.isprintable()
+    assert json.loads(text)["resource"] == _RECORD.resource
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("/plain/name_1", "/plain/name_1"),
+        ("żółw 机器人", "żółw 机器人"),
+        ("\x1b[31mred\x1b[0m", "\\x1b[31mred\\x1b[0m"),
+        ("a\r\nb\tc\0", "a\\r\\nb\\tc\\x00"),
+        ("\u202eabc\u2066", "\\u202eabc\\u2066"),
+        ("\x9b2J", "\\x9b2J"),
+        ("\udcff", "\\udcff"),
+        ("\\x1b", "\\\\x1b"),
+        ("\u2028\ufeff\U000e0041", "\\u2028\\ufeff\\U000e0041"),
+    ],
+)
+def test_printable(text: str, shown: str) -> None:
+    """Control characters, escape sequences and invisible or bidirectional marks are escaped, letters are not."""
+    assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    ("time", "text"),
+    [
+        (0, "1970-01-01T00:00:00.000000000Z"),
+        (-1, "1969-12-31T23:59:59.999999999Z"),
+        (2**63 - 1, "2262-04-11T23:47:16.854775807Z"),
+    ],
+)
+def test_time(time: int, text: str) -> None:
+    """Times are UTC with nanoseconds over the whole range that can be stored."""
+    assert rfc3339(time) == text

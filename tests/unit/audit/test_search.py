@@ -1,0 +1,195 @@
+"""Tests of finding records, while the log is written and when it is not."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.query import Filter, FilterError
+from appliance.audit.record import RuleReference, Severity
+from appliance.audit.search import Follower, export, search, show
+from tests.support.audit import decision, settle
+
+_SECOND = 1_000_000_000
+_BEGIN = 1_700_000_000 * _SECOND
+
+
+@pytest.fixture
+def log(make_log):
+    """An open log: a hundred ordinary decisions a second apart, and some that differ."""
+    log = make_log(checkpoint_seconds=3600)
+    for number in range(100):
+        log.record(decision(log, number, time=_BEGIN + number * _SECOND))
+    other = RuleReference("Clients", "/reset/**", "robot.ini", 30)
+    odd = [
+        {"decision": "deny", "host": "10.66.0.1", "caller_id": "/evil", "resource": "/arm/joint_1"},
+        {"decision": "would deny", "resource": "/arm/joint_2", "rule": other, "category": "call"},
+        {
+            "event": "node lost",
+            "decision": None,
+            "severity": Severity.ALARM,
+            "reason": "No answer from Żółw 100%",
+        },
+        {"detail": {"type": "std_msgs/Float64", "quote": 'say "hi"'}, "reason": "a_b and a%b", "revision": 9},
+    ]
+    for number, fields in enumerate(odd):
+        log.record(decision(log, time=_BEGIN + (1000 + number) * _SECOND, **fields))
+    assert settle(log) is None
+    return log
+
+
+def sequences(path: Path, wanted: Filter, **arguments: object) -> list[int]:
+    """Which records are found, by their sequences less two (the log's own first record is 1)."""
+    return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        (Filter(decision=("deny",)), [100]),
+        (Filter(decision=("deny", "would deny")), [101, 100]),
+        (Filter(host="10.66.0.1"), [100]),
+        (Filter(host="10.66.*"), [100]),
+        (Filter(caller_id="/evil"), [100]),
+        (Filter(resource="/arm/*"), [101, 100]),
+        (Filter(resource="/arm/joint_?"), [101, 100]),
+        (Filter(resource="/arm/joint_[13]"), [100]),
+        (Filter(resource="/arm"), []),
+        (Filter(category="call"), [101]),
+        (Filter(event="node *"), [102]),
+        (Filter(severity=Severity.WARNING), [102]),
+        (Filter(rule="Clients"), [101]),
+        (Filter(rule="/reset/**"), [101]),
+        (Filter(since=_BEGIN + 1001 * _SECOND, until=_BEGIN + 1003 * _SECOND), [102, 101]),
+        (Filter(until=_BEGIN + 2 * _SECOND), [1, 0]),
+        (Filter(text="float64"), [103]),
+        (Filter(text="Żółw"), [102]),
+        (Filter(text='say \\"hi'), [103]),
+        (Filter(text="a_b"), [103]),
+        (Filter(text="0%"), [102]),
+        (Filter(text="a%b"), [103]),
+        (Filter(text="nowhere"), []),
+        (Filter(text="arm", decision=("deny",)), [100]),
+        (Filter(text="joint", resource="/arm/*", decision=("would deny",)), [101]),
+        (Filter(decision=("deny",), category="call"), []),
+        (Filter(decision=("allow",), resource="/cmd_7", host="10.0.0.2"), [87, 67, 47, 27, 7]),
+    ],
+    ids=str,
+)
+def test_filters(log, path: Path, wanted: Filter, expected: list[int]) -> None:
+    """Each filter finds exactly what it says, newest first, also combined, in a running and a closed log."""
+    assert sequences(path, wanted) == expected
+    log.close()
+    assert sequences(path, wanted) == expected
+
+
+def test_text_is_found_at_once_and_after_indexing(log, path: Path) -> None:
+    """A text is found as soon as its record is on disk, whether it is in the full-text index yet or not."""
+    for number in range(600):
+        log.record(decision(log, number, reason=f"needle {number}"))
+        if number % 100 == 0:
+            assert settle(log) is None
+            assert len(search(path, Filter(text=f"needle {number}")).entries) >= 1
+    assert settle(log) is None
+    assert len(search(path, Filter(text="needle"), limit=1000).entries) == 600
+
+
+@pytest.mark.parametrize("newest_first", [True, False])
+@pytest.mark.parametrize("wanted", [Filter(), Filter(resource="/cmd_*"), Filter(text="lets it")])
+def test_paging(log, path: Path, wanted: Filter, newest_first: bool) -> None:
+    """Pages in a row give every record once, in order, though records are added meanwhile."""
+    everything = [entry.record.id for entry in search(path, wanted, limit=1000).entries]
+    found: list[str] = []
+    cursor = None
+    for _page in itertools.count():
+        page = search(path, wanted, cursor, 7, newest_first=newest_first)
+        found += [entry.record.id for entry in page.entries]
+        cursor = page.cursor
+        if cursor is None:
+            break
+        if newest_first:
+            log.record(decision(log))
+            assert settle(log) is None
+    assert found == (everything if newest_first else everything[::-1])
+
+
+def test_export_is_everything_oldest_first(log, path: Path) -> None:
+    """The export has every record once, oldest first, whatever the size of its pages."""
+    entries = list(export(path, Filter(), page=9))
+    assert [entry.sequence for entry in entries] == list(range(1, len(entries) + 1))
+    assert len(entries) >= 105
+
+
+def test_show_with_neighbours(log, path: Path) -> None:
+    """One record by its id or its sequence, with what the same host or caller did before and after."""
+    entry = search(path, Filter(resource="/cmd_7", host="10.0.0.2")).entries[2]
+    shown = show(path, entry.record.id, neighbours=2)
+    assert shown is not None
+    assert shown == show(path, str(entry.sequence), neighbours=2)
+    assert shown.entry == entry
+    assert [one.sequence - entry.sequence for one in shown.before] == [-10, -5]
+    assert [one.sequence - entry.sequence for one in shown.after] == [5, 10]
+    for unknown in ("0" * 20, "99999999", "", "x' OR 1=1", "\0", "9" * 50, "½"):
+        assert show(path, unknown) is None
+
+
+def test_follow(log, path: Path) -> None:
+    """A follower gives what is recorded after it began, once, in order, and only what is asked for."""
+    follower = Follower(path, Filter(decision=("deny",)))
+    assert follower.poll() == []
+    sent = [decision(log, number, decision="deny", resource=f"/n{number}") for number in range(25)]
+    for one in sent:
+        log.record(one)
+        log.record(decision(log))
+    assert settle(log) is None
+    got = [entry.record for _poll in range(10) for entry in follower.poll(limit=10)]
+    assert got == sent
+    assert follower.poll() == []
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        (Filter(resource="x" * 300), "resource: longer than 256"),
+        (Filter(resource="*a" * 20), r"resource: more than 8 times '\*'"),
+        (Filter(host="\udc80"), "host: not valid Unicode"),
+        (Filter(text="y" * 300), "text: longer"),
+    ],
+)
+def test_filters_that_cannot_be_used(log, path: Path, wanted: Filter, message: str) -> None:
+    """A filter past its limits is an error that says which part and why."""
+    with pytest.raises(FilterError, match=message):
+        search(path, wanted)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"limit": 0}, {"limit": 10_001}, {"cursor": "x"}, {"cursor": "-1"}, {"cursor": "9" * 30}]
+)
+def test_page_that_cannot_be_asked_for(log, path: Path, arguments: dict[str, object]) -> None:
+    """A wrong limit or cursor is an error."""
+    with pytest.raises(FilterError):
+        search(path, Filter(), **arguments)
+
+
+def test_no_log_and_no_directory(tmp_path: Path) -> None:
+    """Searching where there is no log says what is missing and which option gives the place."""
+    with pytest.raises(LogUnreadableError, match=r"no audit log yet.*--state"):
+        search(tmp_path / "audit.db", Filter())
+    with pytest.raises(LogUnreadableError, match=r"no such directory.*--state"):
+        search(tmp_path / "none" / "audit.db", Filter())
+
+
+def test_damaged_log(path: Path) -> None:
+    """Searching a file that is no log is an error that names it."""
+    path.write_bytes(b"rubbish" * 1000)
+    with pytest.raises(LogUnreadableError, match=r"audit\.db"):
+        search(path, Filter())
+
+
+def test_reading_leaves_no_trace(log, path: Path) -> None:
+    """Searching a stopped log does not change its file."""
+    log.close()
+    before = path.read_bytes()
+    search(path, Filter(text="needle"))
+    assert path.read_bytes() == before

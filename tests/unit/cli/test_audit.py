@@ -1,0 +1,233 @@
+"""Tests of `rosrv audit` as a user runs it: a command with output and an exit status."""
+
+import contextlib
+import json
+import os
+import pty
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from tests.support.audit import decision, settle
+
+_EVIL = "/evil\x1b[31m\u202e\r\n[bold]x[/bold]"
+_LIMIT_SECONDS = 60
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """The state directory of a stopped appliance with a short log."""
+    (tmp_path / "control").mkdir()
+    log = AuditLog(tmp_path / "control" / "audit.db")
+    for number in range(20):
+        log.record(decision(log, number))
+    log.record(
+        decision(
+            log, decision="deny", caller_id=_EVIL, host="10.66.0.1", resource="/arm", reason="no rule lets it"
+        )
+    )
+    log.close()
+    return tmp_path
+
+
+def rosrv(*arguments: str, state: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `rosrv audit` with its output in a pipe."""
+    environment = {name: value for name, value in os.environ.items() if name != "ROSRV_STATE"}
+    if state is not None:
+        environment["ROSRV_STATE"] = str(state)
+    return subprocess.run(
+        [sys.executable, "-m", "appliance.cli.main", "audit", *arguments],
+        capture_output=True, text=True, env=environment, timeout=_LIMIT_SECONDS, check=False,
+    )  # fmt: skip
+
+
+def lines(done: subprocess.CompletedProcess[str]) -> list[dict[str, object]]:
+    """The objects of NDJSON output."""
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_search_json(state: Path) -> None:
+    """`search --json` prints the records that match as NDJSON, newest first."""
+    found = lines(
+        rosrv(
+            "search",
+            "--state",
+            str(state),
+            "--topic",
+            "/cmd_*",
+            "--allow",
+            "--since",
+            "1h",
+            "--limit",
+            "5",
+            "--json",
+        )
+    )
+    assert [one["resource"] for one in found] == ["/cmd_19", "/cmd_18", "/cmd_17", "/cmd_16", "/cmd_15"]
+    assert found[0]["rule"] == {"section": "Publishers", "key": "/cmd_*", "file": "robot.ini", "line": 12}
+    (denied,) = lines(
+        rosrv(
+            "search",
+            "--deny",
+            "--host",
+            "10.66.*",
+            "--caller",
+            "/evil*",
+            "--text",
+            "NO RULE",
+            "--json",
+            state=state,
+        )
+    )
+    assert denied["caller_id"] == _EVIL
+
+
+def test_search_in_a_pipe_is_plain_lines(state: Path) -> None:
+    """In a pipe each record is one line without escape codes, strangers' text escaped."""
+    done = rosrv("search", "--deny", state=state)
+    (line,) = done.stdout.splitlines()
+    assert "DENY" in line
+    assert "10.66.0.1 /evil\\x1b[31m\\u202e\\r\\n[bold]x[/bold] publish /arm: no rule lets it" in line
+    assert "[Publishers] /cmd_* robot.ini:12" in line
+    assert line.isprintable()
+
+
+def test_search_on_a_terminal_is_a_table(state: Path) -> None:
+    """On a terminal there is a table, and nothing of a stranger's text is interpreted."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", "--deny", "--state", str(state)]
+    environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
+    with subprocess.Popen(command, stdout=theirs, stderr=theirs, env=environment) as process:
+        os.close(theirs)
+        shown = b""
+        with contextlib.suppress(OSError):  # the terminal is gone when the command is
+            while part := os.read(ours, 65_536):
+                shown += part
+        assert process.wait(_LIMIT_SECONDS) == 0
+    os.close(ours)
+    assert b"decision" in shown
+    assert b"/evil\\x1b[31m\\u202e\\r\\n[bold]x[/bold]" in shown
+    assert b"\x1b[31mx" not in shown
+    assert "\u202e".encode() not in shown
+
+
+def test_show(state: Path) -> None:
+    """`show` prints one record in full with its neighbours, as text and as JSON."""
+    (denied,) = lines(rosrv("search", "--deny", "--json", state=state))
+    shown = json.loads(rosrv("show", str(denied["id"]), "--json", state=state).stdout)
+    assert {name: value for name, value in shown.items() if name != "neighbours"} == denied
+    text = rosrv("show", str(denied["sequence"]), state=state).stdout
+    assert "reason" in text
+    assert "no rule lets it" in text
+    missing = rosrv("show", "f" * 20, state=state)
+    assert missing.returncode == 1
+    assert "no record with the id" in missing.stderr
+
+
+def test_export(state: Path, tmp_path: Path) -> None:
+    """`export` writes all records as NDJSON, oldest first, and never over a file that is there."""
+    exported = lines(rosrv("export", state=state))
+    assert [one["sequence"] for one in exported] == list(range(1, len(exported) + 1))
+    target = tmp_path / "out.ndjson"
+    assert rosrv("export", "--output", str(target), state=state).returncode == 0
+    assert [json.loads(line) for line in target.read_text().splitlines()] == exported
+    again = rosrv("export", "--output", str(target), state=state)
+    assert again.returncode == 2
+    assert str(target) in again.stderr
+
+
+def test_verify(state: Path) -> None:
+    """`verify` exits with 0 and says so if the log is whole; with 1 and the record if it is not."""
+    whole = rosrv("verify", state=state)
+    assert whole.returncode == 0
+    assert "complete and unchanged" in whole.stdout
+    with closing(sqlite3.connect(state / "control" / "audit.db")) as attacker:
+        attacker.execute("UPDATE record SET decision = 'allow' WHERE decision = 'deny'")
+        attacker.execute("DELETE FROM record WHERE sequence = 5")
+        attacker.commit()
+    broken = rosrv("verify", state=state)
+    assert broken.returncode == 1
+    assert "MISSING: record 5:" in broken.stdout
+    assert "CHANGED: record 22:" in broken.stdout
+    found = json.loads(rosrv("verify", "--json", state=state).stdout)
+    assert found["ok"] is False
+    assert {(one["kind"], one["first"]) for one in found["findings"]} == {("missing", 5), ("changed", 22)}
+
+
+@pytest.mark.parametrize("verb", [("search",), ("tail",), ("show", "1"), ("verify",), ("export",)])
+def test_no_log(tmp_path: Path, verb: tuple[str, ...]) -> None:
+    """Without a log every verb says what is missing and which option gives the place, and exits with 2."""
+    for place in (tmp_path, tmp_path / "nowhere"):
+        done = rosrv(*verb, "--state", str(place))
+        assert done.returncode == 2
+        assert str(place) in done.stderr
+        assert "--state" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--since", "yesterday"),
+        ("--topic", "*" * 20),
+        ("--cursor", "x"),
+        ("--limit", "0"),
+        ("--severity", "bad"),
+    ],
+)
+def test_wrong_arguments(state: Path, arguments: tuple[str, ...]) -> None:
+    """A wrong argument is an error in words with exit status 2."""
+    done = rosrv("search", *arguments, state=state)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert done.stderr
+
+
+def test_verify_with_a_wrong_key_file(state: Path, tmp_path: Path) -> None:
+    """A key file that is no key is an error with its name, not a verdict on the log."""
+    (tmp_path / "key.pem").write_text("rubbish")
+    done = rosrv("verify", "--key", str(tmp_path / "key.pem"), state=state)
+    assert done.returncode == 2
+    assert "key.pem" in done.stderr
+
+
+def test_tail_follows(state: Path) -> None:
+    """`tail` shows the last records, then those that are recorded, and ends quietly when interrupted."""
+    command = [sys.executable, "-m", "appliance.cli.main", "audit", "tail", "-n", "1", "--deny", "--json"]
+    environment = os.environ | {"ROSRV_STATE": str(state)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert json.loads(process.stdout.readline())["resource"] == "/arm"
+        log = AuditLog(state / "control" / "audit.db")
+        log.record(decision(log, decision="allow"))
+        log.record(decision(log, decision="deny", resource="/new"))
+        assert settle(log) is None
+        assert json.loads(process.stdout.readline())["resource"] == "/new"
+        log.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(_LIMIT_SECONDS) == 0
+        assert process.stderr.read() == ""
+
+
+def test_reader_that_stops_early(state: Path) -> None:
+    """A reader that has enough (head) is no error."""
+    command = f"{sys.executable} -m appliance.cli.main audit export --state {state} | head -1"
+    done = subprocess.run(
+        ["/bin/bash", "-c", f"set -o pipefail; {command}"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1

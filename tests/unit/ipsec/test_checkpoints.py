@@ -1,0 +1,87 @@
+"""Tests of what the signer remembers: only one past can be signed."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from appliance.ipsec.checkpoints import MOST_LOGS, CheckpointRefusedError, SignedCheckpoints
+
+_NONE = "0" * 64
+
+
+def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: str = "b" * 64) -> bytes:
+    """The text of a checkpoint."""
+    return (
+        f"rosrv audit checkpoint 1\nlog {log}\nnumber {number}\nsequence {number * 10}\n"
+        f"hash {digest}\ntime 1\nprevious {previous}\n"
+    ).encode()
+
+
+def digest(text: bytes) -> str:
+    """What the next checkpoint carries as `previous`."""
+    return hashlib.sha256(text).hexdigest()
+
+
+def test_each_follows_the_one_before(tmp_path: Path) -> None:
+    """Checkpoints in order are signed, also by a signer that was started anew in between."""
+    previous = _NONE
+    for number in range(1, 10):
+        text = checkpoint(number, previous)
+        SignedCheckpoints(tmp_path).approve(text)
+        previous = digest(text)
+
+
+def test_asked_again(tmp_path: Path) -> None:
+    """A checkpoint whose signature was lost on the way is signed again, if it is the same."""
+    first = checkpoint(1)
+    second = checkpoint(2, digest(first))
+    signed = SignedCheckpoints(tmp_path)
+    for text in (first, second, first, second):
+        signed.approve(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (checkpoint(2, "c" * 64), "hash of the one signed before"),
+        (checkpoint(1, digest="d" * 64), "another checkpoint 1"),
+        (checkpoint(3), "does not follow number 1"),
+        (checkpoint(0), "does not follow"),
+        (b"", "not an audit checkpoint"),
+        (b"rosrv audit checkpoint 1\n", "not an audit checkpoint"),
+        (checkpoint(2) + b"x", "not an audit checkpoint"),
+        (checkpoint(2, log="../../../../etc/passwd"), "not an audit checkpoint"),
+        (b"\0" * 100_000, "not an audit checkpoint"),
+    ],
+)
+def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
+    """A second past, a gap, and what is no checkpoint are refused with the reason, and change nothing."""
+    signed = SignedCheckpoints(tmp_path)
+    signed.approve(checkpoint(1))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(CheckpointRefusedError, match=reason):
+        signed.approve(text)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_logs_are_apart_and_bounded(tmp_path: Path) -> None:
+    """Each log has its own past; control cannot fill the signer's disk with invented logs."""
+    signed = SignedCheckpoints(tmp_path)
+    for number in range(MOST_LOGS):
+        signed.approve(checkpoint(1, log=f"{number:032x}"))
+    with pytest.raises(CheckpointRefusedError, match=r"remove \.signed files"):
+        signed.approve(checkpoint(1, log="f" * 32))
+
+
+def test_cut_by_a_crash(tmp_path: Path) -> None:
+    """A hash that a crash cut short was not approved; the checkpoint can be approved again."""
+    first = checkpoint(1)
+    second = checkpoint(2, digest(first))
+    signed = SignedCheckpoints(tmp_path)
+    signed.approve(first)
+    signed.approve(second)
+    (memory,) = tmp_path.glob("*.signed")
+    memory.write_bytes(memory.read_bytes()[:-5])
+    signed.approve(second)
+    assert len(memory.read_bytes()) == 8 + 2 * 32

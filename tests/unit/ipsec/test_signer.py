@@ -1,0 +1,213 @@
+"""Tests of the signer as a process of its own, spoken to over its lifeline and its link."""
+
+import contextlib
+import os
+import select
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from appliance.audit.checkpoints import read_remembered
+from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.search import search
+from appliance.audit.signatures import read_public_key
+from appliance.audit.verify import verify
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import (
+    Failed,
+    Lifeline,
+    LinkOpened,
+    Ping,
+    Pong,
+    Ready,
+    SignatureMade,
+    SignatureRefused,
+    SignatureWanted,
+    SignerLink,
+    Stop,
+)
+from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE
+from tests.support.audit import decision, settle
+
+_LIMIT_SECONDS = 30
+_TEXT = (
+    f"rosrv audit checkpoint 1\nlog {'a' * 32}\nnumber 1\nsequence 1\nhash {'b' * 64}\ntime 1\nprevious {'0' * 64}\n"
+).encode()
+
+
+class SignerProcess:
+    """A running signer; `say` and `hear` are the supervisor's side of the lifeline."""
+
+    def __init__(self, directory: Path) -> None:
+        ours, theirs = socket.socketpair()
+        command = (
+            "import sys; from pathlib import Path; from appliance.ipsec.signer import main\n"
+            "main(int(sys.argv[1]), Path(sys.argv[2]))"
+        )
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", command, str(theirs.fileno()), str(directory)], pass_fds=[theirs.fileno()]
+        )
+        theirs.close()
+        self.lifeline = Channel(ours, Lifeline)
+        self.links: list[Channel] = []
+
+    def open_link(self) -> Channel:
+        """Give the signer a link to control; control's end of it."""
+        ours, theirs = socket.socketpair()
+        self.lifeline.send(LinkOpened(role="control", index=0), (theirs.fileno(),))
+        theirs.close()
+        self.links.append(Channel(ours, SignerLink))
+        return self.links[-1]
+
+    def end(self) -> int:
+        """Stop it; its exit status."""
+        for link in self.links:
+            link.close()
+        with contextlib.suppress(ChannelClosedError):
+            self.lifeline.send(Stop())
+        self.lifeline.close()
+        return self.process.wait(_LIMIT_SECONDS)
+
+
+def hear(channel: Channel) -> Any:
+    """The next message on a channel."""
+    assert select.select([channel], [], [], _LIMIT_SECONDS)[0], "no answer"
+    ((message, _descriptors),) = channel.receive()
+    return message
+
+
+@pytest.fixture
+def signer(tmp_path: Path) -> Iterator[SignerProcess]:
+    """A signer in service, with an empty directory of its own."""
+    (tmp_path / "signer").mkdir(mode=0o700)
+    running = SignerProcess(tmp_path / "signer")
+    assert isinstance(hear(running.lifeline), Ready)
+    yield running
+    assert running.end() == 0
+
+
+def test_answers_pings(signer: SignerProcess) -> None:
+    """The signer answers its supervisor."""
+    signer.lifeline.send(Ping(7))
+    assert hear(signer.lifeline) == Pong(7)
+
+
+def test_key_is_made_once_and_private(tmp_path: Path) -> None:
+    """The key is made at the first start, readable by the signer only, and the same at the next start."""
+    keys = []
+    for _life in range(2):
+        running = SignerProcess(tmp_path)
+        keys.append(hear(running.lifeline).detail["public_key"])
+        assert running.end() == 0
+    assert keys[0] == keys[1] == read_public_key(tmp_path / PUBLIC_KEY_FILE).hex()
+    assert stat.S_IMODE((tmp_path / KEY_FILE).stat().st_mode) == 0o600
+
+
+def test_signs_a_checkpoint(signer: SignerProcess) -> None:
+    """A checkpoint comes back with a right signature of the signer's key."""
+    link = signer.open_link()
+    link.send(SignatureWanted(1, _TEXT))
+    made = hear(link)
+    assert isinstance(made, SignatureMade)
+    key = Ed25519PublicKey.from_public_bytes(made.public_key)
+    key.verify(made.signature, _TEXT)
+    with pytest.raises(InvalidSignature):
+        key.verify(made.signature, _TEXT + b" ")
+
+
+def test_signs_nothing_else(signer: SignerProcess) -> None:
+    """What is no checkpoint, or a second past, is refused with the reason, and the signer goes on."""
+    link = signer.open_link()
+    link.send(SignatureWanted(1, b"a certificate for me, please"))
+    assert hear(link) == SignatureRefused(1, "what was to be signed is not an audit checkpoint")
+    link.send(SignatureWanted(1, _TEXT))
+    assert isinstance(hear(link), SignatureMade)
+    link.send(SignatureWanted(1, _TEXT.replace(b"time 1", b"time 2")))
+    assert "another checkpoint 1" in hear(link).reason
+
+
+def test_new_link_replaces_the_old(signer: SignerProcess) -> None:
+    """After control died the signer serves its next link."""
+    signer.open_link().close()
+    link = signer.open_link()
+    link.send(SignatureWanted(1, _TEXT))
+    assert isinstance(hear(link), SignatureMade)
+
+
+def test_rubbish_on_the_link(signer: SignerProcess) -> None:
+    """Bytes that are no message do not end the signer; the next link is served."""
+    link = signer.open_link()
+    os.write(link.fileno(), b"\xff" * 5000)
+    again = signer.open_link()
+    again.send(SignatureWanted(1, _TEXT))
+    assert isinstance(hear(again), SignatureMade)
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda key: key.chmod(0o644), "others may read this private key"),
+        (lambda key: key.write_text("rubbish"), "not a private key"),
+        (lambda key: key.unlink(), "restore it from a backup"),
+    ],
+    ids=["readable", "rubbish", "missing"],
+)
+def test_damaged_key(tmp_path: Path, damage: Any, reason: str) -> None:
+    """A key that was damaged, opened to others or lost is an error in words, and is never replaced."""
+    first = SignerProcess(tmp_path)
+    hear(first.lifeline)
+    first.end()
+    damage(tmp_path / KEY_FILE)
+    second = SignerProcess(tmp_path)
+    failed = hear(second.lifeline)
+    assert isinstance(failed, Failed)
+    assert reason in failed.reason
+    assert str(tmp_path) in failed.reason
+    assert second.end() == 1
+
+
+def test_supervisor_gone(tmp_path: Path) -> None:
+    """A signer whose supervisor vanished ends."""
+    running = SignerProcess(tmp_path)
+    hear(running.lifeline)
+    running.lifeline.close()
+    assert running.process.wait(_LIMIT_SECONDS) == 0
+
+
+def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
+    """Checkpoints made while the signer was away are signed when it is there, and the log proves itself with them."""
+    path = tmp_path / "audit.db"
+    link: list[Channel] = []
+    log = AuditLog(
+        path,
+        checkpoint_every=10,
+        signer=lambda number, text: link[0].send(SignatureWanted(number, text)) if link else None,
+    )
+    for number in range(100):
+        log.record(decision(log, number))
+        if number % 10 == 9:
+            assert settle(log) is None
+    settle(log)
+    assert verify(path).signed_checkpoints == 0
+    link.append(signer.open_link())
+    log.request_signatures()
+    while verify(path).signed_checkpoints < verify(path).checkpoints:
+        assert select.select([link[0]], [], [], _LIMIT_SECONDS)[0], "no answer"
+        for message, _descriptors in link[0].receive():
+            log.signed(message.number, message.signature, message.public_key)
+        settle(log)
+    log.close()
+    result = verify(path, signer=tmp_path / "signer")
+    assert result.ok, result.findings
+    assert result.signed_checkpoints >= 5
+    assert read_remembered(tmp_path / "signer", result.log) is not None
+    assert not search(path, Filter(event="signature refused")).entries
