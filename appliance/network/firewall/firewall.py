@@ -62,10 +62,12 @@ class Firewall:
         """
         require_network_admin("the firewall")
         rules = appliance_rules(settings)
-        backend = self._backend or self._choose()
-        backend.install(rules)
-        self._backend, self._rules = backend, rules
-        return backend.name
+        if self._backend is None:
+            self._backend = self._choose(rules)
+        else:
+            self._backend.install(rules)
+        self._rules = rules
+        return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
         """Replace the rules by those of new settings; if that fails, the old ones stay in force.
@@ -103,8 +105,8 @@ class Firewall:
     def _all(self) -> tuple[Backend, ...]:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
 
-    def _choose(self) -> Backend:
-        """Return the first candidate that is proven to work; leave nothing of the others behind."""
+    def _choose(self, rules: tuple[Rule, ...]) -> Backend:
+        """Return the first candidate that is proven to work and takes all the rules, which are then installed."""
         backends = self._all()
         for backend in backends:
             self._clear(backend)  # first, for a rule of either that is left over would spoil the proof
@@ -113,6 +115,7 @@ class Firewall:
             if self._choice in ("auto", backend.name):
                 try:
                     prove(backend, self._namespace)
+                    backend.install(rules)
                 except FirewallError as error:
                     self._not_used.append(f"{backend.name}: {error}")
                     self._clear(backend)
@@ -128,7 +131,9 @@ class Firewall:
         try:
             backend.remove()
         except FirewallError as error:
-            self._not_used.append(f"{backend.name}: {error}")
+            reason = f"{backend.name}: {error}"
+            if reason not in self._not_used:
+                self._not_used.append(reason)
 
 
 def statuses(rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...]) -> tuple[RuleStatus, ...]:

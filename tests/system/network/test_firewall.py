@@ -332,6 +332,26 @@ def test_auto_takes_what_the_kernel_enforces(
         Firewall(protected.namespace, "nft").install(settings(11312))
 
 
+def test_auto_takes_the_one_that_takes_every_rule(
+    protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A back end that enforces the proof but lacks a part that the rules need is passed over, leaving nothing."""
+    real = need_program("nft", "nftables")
+    partial = tmp_path / "nft"
+    partial.write_text(
+        "#!/bin/sh\ncat >$0.$$\n"
+        "if grep -q limit $0.$$; then echo 'no such expression: limit' >&2; exit 1; fi\n"
+        f'exec {real} "$@" <$0.$$\n'
+    )
+    partial.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    firewall = Firewall(protected.namespace)
+    assert firewall.install(settings(11312)) == "iptables"
+    assert "no such expression: limit" in firewall.report().not_used[0]
+    assert firewall.report().intact
+    assert "table inet rosrv" not in ruleset(protected)
+
+
 CONFINED = """
 import sys
 from appliance.network.firewall.firewall import Firewall
