@@ -1,0 +1,70 @@
+"""The documented form of a record as a JSON schema, and the tables of the reviewer's page, made from the code.
+
+`python -m appliance.audit.schema` prints the generated part of docs/audit.md; a test holds the page against it.
+"""
+
+import json
+import sys
+from typing import Any
+
+from appliance.audit.events import EVENTS
+from appliance.audit.record import SCHEMA_VERSION, Severity
+
+_TEXT_OR_NULL = {"type": ["string", "null"]}
+_FIELDS: dict[str, tuple[dict[str, Any], str]] = {
+    "schema": ({"const": SCHEMA_VERSION}, "version of this schema"),
+    "id": ({"type": "string", "pattern": "^[0-9a-f]{20}$"}, "unique; sorted as text it is sorted by time"),
+    "time": ({"type": "string", "format": "date-time"}, "RFC 3339, UTC, nanoseconds"),
+    "sequence": ({"type": "integer"}, "place in the log; never goes back, has no gaps"),
+    "event": ({"type": "string"}, "what happened: a name of the list below"),
+    "severity": ({"enum": [one.value for one in Severity]}, "how much a person should care"),
+    "decision": ({"enum": ["allow", "deny", "would deny"]}, "absent where nothing was decided"),
+    "host": (_TEXT_OR_NULL, "address of the peer"),
+    "caller_id": (_TEXT_OR_NULL, "the name the peer gave: a claim"),
+    "category": (_TEXT_OR_NULL, "what kind of request"),
+    "resource": (_TEXT_OR_NULL, "topic, service, parameter, node or call"),
+    "rule": (
+        {
+            "type": ["object", "null"],
+            "properties": {
+                "section": {"type": "string"},
+                "key": {"type": "string"},
+                "file": {"type": "string"},
+                "line": {"type": "integer", "minimum": 0},
+            },
+            "required": ["section", "key", "file", "line"],
+            "additionalProperties": False,
+        },
+        "the rule of the policy that decided; null where none did",
+    ),
+    "revision": ({"type": ["integer", "null"]}, "of the policy in force"),
+    "reason": ({"type": "string"}, "a sentence for a person"),
+    "duration_us": ({"type": ["integer", "null"]}, "microseconds from the request's arrival to the decision"),
+    "detail": ({"type": "object"}, "further fields of this event"),
+}
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema (2020-12) of a record as CLI, REST and export give it."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"ROSRV audit record, version {SCHEMA_VERSION}",
+        "type": "object",
+        "properties": {name: form | {"description": text} for name, (form, text) in _FIELDS.items()},
+        "required": [name for name in _FIELDS if name != "decision"],
+        "additionalProperties": False,
+    }
+
+
+def markdown() -> str:
+    """The generated part of the reviewer's page."""
+    lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
+    lines += [f"| `{name}` | {text} |" for name, (_form, text) in _FIELDS.items()]
+    lines += ["", "## Events", "", "| event | meaning |", "|---|---|"]
+    lines += [f"| `{name}` | {text} |" for name, text in EVENTS.items()]
+    lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())
