@@ -77,6 +77,7 @@ class Faces:
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self._registry.find(*identity)
         if incarnation is not None and incarnation.life is Life.LIVE:
+            incarnation.touched = time.monotonic()
             incarnation.told = self._address_for(caller.peer)
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
@@ -103,6 +104,7 @@ class Faces:
             relay_port=relay_port,
             own=caller.own,
             changed=time.time(),
+            touched=time.monotonic(),
         )
         self._registry.add(incarnation)
         await self.open(incarnation)

@@ -20,8 +20,12 @@ from dataclasses import dataclass
 from typing import cast
 
 import httptools
+import structlog
 
 from appliance.policy.model import Address
+
+
+_log = structlog.get_logger()
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +194,7 @@ class _Connection(asyncio.Protocol):
     # --- asyncio.Protocol ---
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
+        self._transport = transport = cast(asyncio.Transport, transport)
         peername, sockname = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
         if not peername:  # gone before it was accepted
             self._closing = True
@@ -306,14 +310,18 @@ class _Connection(asyncio.Protocol):
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         turns = self.server.turns
         await turns.enter(request.peer.host)
+        status = b"200 OK"
         try:
             body = await self.server.handler(request)
+        except Exception:  # noqa: BLE001 - a defect of ours must not leave the peer without an answer
+            _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
+            status, body = b"500 Internal Server Error", b""
         finally:
             turns.leave()
             self._busy = None
         if self._closing:
             return
-        self._write(b"200 OK", body, keep=keep)
+        self._write(status, body, keep=keep)
         self.deadline = time.monotonic() + self._limits.idle_seconds
         if keep and self._pending:
             self._serve_next()

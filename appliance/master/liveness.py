@@ -21,6 +21,7 @@ from appliance.ros.xmlrpc import Limits
 _log = structlog.get_logger()
 _AT_ONCE = 64  # nodes asked at the same time
 _REPLACED_SECONDS = 60.0
+_IDLE_SECONDS = 30.0  # longer than a registering call can be on its way
 _LOOK_AGAIN_SECONDS = 0.3
 
 
@@ -118,7 +119,8 @@ class Liveness:
 
     async def _lose(self, incarnation: Incarnation, why: str) -> None:
         if not incarnation.registrations:
-            self._forget(incarnation)
+            if time.monotonic() - incarnation.touched > _IDLE_SECONDS:
+                self._forget(incarnation)
             return
         registrations = list(incarnation.registrations.values())
         self._graph.lost(incarnation, why)

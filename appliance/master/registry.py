@@ -71,6 +71,7 @@ class Incarnation:
     own: bool = False
     life: Life = Life.LIVE
     changed: float = 0.0  # wall-clock seconds when `life` changed
+    touched: float = 0.0  # monotonic seconds of its last registering call
     registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
