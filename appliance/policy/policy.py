@@ -25,6 +25,7 @@ DEFAULT_PORTS = range(19001, 21001)
 
 _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
+_LONGEST_REASON = 299
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,9 +179,8 @@ class Policy:
             deciding.append(inherited)
         for rule in deciding:
             if not rule.grants(atoms):
-                reason = f"{_what(request, 'may not')} with what is below it: {rule.shown}"
-                reason += f", by {rule.place}"
-                return _decided(False, rule.rule, reason, table.audit_only)
+                what = f"{_what(request, 'may not')} with what is below it"
+                return _decided(False, rule.rule, _sentence(what, rule), table.audit_only)
         return None
 
     def knows(self, address: Address) -> bool:
@@ -244,8 +244,7 @@ class Policy:
         if found.grants(self._hosts.atoms_of(request.host)):
             return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
         what = _what(request, "is not among the hosts that may")
-        reason = f"{what}: {found.shown}, by {found.place}"
-        return _decided(False, found.rule, reason, table.audit_only)
+        return _decided(False, found.rule, _sentence(what, found), table.audit_only)
 
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
@@ -284,6 +283,12 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
 def _what(request: Request, may: str) -> str:
     phrase = PHRASES[request.category]
     return f"{canonical_address(request.host)} {may} {phrase} {_shortened(request.resource)}"
+
+
+def _sentence(what: str, rule: CompiledRule) -> str:
+    """The reason of a denial by a rule; who may instead is left out where it would make it too long."""
+    reason = f"{what}: {rule.shown}, by {rule.place}"
+    return reason if len(reason) <= _LONGEST_REASON else f"{what}, by {rule.place}"
 
 
 def _shortened(text: str, limit: int = 60) -> str:

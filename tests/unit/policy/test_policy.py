@@ -69,6 +69,26 @@ def test_denial_names_who_may_and_the_rule() -> None:
     )
 
 
+def test_reason_stays_short_and_keeps_the_place() -> None:
+    """However long names, values and file are, a reason has fewer than 300 characters and ends with the line."""
+    name = "/" + "n" * 900
+    text = (
+        f"[Groups]\n{'g' * 500} = ::1\n[Parameters]\nwrite {name} = {'g' * 500} host:{'h' * 200} fd00::/16\n"
+    )
+    policy = compile_policy(text, file="d/" + "f" * 300 + ".ini")
+    host = "fd01:1111:2222:3333:4444:5555:6666:7777"
+    for decision in (
+        ask(policy, host, "write", name),
+        ask_parameter(policy, "::1", "/"),
+        ask(policy, host, "write", name + "x"),
+        ask(policy, host, "command", "x" * 900),
+        ask(policy, host, "publish", "\x00" * 900),
+        ask(policy, host, "read", name),
+    ):
+        assert len(decision.reason) < 300
+    assert ask(policy, host, "write", name).reason.endswith(":4)")
+
+
 def test_name_is_not_a_prefix() -> None:
     """A key /chatter says nothing of /chatter2 nor of /chatter/x."""
     policy = compiled("[Publishers]\n/chatter = 10.0.0.1\n")
