@@ -19,7 +19,7 @@ from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.proof import prove
 from appliance.network.firewall.rules import Chain, FirewallSettings, PortRange, RateLimit, Rule, Verdict
 from appliance.network.lab import INTERFACE, Host, Lab
-from appliance.network.probe import Outcome, probe_port
+from appliance.network.probe import PROBE_UID, Outcome, probe_port
 from tests.support.requirements import need_program, need_root
 
 CONTROL, ROSMASTER, OTHER = 61011, 61012, 61055
@@ -445,6 +445,15 @@ def test_the_probe_sees_a_closed_and_an_open_port(protected: Host) -> None:
     with listening(protected, "127.0.0.1") as port:
         assert probe_port(protected.namespace, port).listening == ("127.0.0.1",)
         assert probe_port(protected.namespace, port).listening_outside == ()
+
+
+def test_the_probe_is_the_user_it_says(protected: Host) -> None:
+    """The probe is refused where root alone may pass, and gets through where its own user may."""
+    firewall = Firewall(protected.namespace)
+    with listening(protected) as port:
+        for uid, closed in ((0, True), (PROBE_UID, False)):
+            firewall.install(FirewallSettings(control_uid=uid, rosmaster_uid=ROSMASTER, rosmaster_port=port))
+            assert probe_port(protected.namespace, port).closed is closed
 
 
 def test_the_probe_refuses_to_be_root(protected: Host) -> None:
