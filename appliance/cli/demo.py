@@ -149,7 +149,8 @@ class Show:
 
         The same denial, a moment later, is counted and not recorded a second time.
         """
-        denials = self.stage.audit("--deny", "--host", ATTACKER)  # newest first
+        found = self.stage.audit("--deny", "--host", ATTACKER, "--limit", "1000")  # newest first
+        denials = [one for one in found if one["event"] != "denials folded"]
         before, self.last_sequence = self.last_sequence, max((one["sequence"] for one in denials), default=-1)
         for one in denials:
             new = one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried
