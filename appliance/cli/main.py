@@ -5,7 +5,7 @@ import traceback
 
 import typer
 
-from appliance.cli import audit, config, demo, policy, protect, up
+from appliance.cli import audit, config, demo, policy, policy_running, protect, status, up
 from appliance.config_sources import ConfigError
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
@@ -17,9 +17,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command()(up.up)
+app.command()(status.status)
 app.command()(demo.demo)
 app.command()(protect.protect)
 app.add_typer(audit.app, name="audit")
+for verb in (
+    policy_running.reload,
+    policy_running.rollback,
+    policy_running.confirm,
+    policy_running.revisions,
+):
+    policy.app.command()(verb)
 app.add_typer(policy.app, name="policy")
 app.add_typer(config.app, name="config")
 

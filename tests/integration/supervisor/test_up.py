@@ -12,6 +12,7 @@ import tempfile
 import time
 import xmlrpc.client
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -66,13 +67,18 @@ def refusal(directory: Path, *more: str) -> str:
     return done.stderr
 
 
+def pid_of_master(uri: str) -> str:
+    """What the master at this address answers when it is asked for its process id."""
+    with xmlrpc.client.ServerProxy(uri) as master:
+        return str(master.getPid("/tester"))
+
+
 def test_one_line_says_that_nodes_may_connect(directory: Path) -> None:
     """With `--json` it is the documented object, and the master named there answers."""
     with up(directory, "--json") as running:
         ready = running.wait_for(event="ready", timeout=60)
         assert ready | {"master": "-"} == {"event": "ready", "master": "-", "api": None, "revision": 1}
-        with xmlrpc.client.ServerProxy(ready["master"]) as master:
-            assert str(master.getUri("/tester")).startswith("[1, ")
+        assert pid_of_master(ready["master"]).startswith("[1, ")
     assert running.events == [ready]
 
 
@@ -169,3 +175,23 @@ def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> Non
                 running.stop(with_signal=number)
         assert lives[0] == lives[1] != []
         assert rules() == []
+
+
+def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Path) -> None:
+    """As root, on a host of the lab: the processes live in a namespace that is reached by the host's address;
+    after the end the namespace is gone."""
+    need_root()
+    with Lab("rosrv-up") as lab:
+        host, robot = lab.host("machine", "10.81.0.2/24"), lab.host("robot", "10.81.0.10/24")
+        flags = ("--json", "--isolation", "netns", "--listen", "0.0.0.0:11311")
+        running = Process(host, command(directory, *flags), env=ENVIRONMENT, label="rosrv up")
+        try:
+            running.wait_for(event="ready", timeout=60)
+            assert robot.run(partial(pid_of_master, "http://10.81.0.2:11311")).startswith("[1, ")
+            started = [json.loads(line) for line in running.errors if '"process started"' in line]
+            spaces = {one["role"]: os.readlink(f"/proc/{one['pid']}/ns/net") for one in started}  # noqa: PTH115
+            assert spaces["control"] == spaces["relay"] == spaces["rosmaster"]
+            assert spaces["control"] != os.readlink(f"/proc/{running.pid}/ns/net")  # noqa: PTH115
+        finally:
+            assert running.stop(with_signal=signal.SIGTERM) == 0
+        assert not Path("/run/netns/rosrv").exists()
