@@ -240,7 +240,8 @@ class Supervisor:
                 life.heard()
             case Ready(detail):
                 self._child_ready(life, detail)
-            case Failed(reason):
+            case Failed(said):
+                reason = _printable(said)
                 log.error("process cannot serve", role=life.role, reason=reason)
                 self.stop(reason)
             case SocketKept(name):
@@ -427,6 +428,11 @@ def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
     # A defect of ours in one callback must not take the robot's master away: it is shown, and the loop
     # goes on.
     log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
+
+
+def _printable(text: str) -> str:
+    """Text that a terminal shows and does not obey; lines stay lines."""
+    return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
 
 
 def _title(post: Post) -> str:

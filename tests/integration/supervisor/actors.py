@@ -133,7 +133,7 @@ class _Stubborn(_Actor):
 
 class _Failing(_Actor):
     def started(self) -> None:
-        self.lifeline.send(Failed("policy.ini:3: unknown section [Nods]\npolicy.ini:9: unknown key"))
+        self.lifeline.send(Failed("policy.ini:3: unknown section [Nods]\npolicy.ini:9: unknown key \x1b[2J"))
 
 
 class _Control(_Actor):
