@@ -36,6 +36,7 @@ Settled = Callable[[str | None], None]
 _GATHER_SECONDS = 0.02
 _RETRY_SECONDS = 0.5
 _LARGEST_BATCH = 2048
+_TEXT_BACKLOG = 20_000
 _IDLE_SECONDS = 1.0
 _CLOSE_SECONDS = 10.0
 _REMOVED_AT_ONCE = 512
@@ -257,6 +258,7 @@ class AuditLog:
             self._answer_barriers()
             if written and self._seal_is_due():
                 self._keep_house(self._seal)
+            self._keep_house(self._index_backlog)
             if not more or not written:
                 break
         if self._writer is not None and not self._queue:
@@ -446,6 +448,11 @@ class AuditLog:
     def _index(self) -> None:
         while self._writer is not None and not self._queue and self._writer.index_text():
             pass
+
+    def _index_backlog(self) -> None:
+        """Under load the full-text index waits, but only so long: what it lacks every search has to read."""
+        if self._writer is not None and self._writer.text_lag > _TEXT_BACKLOG:
+            self._writer.index_text(_LARGEST_BATCH)
 
     def _answer_barriers(self) -> None:
         result = self._failed if self._held or self._folder.touched else None

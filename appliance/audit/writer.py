@@ -100,6 +100,7 @@ class ChainWriter:
         last = execute(
             "SELECT number, sequence, text FROM checkpoint ORDER BY number DESC LIMIT 1"
         ).fetchone()
+        self._text_through = int(execute("SELECT through FROM indexed").fetchone()[0])
         self.checkpoint_number, self.checkpoint_sequence, self._checkpoint_hash = 0, 0, NO_CHECKPOINT
         if last is not None:
             self.checkpoint_number, self.checkpoint_sequence = last[0], last[1]
@@ -190,13 +191,18 @@ class ChainWriter:
         keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
         self.append(summaries, [(key, None) for key in keys])
 
-    def index_text(self) -> bool:
+    @property
+    def text_lag(self) -> int:
+        """How many records are not in the full-text index yet; a search reads these one by one."""
+        return int(self.sequence - self._text_through)
+
+    def index_text(self, rows: int = _TEXT_ROWS) -> bool:
         """Enter some more records into the full-text index; whether there is more to enter."""
-        self._check_file()
-        (through,) = self._connection.execute("SELECT through FROM indexed").fetchone()
+        through = self._text_through
         if through >= self.sequence:
             return False
-        end = min(through + _TEXT_ROWS, self.sequence)
+        self._check_file()
+        end = min(through + rows, self.sequence)
         self._connection.execute("BEGIN IMMEDIATE")
         try:
             self._connection.execute(
@@ -209,6 +215,7 @@ class ChainWriter:
         except BaseException:
             self._roll_back()
             raise
+        self._text_through = end
         return bool(end < self.sequence)
 
     def size(self) -> int:
@@ -262,6 +269,7 @@ class ChainWriter:
             self._roll_back()
             raise
         self.sequence, self.hash, self.last_id = sequence, digest, last_id
+        self._text_through = max(through, gone.last_sequence)
         execute("PRAGMA incremental_vacuum(256)").fetchall()
 
     def _check_file(self) -> None:
