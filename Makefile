@@ -23,6 +23,7 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/mypy
+	$(BIN)/mypy tests/conftest.py tests/support/*.py
 	$(BIN)/lint-imports
 	$(PYTEST) tests/unit -n 2 --quiet
 
@@ -32,8 +33,8 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 test-system: setup ## the whole product: demo, namespaces, firewall
 	$(PYTEST) tests/system --quiet --durations=10
 
-bench: setup ## measure and compare with a plain master (benchmarks/README.md)
-	$(BIN)/python -m benchmarks $(ARGS)
+bench: setup ## measure: every program in benchmarks/
+	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done
 
 clean: ## remove what was built, .venv included
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
