@@ -50,10 +50,11 @@ class AdminServer:
         self._audit_failed = audit_failed
         self._started = time.time()
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
+        self._server: asyncio.Server | None = None  # held: a server that nobody holds is closed
 
     async def start(self, sock: socket.socket) -> None:
         """Serve the listening socket."""
-        await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
+        self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -1,0 +1,111 @@
+"""`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
+
+import datetime
+import json
+import re
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from appliance.channel.admin import AdminRequest, PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
+from appliance.cli.policy_input import usage_error
+from appliance.cli.policy_output import counted, say
+from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+
+_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def reload(
+    state: State = DEFAULT_STATE,
+    confirm_within: Annotated[
+        str | None,
+        typer.Option(
+            help="Go back by itself after this time (30s, 5m, 1h) unless `rosrv policy confirm` comes"
+        ),
+    ] = None,
+    as_json: _Json = False,
+) -> None:
+    """Read the policy file again: check, test, swap at once, and take back what it no longer allows.
+
+    A bad file changes nothing; every error is shown and the exit status is 1.
+
+    Example: rosrv policy reload --confirm-within 5m
+    """
+    seconds = _seconds(confirm_within) if confirm_within is not None else None
+    body = _ask(state, PolicyReload(seconds), as_json=as_json)
+    _say_loaded(body, as_json=as_json)
+
+
+def rollback(
+    revision: Annotated[
+        int | None, typer.Argument(help="A kept revision; without it, the one before")
+    ] = None,
+    state: State = DEFAULT_STATE,
+    as_json: _Json = False,
+) -> None:
+    """Bring a kept revision into force again.
+
+    Example: rosrv policy rollback 7
+    """
+    _say_loaded(_ask(state, PolicyRollback(revision), as_json=as_json), as_json=as_json)
+
+
+def confirm(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Keep a policy that was loaded with --confirm-within; exit status 1 when there is nothing to confirm.
+
+    Example: rosrv policy confirm
+    """
+    body = _ask(state, PolicyConfirm(), as_json=as_json)
+    if as_json:
+        sys.stdout.write(json.dumps(body) + "\n")
+    else:
+        kept = f"revision {body['revision']} stays in force"
+        say(kept if body["confirmed"] else f"nothing waits to be confirmed: {kept}")
+    raise typer.Exit(0 if body["confirmed"] else 1)
+
+
+def revisions(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """List the kept revisions, the newest first.
+
+    Example: rosrv policy revisions
+    """
+    for row in _ask(state, PolicyRevisions(), as_json=as_json)["revisions"]:
+        if as_json:
+            sys.stdout.write(json.dumps(row) + "\n")
+            continue
+        loaded = datetime.datetime.fromtimestamp(row["loaded"], datetime.UTC).isoformat(timespec="seconds")
+        mark = "in force" if row["in_force"] else ""
+        say(f"{row['revision']:>5}  {loaded}  {row['who']}: {row['note']}  {row['file']}  {mark}".rstrip())
+
+
+def _ask(state: Any, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+    try:
+        return body_or_exit(ask(state, request), as_json=as_json)
+    except NotRunningError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(2) from None
+
+
+def _say_loaded(body: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(body) + "\n")
+        return
+    for warning in body["warnings"]:
+        say(warning, "yellow")
+    say(
+        f"revision {body['revision']} is in force (was {body['replaced']}); {counted(body['revoked'], 'right')} revoked"
+    )
+    if body["confirm_by"] is not None:
+        until = datetime.datetime.fromtimestamp(body["confirm_by"], datetime.UTC).isoformat(
+            timespec="seconds"
+        )
+        say(f"it goes back by itself at {until} unless you say: rosrv policy confirm", "yellow")
+
+
+def _seconds(text: str) -> float:
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh])", text)
+    if found is None or float(found[1]) <= 0:
+        raise usage_error(f"--confirm-within {text!r} is not a time: write 30s, 5m or 1h")
+    return float(found[1]) * _UNITS[found[2]]

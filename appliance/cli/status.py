@@ -1,0 +1,105 @@
+"""`rosrv status`: the running appliance on one screen."""
+
+import datetime
+import json
+import sys
+import time
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from appliance.channel.admin import StatusWanted
+from appliance.cli.policy_output import counted
+from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+
+_RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
+
+
+def status(
+    state: State = DEFAULT_STATE,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object")] = False,
+) -> None:
+    """Show the running appliance: processes, isolation, policy, graph, audit log.
+
+    Exit status: 0 in service, 1 something needs a person, 2 not running.
+
+    Example: rosrv status --state /var/lib/rosrv
+    """
+    try:
+        body = body_or_exit(ask(state, StatusWanted()), as_json=as_json)
+    except NotRunningError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(2) from None
+    troubles = list(_troubles(body))
+    if as_json:
+        sys.stdout.write(json.dumps({**body, "troubles": troubles}) + "\n")
+    else:
+        _show(body, troubles)
+    raise typer.Exit(1 if troubles else 0)
+
+
+def _troubles(body: dict[str, Any]) -> list[str]:
+    """What a person should look at, most pressing first."""
+    found = []
+    if body["audit"]["failed"]:
+        found.append(f"the audit log cannot be written: {body['audit']['failed']}")
+    if body["probe"] not in ("", "passed"):
+        found.append(f"the ROS Master is not hidden: {body['probe']}")
+    if body["relay"] != "connected":
+        found.append("no relay process: topics and services carry nothing")
+    if body["rosmaster"] != "reachable":
+        found.append("the ROS Master is being rebuilt: calls wait")
+    if body["policy"]["confirm_by"] is not None:
+        left = max(0, round(body["policy"]["confirm_by"] - time.time()))
+        found.append(f"the policy goes back in {left} s unless confirmed: rosrv policy confirm")
+    return found
+
+
+def _show(body: dict[str, Any], troubles: list[str]) -> None:
+    console = Console(highlight=False)
+    policy, audit = body["policy"], body["audit"]
+    for trouble in troubles:
+        console.print(Text(f"! {trouble}", style=_RED))
+    grid = Table.grid(padding=(0, 2))
+    grid.add_row("appliance", f"{body['version']}, in service for {_age(body['since'])}")
+    isolation = Text(_isolation(body), style=_YELLOW if body["isolation"] == "none" else _GREEN)
+    grid.add_row("isolation", isolation)
+    differs = "; the file now differs: rosrv policy reload" if policy["differs_from_file"] else ""
+    warnings = f", {counted(policy['warnings'], 'warning')}" if policy["warnings"] else ""
+    grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
+    shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""
+    grid.add_row(
+        "graph", f"{body['nodes']} nodes{shadows}, {body['topics']} topics, {body['services']} services"
+    )
+    dropped = f", {body['dropped']} dropped at slow subscribers" if body["dropped"] else ""
+    grid.add_row("relay", f"{body['connections']} connections, {body['messages']} messages{dropped}")
+    grid.add_row("audit log", f"{audit['lag_records']} records waiting to be written")
+    console.print(grid)
+    table = Table("process", "pid", "for", "restarts", box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for process in body["processes"]:
+        restarts = Text(str(process["restarts"]), style=_YELLOW if process["restarts"] else "")
+        since = datetime.datetime.fromisoformat(process["since"]).timestamp()
+        table.add_row(process["role"], str(process["pid"]), _age(since), restarts)
+    console.print(table)
+
+
+def _isolation(body: dict[str, Any]) -> str:
+    if body["isolation"] == "none":
+        return "none: NO FIREWALL, every user of this machine reaches the real ROS Master"
+    back_end = body["firewall"].get("backend", "no back end reported")
+    return f"{body['isolation']}, firewall {back_end}, probe {body['probe'] or 'not run yet'}"
+
+
+def _age(since: float) -> str:
+    seconds = max(0, int(time.time() - since))
+    days, rest = divmod(seconds, 86_400)
+    hours, rest = divmod(rest, 3_600)
+    minutes, left = divmod(rest, 60)
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"
