@@ -1,0 +1,216 @@
+// A TCPROS publisher and a subscriber in one program, for measuring what is between them (no ROS needed).
+//
+//   relay_load BYTES SECONDS flat|window|paced
+//
+// Prints the publisher's port. Reads one line, "PORT TOPIC": where the subscriber connects. The publisher
+// sends markers until one has come through, then runs: as fast as it can, with at most 64 messages on their
+// way, or 1,000 messages a second. Prints one JSON object: messages a second, lost, out of order, and the
+// delay in microseconds (median and 99th percentile).
+#include <arpa/inet.h>
+#include <netinet/tcp.h>
+#include <poll.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <iostream>
+#include <map>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+using Fields = std::map<std::string, std::string>;
+constexpr uint64_t MARKER = ~0ull;
+constexpr uint64_t WINDOW = 64;
+
+int64_t now() {
+  return std::chrono::duration_cast<std::chrono::nanoseconds>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+void write_all(int fd, const char* data, size_t size) {
+  while (size) {
+    ssize_t sent = send(fd, data, size, MSG_NOSIGNAL);
+    if (sent <= 0) throw std::runtime_error("the connection is gone");
+    data += sent, size -= sent;
+  }
+}
+
+void read_all(int fd, char* data, size_t size) {
+  while (size) {
+    ssize_t got = recv(fd, data, size, 0);
+    if (got <= 0) throw std::runtime_error("the connection is gone");
+    data += got, size -= got;
+  }
+}
+
+void append_length(std::string& out, uint32_t length) { out.append(reinterpret_cast<char*>(&length), 4); }
+
+void write_header(int fd, const Fields& fields) {
+  std::string body, out;
+  for (const auto& [name, value] : fields) {
+    append_length(body, name.size() + 1 + value.size());
+    body += name + "=" + value;
+  }
+  append_length(out, body.size());
+  out += body;
+  write_all(fd, out.data(), out.size());
+}
+
+Fields read_header(int fd) {
+  uint32_t size, length;
+  read_all(fd, reinterpret_cast<char*>(&size), 4);
+  std::string body(size, 0);
+  read_all(fd, body.data(), size);
+  Fields fields;
+  for (size_t at = 0; at + 4 <= size; at += length) {
+    std::memcpy(&length, &body[at], 4);
+    at += 4;
+    const std::string field = body.substr(at, length);
+    fields[field.substr(0, field.find('='))] = field.substr(field.find('=') + 1);
+  }
+  return fields;
+}
+
+void tune(int fd) {
+  int on = 1;
+  setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
+  setsockopt(fd, IPPROTO_TCP, TCP_CONGESTION, "cubic", 5);
+}
+
+struct Load {
+  size_t frame;
+  double seconds;
+  std::string mode;
+  std::atomic<bool> primed{false}, ended{false};
+  std::atomic<uint64_t> received{0};
+  uint64_t sent = 0, lost = 0, disordered = 0;
+  int64_t first = 0, last = 0;
+  std::vector<int64_t> delays;
+
+  void publish(int listening) {
+    int fd = accept(listening, nullptr, nullptr);
+    tune(fd);
+    const Fields asked = read_header(fd);
+    write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", "992ce8a1687cec8c8bd883ec73ca41d1"},
+                      {"message_definition", "string data\n"}, {"topic", asked.at("topic")}, {"type", "std_msgs/String"}});
+    const size_t batch = mode == "paced" ? 1 : std::max<size_t>(1, 262144 / frame);
+    std::vector<char> buffer(batch * frame);
+    const auto stamp = [&](size_t slot, uint64_t number) {
+      const uint32_t length = frame - 4, text = frame - 8;
+      const int64_t time = now();
+      char* at = &buffer[slot * frame];
+      std::memcpy(at, &length, 4), std::memcpy(at + 4, &text, 4);
+      std::memcpy(at + 8, &number, 8), std::memcpy(at + 16, &time, 8);
+    };
+    const auto mark_until = [&](std::atomic<bool>& seen) {
+      while (!seen) {
+        stamp(0, MARKER);
+        write_all(fd, buffer.data(), frame);
+        std::this_thread::sleep_for(std::chrono::milliseconds(20));
+      }
+    };
+    mark_until(primed);
+    const int64_t start = now(), end = start + int64_t(seconds * 1e9);
+    uint64_t given_up = 0, seen = 0;
+    int64_t progress = start;
+    for (int64_t t = start; t < end; t = now()) {
+      size_t count = batch;
+      if (mode == "window") {
+        const uint64_t got = received;
+        if (got != seen) seen = got, progress = t;
+        const uint64_t flying = sent - std::min(sent, got + given_up);
+        if (flying >= WINDOW) {
+          if (t - progress > 300'000'000) given_up += flying, progress = t;  // they were dropped
+          std::this_thread::yield();
+          continue;
+        }
+        count = std::min<size_t>(count, WINDOW - flying);
+      } else if (mode == "paced") {
+        std::this_thread::sleep_until(std::chrono::steady_clock::time_point(std::chrono::nanoseconds(start + int64_t(sent) * 1'000'000)));
+      }
+      for (size_t slot = 0; slot < count; ++slot) stamp(slot, sent + slot);
+      write_all(fd, buffer.data(), count * frame);
+      sent += count;
+    }
+    mark_until(ended);
+    close(fd);
+  }
+
+  void message(const char* at, int64_t t) {
+    uint64_t number;
+    int64_t time;
+    std::memcpy(&number, at + 8, 8), std::memcpy(&time, at + 16, 8);
+    if (number == MARKER) {
+      (received ? ended : primed) = true;
+      return;
+    }
+    if (!received) first = t;
+    static uint64_t next = 0;
+    if (number > next) lost += number - next;
+    if (number < next) ++disordered;
+    next = std::max(next, number + 1);
+    last = t;
+    if ((received & 63) == 0 || mode == "paced") delays.push_back(t - time);
+    received.store(received + 1, std::memory_order_release);
+  }
+
+  void subscribe(int port, const std::string& topic) {
+    int fd = socket(AF_INET, SOCK_STREAM, 0);
+    sockaddr_in where{};
+    where.sin_family = AF_INET, where.sin_port = htons(port), where.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    if (connect(fd, reinterpret_cast<sockaddr*>(&where), sizeof where)) throw std::runtime_error("cannot connect");
+    tune(fd);
+    write_header(fd, {{"callerid", "/load_listener"}, {"md5sum", "*"}, {"type", "*"}, {"topic", topic}, {"tcp_nodelay", "1"}});
+    const Fields header = read_header(fd);
+    if (header.count("error")) throw std::runtime_error(header.at("error"));
+    std::vector<char> buffer(std::max<size_t>(1 << 20, 3 * frame));
+    size_t filled = 0;
+    while (!ended) {
+      ssize_t got = recv(fd, &buffer[filled], buffer.size() - filled, 0);
+      if (got <= 0) throw std::runtime_error("the relay closed the connection");
+      filled += got;
+      const int64_t t = now();
+      size_t at = 0;
+      for (; filled - at >= frame; at += frame) message(&buffer[at], t);
+      std::memmove(&buffer[0], &buffer[at], filled - at);
+      filled -= at;
+    }
+    close(fd);
+  }
+};
+
+int main(int argc, char** argv) try {
+  if (argc != 4) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced");
+  Load load;
+  load.frame = std::max<size_t>(24, std::atoi(argv[1]));
+  load.seconds = std::atof(argv[2]);
+  load.mode = argv[3];
+  int listening = socket(AF_INET, SOCK_STREAM, 0);
+  sockaddr_in where{};
+  socklen_t size = sizeof where;
+  where.sin_family = AF_INET, where.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  if (bind(listening, reinterpret_cast<sockaddr*>(&where), size) || listen(listening, 4)) throw std::runtime_error("cannot listen");
+  getsockname(listening, reinterpret_cast<sockaddr*>(&where), &size);
+  std::cout << ntohs(where.sin_port) << std::endl;
+  std::thread publisher([&] { load.publish(listening); });
+  int port;
+  std::string topic;
+  std::cin >> port >> topic;
+  load.subscribe(port, topic == "-" ? "/load" : topic);
+  publisher.join();
+  std::sort(load.delays.begin(), load.delays.end());
+  const auto delay = [&](double part) { return load.delays.empty() ? 0.0 : load.delays[size_t(part * (load.delays.size() - 1))] / 1e3; };
+  std::printf("{\"messages_per_s\": %.0f, \"sent\": %llu, \"lost\": %llu, \"disordered\": %llu, \"p50_us\": %.1f, \"p99_us\": %.1f}\n",
+              load.received / ((load.last - load.first) / 1e9), (unsigned long long)load.sent,
+              (unsigned long long)(load.sent - load.received), (unsigned long long)load.disordered, delay(.5), delay(.99));
+} catch (const std::exception& error) {
+  std::cerr << "relay_load: " << error.what() << std::endl;
+  std::_Exit(1);
+}

@@ -1,0 +1,279 @@
+"""The relay beside `topic_tools relay` and nothing at all: `python -m benchmarks.relay_throughput`.
+
+One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp` (compiled on first use with g++).
+*window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 messages a second, with
+the delay. Systems take turns; cells are medians of the rounds and ratios are to `topic_tools`, of one round each.
+The relay's control is played here: it places one publication and grants it. Needs rosmaster and topic_tools.
+"""
+
+import argparse
+import json
+import os
+import socket
+import statistics
+import subprocess
+import threading
+import xmlrpc.client
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+from xmlrpc.server import SimpleXMLRPCServer
+
+from appliance.channel.messages import (
+    GrantInstalled,
+    NodePlaced,
+    PublicationPlaced,
+    UpstreamFound,
+    UpstreamWanted,
+)
+from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port, wait_until
+
+HERE = Path(__file__).parent
+PROGRAM = HERE.parent / "build" / "benchmarks" / "relay_load"
+TOPIC_TOOLS = "/usr/lib/topic_tools/relay"
+SIZES = (32, 200, 4096, 65536, 1048576)
+MODES = ("window", "flat", "paced")
+
+
+@dataclass
+class Result:
+    """One run: messages a second, share lost, delay in microseconds, the relay's CPU microseconds a message."""
+
+    rate: float
+    loss: float
+    p50: float
+    cpu: float
+
+
+def compiled() -> Path:
+    """The load generator, compiled when its source is newer."""
+    source = HERE / "relay_load.cpp"
+    if not PROGRAM.exists() or PROGRAM.stat().st_mtime < source.stat().st_mtime:
+        PROGRAM.parent.mkdir(parents=True, exist_ok=True)
+        command = ["g++", "-std=c++17", "-O2", "-o", str(PROGRAM), str(source), "-pthread"]
+        subprocess.run(command, check=True)
+    return PROGRAM
+
+
+def cpu_seconds(pid: int | None) -> float:
+    """User and system time of a process so far."""
+    if pid is None:
+        return 0.0
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def run(mode: str, size: int, seconds: float, system: "System") -> Result:
+    """One run of the load through a system."""
+    with subprocess.Popen(
+        [str(compiled()), str(size), str(seconds), mode],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as load:
+        assert load.stdin is not None
+        assert load.stdout is not None
+        port, topic = system.target(int(load.stdout.readline()))
+        before = cpu_seconds(system.pid)
+        load.stdin.write(f"{port} {topic}\n")
+        load.stdin.close()
+        answer = json.loads(load.stdout.read())
+    received = answer["sent"] - answer["lost"]
+    return Result(
+        answer["messages_per_s"],
+        answer["lost"] / max(1, answer["sent"]),
+        answer["p50_us"],
+        (cpu_seconds(system.pid) - before) / max(1, received) * 1e6,
+    )
+
+
+class System(Protocol):
+    """What is put in the middle."""
+
+    name: str
+    pid: int | None
+
+    def target(self, publisher: int) -> tuple[int, str]:
+        """Port and topic for the subscriber, given the publisher's port."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+class Direct:
+    """Nothing in the middle."""
+
+    name = "direct"
+    pid: int | None = None
+
+    def target(self, publisher: int) -> tuple[int, str]:
+        """The publisher itself."""
+        return publisher, "-"
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class Relay:
+    """This project's relay process, with a control that only knows one topic a run."""
+
+    name = "relay"
+
+    def __init__(self) -> None:
+        self._publisher = 0
+        self._runs = 0
+        self._relay = RelayProcess()
+        self._link: ChannelPeer = self._relay.open_link(self._answer)
+        self.pid: int | None = self._relay.process.pid
+
+    def target(self, publisher: int) -> tuple[int, str]:
+        """A new incarnation, whose publisher is this run's."""
+        self._publisher = publisher
+        self._runs += 1
+        key = str(self._runs)
+        with socket.create_server((LOOPBACK, 0)) as listening:
+            self._link.send(NodePlaced(key, "/load", LOOPBACK), (listening.fileno(),))
+            self._link.send(PublicationPlaced(key, "/load", "std_msgs/String"))
+            self._link.send(GrantInstalled(key, "/load", LOOPBACK, "/load_listener"))
+            self._relay.ping(self._runs)
+            return int(listening.getsockname()[1]), "/load"
+
+    def close(self) -> None:
+        """End the process."""
+        self._relay.stop()
+        self._link.close()
+
+    def _answer(self, message: Any) -> None:
+        if isinstance(message, UpstreamWanted):
+            self._link.send(UpstreamFound(message.key, message.topic, LOOPBACK, self._publisher))
+
+
+class TopicTools:
+    """`topic_tools relay` at a rosmaster, a fresh one each run; the publisher's node API is served here."""
+
+    name = "topic_tools"
+
+    def __init__(self) -> None:
+        port = free_port()
+        self._uri = f"http://{LOOPBACK}:{port}/"
+        self._environment = {**os.environ, "ROS_MASTER_URI": self._uri, "ROS_IP": LOOPBACK}
+        self._master = subprocess.Popen(
+            ["rosmaster", "--core", "-p", str(port)],
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        wait_until(self._answers, "rosmaster answers")
+        self._api = SimpleXMLRPCServer((LOOPBACK, 0), logRequests=False)
+        self._api.register_instance(self)
+        self._api_uri = f"http://{LOOPBACK}:{self._api.server_address[1]}/"
+        threading.Thread(target=self._api.serve_forever, daemon=True).start()
+        self._publisher = 0
+        self._runs = 0
+        self._relay: subprocess.Popen[bytes] | None = None
+        self.pid: int | None = None
+
+    def target(self, publisher: int) -> tuple[int, str]:
+        """Start a relay between two new topics and find the port it publishes on."""
+        self.stop_relay()
+        self._publisher = publisher
+        self._runs += 1
+        given, taken = f"/in{self._runs}", f"/out{self._runs}"
+        call(self._uri, "registerPublisher", "/load", given, "std_msgs/String", self._api_uri)
+        self._relay = subprocess.Popen(
+            [TOPIC_TOOLS, given, taken, f"__name:=relay{self._runs}"], env=self._environment
+        )
+        self.pid = self._relay.pid
+        found: list[str] = []
+
+        def published() -> bool:
+            _code, _text, (publishers, _subscribers, _services) = call(self._uri, "getSystemState", "/load")
+            found[:] = [node for topic, nodes in publishers if topic == taken for node in nodes]
+            return bool(found)
+
+        wait_until(published, "topic_tools relay publishes")
+        uri = call(self._uri, "lookupNode", "/load", found[0])[2]
+        return int(call(uri, "requestTopic", "/load_listener", taken, [["TCPROS"]])[2][2]), taken
+
+    def stop_relay(self) -> None:
+        """End this run's relay."""
+        if self._relay is not None:
+            self._relay.terminate()
+            self._relay.wait(10)
+
+    def close(self) -> None:
+        """End everything that was started."""
+        self.stop_relay()
+        self._api.shutdown()
+        self._api.server_close()
+        self._master.terminate()
+        self._master.wait(10)
+
+    def _dispatch(self, method: str, _parameters: tuple[Any, ...]) -> Any:
+        if method == "requestTopic":
+            return [1, "", ["TCPROS", LOOPBACK, self._publisher]]
+        return [1, "", 0]
+
+    def _answers(self) -> bool:
+        try:
+            return bool(call(self._uri, "getUri", "/load")[0] == 1)
+        except (OSError, xmlrpc.client.Error):
+            return False
+
+
+def table(
+    results: dict[tuple[str, int, str], list[Result]], mode: str, sizes: list[int], names: list[str]
+) -> None:
+    """Print one mode's medians and ratios."""
+    print(f"\n{mode}: " + ("p50 in microseconds" if mode == "paced" else "messages a second"))
+    print("x: ratio to topic_tools; in brackets: CPU microseconds a message of what is in the middle")
+    print(f"{'':<12}" + "".join(f"{size:>30,}" for size in sizes))
+    for name in names:
+        cells = []
+        for size in sizes:
+            runs = results[mode, size, name]
+            base = results[mode, size, "topic_tools"]
+
+            def value(one: Result) -> float:
+                return one.p50 if mode == "paced" else one.rate
+
+            ratio = statistics.median(
+                value(one) / value(other) for one, other in zip(runs, base, strict=True)
+            )
+            loss = statistics.median(one.loss for one in runs)
+            text = f"{statistics.median(map(value, runs)):,.0f} x{ratio:.2f}"
+            cpu = statistics.median(one.cpu for one in runs)
+            text += f" lost {loss:.0%}" if loss else ""
+            text += f" ({cpu:.2f})" if cpu else ""
+            cells.append(f"{text:>30}")
+        print(f"{name:<12}" + "".join(cells))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=1.5)
+    parser.add_argument(
+        "--sizes", type=lambda text: [int(one) for one in text.split(",")], default=list(SIZES)
+    )
+    parser.add_argument("--modes", type=lambda text: text.split(","), default=list(MODES))
+    options = parser.parse_args()
+    results: dict[tuple[str, int, str], list[Result]] = {}
+    systems: list[System] = [Direct(), Relay(), TopicTools()]
+    try:
+        for _round in range(options.rounds):
+            for mode in options.modes:
+                for size in options.sizes:
+                    for system in systems:
+                        result = run(mode, size, options.seconds, system)
+                        results.setdefault((mode, size, system.name), []).append(result)
+    finally:
+        for system in systems:
+            system.close()
+    for mode in options.modes:
+        table(results, mode, options.sizes, [system.name for system in systems])
+
+
+if __name__ == "__main__":
+    main()
