@@ -151,7 +151,14 @@ class Engine:
             return
         node = self._table.node(key)
         name = key if node is None else node.name
-        relayed = RelayedTopic(key, topic, name, self._limits.queue_grace, self._loop.clock)
+        relayed = RelayedTopic(
+            key,
+            topic,
+            name,
+            grace=self._limits.queue_grace,
+            clock=self._loop.clock,
+            budget=self._context.budget,
+        )
         publisher = Publisher(self._context, relayed)
         relayed.upstream = publisher
         self._topics[key, topic] = (relayed, publisher)

@@ -6,8 +6,8 @@ into and returns all frames that are whole after each read as one `Batch`, walke
 - Small frames are received into a scratch area that all receivers of the process share; only the torn frame
   at the end of a read, if there is one, is set aside until the rest arrives.
 - A frame beyond `LARGE` gets an area of its own that is filled in place. It is anonymous memory, so a length
-  that is declared and never sent costs address space only. The area is used again for the next large frame
-  unless a queue has kept it.
+  that is declared and never sent costs address space only. An area of up to 2 MiB is used again for the
+  next large frame unless a queue has kept it.
 
 Frames are passed on whole, so a publisher that dies in the middle of one tears nobody's stream: what its
 subscribers have been sent always ends with a frame.
@@ -20,7 +20,7 @@ from appliance.ros.errors import LimitExceededError, PeerError
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
-_KEEP_AREA = 8 << 20
+_KEEP_AREA = 2 << 20
 
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from appliance.channel.messages import TopicTraffic
-from appliance.relay.frames import Batch
+from appliance.relay.frames import Batch, MemoryBudget
 
 
 class Member(Protocol):
@@ -66,13 +66,23 @@ class Upstream(Protocol):
 class RelayedTopic:
     """A topic of an incarnation with its subscribers."""
 
-    def __init__(self, key: str, topic: str, name: str, grace: float, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        key: str,
+        topic: str,
+        name: str,
+        *,
+        grace: float,
+        clock: Callable[[], float],
+        budget: MemoryBudget,
+    ) -> None:
         self.key = key
         self.topic = topic
         self.upstream: Upstream | None = None
         self._name = name
         self._grace = grace
         self._clock = clock
+        self._budget = budget
         self._header: dict[str, str] | None = None
         self._waiting: tuple[Member, ...] = ()
         self._served: tuple[Member, ...] = ()
@@ -121,7 +131,7 @@ class RelayedTopic:
 
     def upstream_closed(self) -> None:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
-        self._latched = None
+        self._latch(None)
         self._paused = False
         if not self._served:
             self._header = None
@@ -135,7 +145,7 @@ class RelayedTopic:
 
     def _pass_on(self, batch: Batch) -> None:
         if self._latching:
-            self._latched = batch.keep_last()
+            self._latch(batch.keep_last())
         congested = False
         for member in self._served:
             member.deliver(batch)
@@ -174,6 +184,14 @@ class RelayedTopic:
         if self._latched is not None:
             member.deliver(self._latched)
         self.relieve()
+
+    def _latch(self, batch: Batch | None) -> None:
+        """Remember the last message; it counts as memory in use."""
+        if self._latched is not None:
+            self._budget.used -= len(self._latched.view)
+        if batch is not None:
+            self._budget.used += len(batch.view)
+        self._latched = batch
 
     def _relieve_or_pause(self) -> None:
         full = [member for member in self._served if member.full]

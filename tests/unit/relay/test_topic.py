@@ -4,7 +4,7 @@ import struct
 from collections.abc import Mapping
 
 from appliance.channel.messages import TopicTraffic
-from appliance.relay.frames import Batch
+from appliance.relay.frames import Batch, MemoryBudget
 from appliance.relay.topic import RelayedTopic
 
 HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
@@ -80,7 +80,10 @@ class Story:
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.topic = RelayedTopic("k", "/chatter", "/talker", 0.05, lambda: self.now)
+        self.budget = MemoryBudget(1 << 30)
+        self.topic = RelayedTopic(
+            "k", "/chatter", "/talker", grace=0.05, clock=lambda: self.now, budget=self.budget
+        )
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream
 
@@ -149,8 +152,11 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
     story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
     story.topic.received(batch(b"1"))
+    story.topic.received(batch(b"12"))
+    assert story.budget.used == len(batch(b"12").view)
     story.topic.upstream_closed()
     assert story.join().received == b""
+    assert story.budget.used == 0
 
 
 def test_subscribers_survive_the_loss_of_the_publisher() -> None:
