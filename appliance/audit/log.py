@@ -37,6 +37,7 @@ _GATHER_SECONDS = 0.02
 _RETRY_SECONDS = 0.5
 _LARGEST_BATCH = 2048
 _TEXT_BACKLOG = 20_000
+_TEXT_STEP = 256
 _IDLE_SECONDS = 1.0
 _CLOSE_SECONDS = 10.0
 _REMOVED_AT_ONCE = 512
@@ -121,12 +122,14 @@ class AuditLog:
         self._degraded: str | None = None
         self._house_at = 0.0
         self._asked_at = 0.0
-        self._caught_up = time.monotonic()
+        self._caught_up = self._written_at = time.monotonic()
         self._unsealed = 0
         self._sealed_at = time.monotonic()
         self._lost = _Lost()
         self._idle = False
         self._ended = False
+        self._counts_recovered = False
+        self._continued: tuple[str, int] | None = None
         self._unwritten: str | None = None
         self._wake = threading.Event()
         self._hurry = threading.Event()
@@ -262,7 +265,10 @@ class AuditLog:
             if not more or not written:
                 break
         if self._writer is not None and not self._queue:
-            self._keep_house(self._index)
+            # One record alone does not pay a commit of the index; it waits for others or for a quiet second.
+            quiet = time.monotonic() - self._written_at >= _IDLE_SECONDS / 2
+            if quiet or self._writer.text_lag >= _TEXT_STEP:
+                self._keep_house(self._index)
         if self._writer is not None and time.monotonic() >= self._retained_at:
             self._keep_house(self._retain)
 
@@ -347,7 +353,7 @@ class AuditLog:
 
     def _open(self) -> None:
         earlier = self._signatures.key_was_pinned
-        writer = ChainWriter(self.path, self._clock())
+        writer = ChainWriter(self.path, self._clock(), self._continued)
         self.ids.raise_floor(writer.last_id)
         self._writer = writer
         if writer.created:
@@ -356,9 +362,12 @@ class AuditLog:
                 0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
             )
         self._unsealed = writer.sequence - writer.checkpoint_sequence
-        left = writer.open_folds()
-        if left and not self._folder.touched:
+        # Only what an earlier process left; what this one counts stands there as well and is still being counted.
+        left = [] if self._counts_recovered else writer.open_folds()
+        if left:
             writer.close_folds([summary(one, self.ids.next(), self._clock(), recovered=True) for one in left])
+        self._counts_recovered = True
+        self._continued = (writer.log_id, writer.sequence)
         if not self._failed_since:
             self._failed = None
         self._signatures.ask(writer)
@@ -372,10 +381,11 @@ class AuditLog:
             touched = tuple(self._folder.touched)
             report = self._report_of_failure()
             writer.append(batch + report, [(_fold_key(key), self._folder.state(key)) for key in touched])
+            self._continued = (writer.log_id, writer.sequence)
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
             self._unsealed += len(batch) + len(report)
-            self._caught_up = time.monotonic()
+            self._caught_up = self._written_at = time.monotonic()
             self._failed, self._failed_since = None, 0
             if self._lost.count:
                 self._held.append(

@@ -35,6 +35,10 @@ _ROWS_PER_INSERT = 64
 _WIDTH = len(StoredColumns._fields) + 1
 _ROW = "(" + ", ".join("?" * _WIDTH) + ")"
 _CHECKED_AT_OPENING = 256
+_REPLACED = (
+    "the log was removed or replaced while it was written; put it back, or stop the appliance and move what is"
+    " there away to begin a new log"
+)
 _TEXT_ROWS = 256
 
 
@@ -60,18 +64,25 @@ class RemovedRange(NamedTuple):
 class ChainWriter:
     """The open database of a log, and the head of its chain."""
 
-    def __init__(self, path: Path, begun: int) -> None:
-        """Open the log at `path`, or make it. Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`."""
+    def __init__(self, path: Path, begun: int, continued: tuple[str, int] | None = None) -> None:
+        """Open the log at `path`, or make it unless it is one to be `continued` (its id and last sequence).
+
+        Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
+        """
         self.path = path
         self._lock = _take_lock(path)
         try:
-            self.created = not path.exists()
+            self.created = continued is None and not path.exists()
+            if continued is not None and not path.exists():
+                raise LogUnreadableError(f"{path}: {_REPLACED}")
             if self.created:
                 database.create(path, begun)
             self._connection = database.open_for_writing(path)
             try:
                 self._file = _identity(path)
                 self._read_head()
+                if continued is not None and (self.log_id != continued[0] or self.sequence < continued[1]):
+                    raise LogUnreadableError(f"{path}: {_REPLACED}")
             except BaseException:
                 self._connection.close()
                 raise
@@ -274,10 +285,7 @@ class ChainWriter:
 
     def _check_file(self) -> None:
         if _identity(self.path) != self._file:
-            raise LogUnreadableError(
-                f"{self.path}: the log was removed or replaced while it was written; put it back, or stop the"
-                " appliance and move what is there away to begin a new log"
-            )
+            raise LogUnreadableError(f"{self.path}: {_REPLACED}")
 
     def _roll_back(self) -> None:
         if self._connection.in_transaction:

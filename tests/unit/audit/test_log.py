@@ -337,3 +337,23 @@ def test_closed_log_answers(make_log) -> None:
     log.close()
     log.record(decision(log))
     assert "closed" in (settle(log) or "")
+
+
+def test_recovery_counts_denials_once(make_log, path) -> None:
+    """Denials that were being counted when the log failed for a while are counted once, not twice."""
+    log = make_log(fold=FoldSettings(seconds=3600))
+    for _ in range(50):
+        log.record(decision(log, decision="deny"))
+    assert settle(log) is None
+    stolen = path.with_name("stolen.db")
+    path.rename(stolen)
+    log.record(decision(log, decision="deny"))
+    await_state(log, failed=True)
+    assert not path.exists(), "no new log takes the place of one that was removed"
+    stolen.rename(path)
+    await_state(log, failed=False)
+    assert log.close() is None
+    denials = [entry.record for entry in export(path, Filter(decision=("deny",)))]
+    counted = sum(one.detail["count"] for one in denials if one.event == "denials folded")
+    assert counted + sum(one.event == "decision" for one in denials) == 51
+    assert verify(path).ok
