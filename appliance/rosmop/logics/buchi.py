@@ -19,7 +19,9 @@ from appliance.rosmop.logics.components import strong_components
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.ltl_nodes import Nodes, Translation
 
-Obligations = frozenset[int]
+Obligations = int
+"""A set of nodes, as a bit set of their numbers."""
+
 Sets = frozenset[Obligations]
 """A union of obligation sets: the states in which a nondeterministic automaton may be."""
 
@@ -64,11 +66,11 @@ class Automata:
         if kind == "and":
             return self._product(self._choices(part) for part in parts)
         if kind == "letters" and parts[0] in (0, self._nodes.everything):
-            return frozenset((frozenset(),)) if parts[0] else frozenset()
-        return frozenset((frozenset((node,)),))
+            return _NOTHING_LEFT if parts[0] else frozenset()
+        return frozenset((1 << node,))
 
     def _product(self, factors: Iterable[Sets]) -> Sets:
-        product: Sets = frozenset((frozenset(),))
+        product = _NOTHING_LEFT
         for factor in factors:
             self._spend(len(product) * len(factor))
             product = self._smallest(left | right for left in product for right in factor)
@@ -77,9 +79,9 @@ class Automata:
     def _smallest(self, sets: Iterable[Obligations]) -> Sets:
         """Without those sets that demand more than another one."""
         kept: list[Obligations] = []
-        for candidate in sorted(set(sets), key=len):
+        for candidate in sorted(set(sets), key=int.bit_count):
             self._spend(1 + len(kept) // 8)
-            if not any(smaller <= candidate for smaller in kept):
+            if not any(smaller & candidate == smaller for smaller in kept):
                 kept.append(candidate)
         return frozenset(kept)
 
@@ -98,7 +100,7 @@ class Automata:
     def _find_move(self, node: int, letter: int) -> Sets:
         kind, parts = self._nodes[node]
         if kind == "letters":
-            return frozenset((frozenset(),)) if parts[0] >> letter & 1 else frozenset()
+            return _NOTHING_LEFT if parts[0] >> letter & 1 else frozenset()
         if kind == "next":
             return self._choices(parts[0])
         if kind == "or":
@@ -106,7 +108,7 @@ class Automata:
         if kind == "and":
             return self._product(self._move(part, letter) for part in parts)
         left, right = self._move(parts[0], letter), self._move(parts[1], letter)
-        stay: Sets = frozenset((frozenset((node,)),))
+        stay: Sets = frozenset((1 << node,))
         if kind == "until":
             return self._smallest((*right, *self._product((left, stay))))
         return self._product((right, frozenset((*left, *stay))))
@@ -115,8 +117,8 @@ class Automata:
         """All targets, none dropped for demanding more: acceptance needs them."""
         known = self._steps.get((state, letter))
         if known is None:
-            targets: set[Obligations] = {frozenset()}
-            for node in state:
+            targets: set[Obligations] = {0}
+            for node in _members(state):
                 moves = self._move(node, letter)
                 self._spend(len(targets) * len(moves) + 1)
                 targets = {left | right for left in targets for right in moves}
@@ -125,12 +127,12 @@ class Automata:
 
     def _fulfilled(self, letter: int, target: Obligations, untils: Obligations) -> Obligations:
         """Which untils a transition fulfils."""
-        return frozenset(
-            until
-            for until in untils
-            if until not in target
-            or any(until not in move and move <= target for move in self._move(until, letter))
-        )
+        self._spend(1)
+        found = untils & ~target
+        for until in _members(untils & target):
+            if any(not move >> until & 1 and move & target == move for move in self._move(until, letter)):
+                found |= 1 << until
+        return found
 
     def live(self, states: Sets) -> Sets:
         """Those of the states that accept some word; nothing that demands more than another one."""
@@ -153,8 +155,12 @@ class Automata:
             ]
             if len(edges) > MAX_OBLIGATION_SETS:
                 raise TooLargeError
+            self._spend(len(edges[state]))
             waiting += [target for _, target in edges[state] if target not in edges]
-        untils = frozenset(node for state in edges for node in state if self._nodes[node][0] == "until")
+        untils = 0
+        for state in edges:
+            untils |= state
+        untils = sum(1 << node for node in _members(untils) if self._nodes[node][0] == "until")
         for component in strong_components(edges, lambda state: [target for _, target in edges[state]]):
             inner = set(component)
             missing = untils
@@ -163,7 +169,7 @@ class Automata:
                 for letter, target in edges[state]:
                     if target in inner:
                         cyclic = True
-                        missing -= self._fulfilled(letter, target, missing)
+                        missing &= ~self._fulfilled(letter, target, missing)
                     elif self._live[target]:
                         alive = True
             verdict = alive or (cyclic and not missing)
@@ -179,3 +185,16 @@ class Automata:
         if known is None:
             known = self._after[state, letter] = self.live(self._transitions(state, letter))
         return known
+
+
+_NOTHING_LEFT: Sets = frozenset((0,))
+
+
+def _members(bits: int) -> list[int]:
+    """The numbers in a bit set."""
+    found = []
+    while bits:
+        lowest = bits & -bits
+        found.append(lowest.bit_length() - 1)
+        bits ^= lowest
+    return found

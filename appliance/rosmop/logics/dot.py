@@ -22,8 +22,9 @@ def to_dot(compiled: CompiledProperty) -> str | None:
     for state in shown:
         told = graph.verdicts[state]
         name = _name(compiled, state)
-        label = name if not told or told[0] == name else f"{name}\\n{', '.join(told)}"
-        double = ", peripheries=2" if told else ""
+        more = [category for category in told if category != name]
+        label = f"{name}\\n{', '.join(more)}" if more else name
+        double = ", peripheries=2" if told and name not in told else ""
         lines.append(f"  {state} [label={_quoted(label)}{double}];")
     for state in shown:
         labels: dict[int, list[str]] = {}

@@ -44,7 +44,7 @@ class _GrammarReader:
 
     def grammar(self) -> Grammar:
         self._find_heads()
-        if not self._heads:
+        if not self._heads and self._tokens.ahead(1).kind not in (":", "::="):
             raise self._tokens.unexpected("a production such as `S -> a S b | epsilon`")
         while self._tokens.token.kind != "end":
             self._production()

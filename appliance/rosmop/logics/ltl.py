@@ -101,7 +101,7 @@ def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
     return for_it, against_it
 
 
-_SOMETHING: Sets = frozenset((frozenset(),))
+_SOMETHING: Sets = frozenset((0,))
 
 
 def _refuse_past(source: Source, formula: Formula) -> None:

@@ -61,32 +61,21 @@ Step = tuple[Shape, tuple[int, ...]]
 class Frame:
     """An Earley set. ``age`` grows from frame to frame; ``depth`` counts the frames that wait below."""
 
-    __slots__ = ("age", "conts", "depth", "made", "shape")
+    __slots__ = ("age", "conts", "depth", "shape")
 
     def __init__(self, shape: Shape, conts: "Conts", age: int, depth: int) -> None:
         self.shape = shape
         self.conts = conts
         self.age = age
         self.depth = depth
-        self.made: dict[int, Continuation] | None = None
 
     def resolve(self, references: Sequence[int]) -> "Conts":
         """The continuations that references of this frame's shape stand for."""
-        if len(references) == 1 and references[0] >= 0:
-            return (self.conts[references[0]],)
-        conts, made = self.conts, self.made
-        if made is None:
-            made = self.made = {}
-        found = []
-        for reference in references:
-            if reference >= 0:
-                found.append(conts[reference])
-            else:
-                cont = made.get(reference)
-                if cont is None:
-                    cont = made[reference] = (self, reference)
-                found.append(cont)
-        return tuple(found)
+        if len(references) == 1:
+            only = references[0]
+            return (self.conts[only] if only >= 0 else (self, only),)
+        conts = self.conts
+        return tuple([conts[reference] if reference >= 0 else (self, reference) for reference in references])
 
 
 Continuation = tuple[Frame, int] | None
@@ -126,7 +115,7 @@ class Recogniser:
         accepted = False
         while shape.done:
             if not shape.kept:
-                shape, conts, accepted = self._complete_wide(shape, conts, accepted=accepted)
+                shape, conts, accepted = self._complete_wide(shape, conts, frame, accepted=accepted)
                 break
             index = _newest(shape.done, conts)
             cont = conts[index]
@@ -150,7 +139,9 @@ class Recogniser:
             raise RunFaultError(f"the trace is nested more than {MAX_DEPTH} deep")
         return Frame(shape, conts, frame.age + 1, depth), accepted
 
-    def _complete_wide(self, shape: Shape, conts: Conts, *, accepted: bool) -> tuple[Shape, Conts, bool]:
+    def _complete_wide(
+        self, shape: Shape, conts: Conts, before: Frame, *, accepted: bool
+    ) -> tuple[Shape, Conts, bool]:
         """All completions at once, without tables: for the large frames of ambiguous grammars."""
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
@@ -167,9 +158,11 @@ class Recogniser:
             fresh = {others[reference] for reference in returned.done} - completed
             completed |= fresh
             waiting += fresh
+        same = {cont: cont for cont in before.conts}
         number: dict[Continuation, int] = {}
         entries = sorted((item, number.setdefault(cont, len(number))) for item, cont in items)
-        return self._shape(tuple(entries), (), len(number)), tuple(number), accepted
+        chosen = tuple([same.get(cont, cont) for cont in number])
+        return self._shape(tuple(entries), (), len(number)), chosen, accepted
 
     # ---- tables
 

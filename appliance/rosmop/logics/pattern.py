@@ -123,18 +123,22 @@ class Pattern:
         """The next mode when the clock of the mode has run out."""
         if self.within_ns is None:
             return mode
-        if self.kind == "no" and mode == "quiet":
-            return "stirred" if self.opens is not None and self.closes is not None else "over"
+        if self.kind == "no" and mode == "quiet" and (self.opens is None or self.closes is None):
+            return "over"
         return "violated" if mode == _DUE.get(self.kind) else mode
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
-    """The verdict of each mode: what is certain in it, whatever follows."""
+    """The verdict of each mode: what is certain in it, whatever follows.
+
+    What is due can always still come, unless the event that is waited for closes the scope.
+    """
     unmet = {"violated", _DUE.get(pattern.kind, "violated")}
     found: dict[Mode, Categories] = {}
     for mode in MODES:
         possible = _reachable(pattern, mode, events)
-        found[mode] = VALIDATION if not possible & unmet else VIOLATION if possible <= unmet else UNDECIDED
+        certain = mode == "violated" or (mode in unmet and pattern.closes == pattern.second)
+        found[mode] = VIOLATION if certain else UNDECIDED if possible & unmet else VALIDATION
     return found
 
 

@@ -1,0 +1,104 @@
+"""What one step of a monitor costs, per logic, on traces of a thousand and a million events.
+
+    python benchmarks/logic_steps.py [--long EVENTS]
+
+The cost must not grow with the trace or with a time bound. The loop around the step is measured alone and subtracted.
+For monitors that are tables the cost of generated code that looks the tables up inline is shown as well.
+"""
+
+import argparse
+import gc
+import time
+from collections.abc import Sequence
+from random import Random
+
+from appliance.rosmop.logics.catalogue import compile_property
+from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty, Run
+from appliance.rosmop.positions import Position
+
+EVENTS = ("a", "b", "c")
+MS = 1_000_000
+
+PROPERTIES = (
+    ("fsm", "s0 [ a -> s1, default s0 ] s1 [ b -> s0, default s1 ]", "mixed"),
+    ("tfsm", "s0 [ a -> s1, default s0 ] s1 [ b -> s0, default s1, timeout 1h -> s0 ]", "mixed"),
+    ("ere", "(a | b c* & ~(a a))* (a | b | c)*", "mixed"),
+    ("ltl", "[](a => o (!c or <> b))", "mixed"),
+    ("ptltl", "a => (!c S b)", "mixed"),
+    ("ptltl", " xor ".join("(*) " * n + "a" for n in range(1, 16)), "mixed"),
+    ("cfg", "S -> S a | S b | S c | epsilon", "mixed"),
+    ("cfg", "S -> S a S b | epsilon", "pairs"),
+    ("cfg", "S -> a S b S | epsilon", "pairs"),
+    ("cfg", "S -> S S | a S b | a b", "pairs"),
+    ("cfg", "S -> a S b | epsilon", "nested"),
+    ("mtl", "a => once[0,500ms] b", "mixed"),
+    ("mtl", "a => once[0,24h] b", "mixed"),
+    ("mtl", "!c since[10ms,20ms] a", "mixed"),
+    ("mtl", "!c since[10s,20s] a", "mixed"),
+    ("mtl", "once[1s,1s] a", "mixed"),
+    ("pattern", "globally: a forbids c within 1ns", "mixed"),
+    ("pattern", "after a until c: a causes b within 1h", "mixed"),
+)
+
+
+def trace(kind: str, length: int) -> list[int]:
+    """Event indexes: at random, balanced pairs of depth up to two, or all openings before all closings."""
+    if kind == "pairs":
+        return [0, 0, 1, 1, 0, 1] * (length // 6)
+    if kind == "nested":
+        return [0] * (length // 2) + [1] * (length // 2)
+    return Random(1).choices(range(len(EVENTS)), k=length)
+
+
+def per_step(run: Run, events: Sequence[int]) -> float:
+    """Nanoseconds per step; events come a millisecond apart."""
+    step = run.step
+    times = range(0, len(events) * MS, MS)
+    gc.collect()
+    start = time.perf_counter_ns()
+    for event, now in zip(events, times, strict=True):
+        step(event, now)
+    spent = time.perf_counter_ns() - start
+    start = time.perf_counter_ns()
+    for _event, _now in zip(events, times, strict=True):
+        pass
+    return (spent - (time.perf_counter_ns() - start)) / len(events)
+
+
+def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | None:
+    """Nanoseconds per step of code that looks the tables up itself."""
+    if not isinstance(compiled, FiniteProperty):
+        return None
+    table, verdicts, state = compiled.automaton.table, compiled.automaton.verdicts, compiled.automaton.initial
+    told = 0
+    start = time.perf_counter_ns()
+    for event in events:
+        state = table[state][event]
+        if verdicts[state]:
+            told += 1
+    spent = time.perf_counter_ns() - start
+    start = time.perf_counter_ns()
+    for _event in events:
+        pass
+    return (spent - (time.perf_counter_ns() - start)) / len(events)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--long", type=int, default=1_000_000, help="events of the long trace")
+    lengths = (1_000, parser.parse_args().long)
+    print(f"{'logic':8} {'ns/step':>8} {'ns/step':>8} {'inline':>7}  formula (trace)")
+    print(f"{'':8} {lengths[0]:>8} {lengths[1]:>8}")
+    for logic, formula, kind in PROPERTIES:
+        compiled = compile_property(logic, formula, EVENTS, Position("benchmark", 1, 1))
+        per_step(compiled.start(0), trace(kind, 1_000))
+        costs = [per_step(compiled.start(0), trace(kind, length)) for length in lengths]
+        inline = inline_step(compiled, trace(kind, lengths[-1]))
+        shown = formula if len(formula) < 60 else formula[:57] + "…"
+        inlined = "" if inline is None else f"{inline:.0f}"
+        print(f"{logic:8} {costs[0]:8.0f} {costs[1]:8.0f} {inlined:>7}  {shown} ({kind})")
+
+
+if __name__ == "__main__":
+    main()
