@@ -34,7 +34,7 @@ class Limits:
     """The same in bytes. A message in the middle of being sent does not count: it is never dropped."""
 
     queue_grace: float = 0.05
-    """While *every* subscriber of a topic is full, and for no longer, its publisher is not read."""
+    """While *every* subscriber of a topic is behind, and for no longer, its publisher is not read."""
 
     memory_bytes: int = 1024 * MIB
     """Queues and unfinished messages of the whole process."""

@@ -15,6 +15,7 @@ from appliance.relay.frames import MemoryBudget, boundary_at
 from appliance.relay.limits import Limits
 
 _VECTORS = 64
+_BEHIND = 1 << 20
 
 
 class Outbox:
@@ -41,6 +42,11 @@ class Outbox:
     def size(self) -> int:
         """Their bytes."""
         return self._size
+
+    @property
+    def behind(self) -> bool:
+        """Whether so much waits that it is worth letting the subscriber catch up, if that holds up nobody."""
+        return self._size >= _BEHIND or self.full
 
     @property
     def full(self) -> bool:

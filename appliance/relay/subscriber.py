@@ -40,7 +40,7 @@ class Subscriber:
         self.topic = topic
         self.host = host
         self.caller_id = fields["callerid"]
-        self.full_since: float | None = None
+        self.behind_since: float | None = None
         self._loop = context.loop
         self._socket = sock
         self._send = sock.send
@@ -96,8 +96,8 @@ class Subscriber:
                 return
             outbox.append(batch.keep(), batch.messages, sent)
             self._loop.change(self._socket.fileno(), READ | WRITE)
-        if self.full_since is None and outbox.full:
-            self.full_since = self._loop.clock()
+        if self.behind_since is None and outbox.behind:
+            self.behind_since = self._loop.clock()
 
     @property
     def full(self) -> bool:
@@ -129,9 +129,8 @@ class Subscriber:
             return
         outbox.advance(sent)
         if not outbox:
-            self.full_since = None
+            self.behind_since = None
             self._loop.change(self._socket.fileno(), READ)
-        if not outbox.full:
             self.topic.relieve()
 
     def _listen(self) -> None:

@@ -12,10 +12,10 @@ md5sum are they cut: they must read the new header. A publisher that is killed a
 incarnation with another key and port; its subscribers are told by control, and the old connections end with
 the withdrawal.
 
-When *all* subscribers are full at the same moment, the publisher is not read for at most `queue_grace`: a
-subscriber process that was descheduled for some milliseconds under a flood loses nothing, while one that is
-stuck is treated as stuck (its oldest messages are dropped) until it has caught up completely, and never
-delays the others: as soon as one has room, the publisher is read.
+When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
+most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
+and large messages do not pile up. One that takes longer is slow: what is beyond its bounds is dropped until it
+has caught up completely, and it never delays the others, since one that keeps up is never behind.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,7 +28,8 @@ from appliance.relay.frames import Batch, MemoryBudget
 class Member(Protocol):
     """A subscriber, as its topic sees it."""
 
-    full_since: float | None
+    behind_since: float | None
+    """When so much waited for it first that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or refuse if the types differ; whether it is served now."""
@@ -149,12 +150,12 @@ class RelayedTopic:
         congested = False
         for member in self._served:
             member.deliver(batch)
-            congested = congested or member.full_since is not None
+            congested = congested or member.behind_since is not None
         if congested:
-            self._relieve_or_pause()
+            self._pause_or_trim()
 
     def relieve(self) -> None:
-        """A subscriber has room again, or is gone: the publisher may be read."""
+        """A subscriber has caught up, or is gone, or time is up: the publisher is read."""
         if self._paused:
             self._paused = False
             if self.upstream is not None:
@@ -193,19 +194,18 @@ class RelayedTopic:
             self._budget.used += len(batch.view)
         self._latched = batch
 
-    def _relieve_or_pause(self) -> None:
-        full = [member for member in self._served if member.full]
-        if not full:
-            return
-        if len(full) == len(self._served):
-            deadlines = [member.full_since + self._grace for member in full if member.full_since is not None]
-            left = max(deadlines) - self._clock()
-            if left > 0 and self.upstream is not None:
+    def _pause_or_trim(self) -> None:
+        """Let the subscribers catch up if all are behind and have not been for long; else drop for the full."""
+        since = [member.behind_since for member in self._served if member.behind_since is not None]
+        if since and len(since) == len(self._served) and self.upstream is not None:
+            left = max(since) + self._grace - self._clock()
+            if left > 0:
                 self._paused = True
                 self.upstream.pause(left)
                 return
-        for member in full:
-            self._dropped += member.trim()
+        for member in self._served:
+            if member.full:
+                self._dropped += member.trim()
 
 
 def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:

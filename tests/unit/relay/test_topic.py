@@ -41,12 +41,12 @@ class RecordedUpstream:
 
 
 class RecordedMember:
-    """A subscriber that takes everything until it is told to be full."""
+    """A subscriber that takes everything until it is told that it is behind."""
 
     def __init__(self, *, fits: bool = True) -> None:
         self.header: Mapping[str, str] = {}
         self.received = b""
-        self.full_since: float | None = None
+        self.behind_since: float | None = None
         self.was_cut = ""
         self.trimmed = 0
         self._fits = fits
@@ -63,7 +63,7 @@ class RecordedMember:
     @property
     def full(self) -> bool:
         """As told."""
-        return self.full_since is not None
+        return self.behind_since is not None
 
     def trim(self) -> int:
         """Pretend to drop three."""
@@ -191,15 +191,15 @@ def test_a_subscriber_of_another_type_is_not_served() -> None:
     assert member.received == b""
 
 
-def test_the_publisher_is_paused_only_while_all_are_full() -> None:
-    """One with room is never delayed by the others; the full one drops."""
+def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
+    """One that keeps up is never delayed by the others; the full one drops."""
     story = Story()
     slow, quick = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
-    slow.full_since = 100.0
+    slow.behind_since = 100.0
     story.topic.received(batch(b"1"))
     assert (slow.trimmed, quick.trimmed) == (1, 0)
-    quick.full_since = 100.01
+    quick.behind_since = 100.01
     story.topic.received(batch(b"2"))
     assert story.upstream.asked[-1] == "pause 0.06"
     story.topic.relieve()
@@ -212,7 +212,7 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
     member = story.join()
     story.topic.upstream_opened(HEADER)
     story.topic.traffic()
-    member.full_since, story.now = 99.0, 100.0
+    member.behind_since, story.now = 99.0, 100.0
     story.topic.received(batch(b"1"))
     assert member.trimmed == 1
     assert "pause" not in "".join(story.upstream.asked)
