@@ -5,9 +5,9 @@ into and returns all frames that are whole after each read as one `Batch`, walke
 
 - Small frames are received into a scratch area that all receivers of the process share; only the torn frame
   at the end of a read, if there is one, is set aside until the rest arrives.
-- A frame beyond `LARGE` gets an area of its own that is filled in place. It is anonymous memory, so a length
-  that is declared and never sent costs address space only. An area of up to 2 MiB is used again for the
-  next large frame unless a queue has kept it.
+- A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 2 MiB is used again
+  for the next large frame unless a queue has kept it; a larger one is anonymous memory, so that a length which
+  is declared and never sent costs address space only.
 
 Frames are passed on whole, so a publisher that dies in the middle of one tears nobody's stream: what its
 subscribers have been sent always ends with a frame.
@@ -91,7 +91,7 @@ class FrameReceiver:
         """Where the next bytes of the connection go."""
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
-                self._area = memoryview(mmap.mmap(-1, self._target))
+                self._area = _new_area(self._target)
             self._delivered = None
             return self._area[self._filled : self._target]
         torn = self._torn
@@ -138,7 +138,7 @@ class FrameReceiver:
 
     def _begin_area(self, need: int, start: memoryview) -> None:
         """Go on with a frame of `need` bytes, of which `start` has come, in an area of its own."""
-        area = memoryview(mmap.mmap(-1, need))
+        area = _new_area(need)
         area[: len(start)] = start
         self._budget.used += len(start) - self._filled
         self._area, self._target, self._filled = area, need, len(start)
@@ -181,6 +181,11 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
         if position <= offset:
             frames += 1
     return frames, position
+
+
+def _new_area(size: int) -> memoryview:
+    """Memory for one large frame: from the heap, which is warm, or, beyond `_KEEP_AREA`, not there until filled."""
+    return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
 
 
 def _too_long(length: int, limit: int) -> LimitExceededError:
