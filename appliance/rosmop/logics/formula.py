@@ -174,7 +174,7 @@ class _FormulaReader:
         self._tokens.expect("]", "`]` (bounds are closed)")
         if high is not None and low > high:
             raise self._source.error(
-                opening.offset, "the lower bound is above the upper bound; exchange them"
+                opening.offset, "the lower bound is above the upper bound (a bare number is seconds)"
             )
         return (low, high)
 

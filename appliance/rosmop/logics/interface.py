@@ -78,6 +78,9 @@ class Source:
 class CompiledProperty(ABC):
     """A property ready to run. ``categories`` are the names that may have handlers."""
 
+    expiry = "deadline"
+    """What the passing of a run's deadline is called in records (``timeout`` for machines)."""
+
     def __init__(self, source: Source, categories: Sequence[str]) -> None:
         self.source = source
         self.logic = source.logic

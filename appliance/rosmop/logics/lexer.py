@@ -45,7 +45,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
             0,
             f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties",
         )
-    alternatives = "|".join(re.escape(sign) for sign in sorted(signs, key=len, reverse=True))
+    alternatives = "|".join(_sign_pattern(sign) for sign in sorted(signs, key=len, reverse=True))
     pattern = re.compile(
         r"(?P<space>\s+|//[^\n]*|/\*.*?\*/)"
         r"|(?P<number>\d+(?:\.\d+)?|\.\d+)"
@@ -66,6 +66,11 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
         offset = match.end()
     tokens.append(Token("end", "", len(source.text)))
     return tokens
+
+
+def _sign_pattern(sign: str) -> str:
+    """A sign that ends in a letter (``~o``) ends where the word ends."""
+    return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
 def _shown(character: str) -> str:

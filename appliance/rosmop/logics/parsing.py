@@ -16,7 +16,7 @@ be completed there. Positions are then not kept; what nobody waits for any more 
   is computed once and kept in tables. A deterministic grammar soon finds everything in them; large shapes,
   which only ambiguous grammars have, are not kept.
 
-Invariants: continuations of a frame belong to older frames, so completing goes from newer to older ones and
+Invariants: continuations of a frame belong to less deep frames, so completing goes from deep to less deep and
 ends; a frame is viable if it has an item, because every symbol of the grammar can be completed
 (``grammar.prepare``).
 """
@@ -59,14 +59,13 @@ Step = tuple[Shape, tuple[int, ...]]
 
 
 class Frame:
-    """An Earley set. ``age`` grows from frame to frame; ``depth`` counts the frames that wait below."""
+    """An Earley set. ``depth`` counts the frames that wait below."""
 
-    __slots__ = ("age", "conts", "depth", "shape")
+    __slots__ = ("conts", "depth", "shape")
 
-    def __init__(self, shape: Shape, conts: "Conts", age: int, depth: int) -> None:
+    def __init__(self, shape: Shape, conts: "Conts", depth: int) -> None:
         self.shape = shape
         self.conts = conts
-        self.age = age
         self.depth = depth
 
     def resolve(self, references: Sequence[int]) -> "Conts":
@@ -100,7 +99,7 @@ class Recogniser:
         item = len(self._next)
         self._next += [start, -1]
         items = ((item, 0),) if grammar.rules and grammar.start is not None else ()
-        self.initial = Frame(self._shape(items, (), len(items)), (None,) * len(items), 0, 0)
+        self.initial = Frame(self._shape(items, (), len(items)), (None,) * len(items), 0)
 
     # ---- one event
 
@@ -117,7 +116,7 @@ class Recogniser:
             if not shape.kept:
                 shape, conts, accepted = self._complete_wide(shape, conts, frame, accepted=accepted)
                 break
-            index = _newest(shape.done, conts)
+            index = _deepest(shape.done, conts)
             cont = conts[index]
             if cont is None:
                 accepted = True
@@ -137,7 +136,7 @@ class Recogniser:
                 depth = cont[0].depth + 1
         if depth > MAX_DEPTH:
             raise RunFaultError(f"the trace is nested more than {MAX_DEPTH} deep")
-        return Frame(shape, conts, frame.age + 1, depth), accepted
+        return Frame(shape, conts, depth), accepted
 
     def _complete_wide(
         self, shape: Shape, conts: Conts, before: Frame, *, accepted: bool
@@ -296,13 +295,13 @@ class Recogniser:
         return joined, tuple([every[number] for number in chosen])
 
 
-def _newest(done: tuple[int, ...], conts: Conts) -> int:
-    """Of the completed continuations the one whose frame is the newest, so that each is dealt with once."""
-    newest, age = done[0], -2
+def _deepest(done: tuple[int, ...], conts: Conts) -> int:
+    """Of the completed continuations the deepest: it can only complete less deep ones, so each has its turn once."""
+    deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:
             cont = conts[index]
-            own = -1 if cont is None else cont[0].age
-            if own > age:
-                newest, age = index, own
-    return newest
+            own = -1 if cont is None else cont[0].depth
+            if own > depth:
+                deepest, depth = index, own
+    return deepest

@@ -24,6 +24,8 @@ class TimedMachine(CompiledProperty):
     With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event.
     """
 
+    expiry = TIMEOUT
+
     def __init__(
         self,
         source: Source,

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -50,6 +51,27 @@ def test_what_may_block(logic: str) -> None:
     assert refused == ({"timeout"} if logic == "tfsm" else set())
     with pytest.raises(KeyError):
         monitor.blocking_refused("no such category")
+
+
+DOCUMENTED = {
+    "fsm": ("start", "stop"),
+    "tfsm": ("on", "off", "ready"),
+    "ere": ("open", "read", "write", "close"),
+    "cfg": ("lock", "unlock"),
+    "ltl": ("request", "grant"),
+    "ptltl": ("fire", "unsafe", "armed"),
+    "mtl": ("fire", "safe"),
+    "pattern": ("armed", "disarmed", "fire", "safe"),
+}
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_the_documented_example_compiles(logic: str) -> None:
+    """The example of each logic in docs/logics.md is accepted as it stands there."""
+    page = Path(__file__).parents[4].joinpath("docs", "logics.md").read_text(encoding="utf-8")
+    example = page.split(f"\n## {logic}\n")[1].split("\n\n")[0]
+    formula = example.split("```")[1] if "```" in example else example.strip("`")
+    assert compiled(logic, formula, DOCUMENTED[logic]).categories
 
 
 def test_an_unknown_logic_is_told_where_its_name_stands() -> None:

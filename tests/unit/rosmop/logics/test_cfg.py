@@ -4,8 +4,9 @@ from random import Random
 
 import pytest
 
+from appliance.rosmop.logics import parsing
 from appliance.rosmop.logics.cfg import GrammarRun
-from appliance.rosmop.logics.interface import FiniteProperty
+from appliance.rosmop.logics.interface import FiniteProperty, RunFaultError
 from tests.unit.rosmop.logics.driving import ABC, compiled, refusal, seeded, told, traces
 
 Rules = dict[str, list[tuple[str, ...]]]
@@ -193,6 +194,28 @@ def test_deep_traces() -> None:
     run.step(2, 0)
     assert [run.step(1, 0) for _ in range(200_000)][-1] == ("match",)
     assert run.step(1, 0) == ("fail",)
+
+
+def test_a_run_that_would_grow_too_far_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limits of nesting and of ambiguity a step is a fault, and the run stays where it was."""
+    monkeypatch.setattr(parsing, "MAX_DEPTH", 50)
+    run = compiled("cfg", "S -> a S b | c").start(0)
+    taken = 0
+    with pytest.raises(RunFaultError, match="nested more than 50 deep"):
+        for _ in range(60):
+            run.step(0, 0)
+            taken += 1
+    assert 50 <= taken <= 52
+    run = compiled("cfg", "S -> a S b | c").start(0)
+    for _ in range(taken - 1):
+        run.step(0, 0)
+    assert run.step(2, 0) == ()
+    assert [run.step(1, 0) for _ in range(taken - 1)][-1] == ("match",)
+    monkeypatch.setattr(parsing, "MAX_WIDTH", 20)
+    run = compiled("cfg", "S -> a S a | b").start(0)
+    with pytest.raises(RunFaultError, match="too many ways"):
+        for _ in range(100):
+            run.step(0, 0)
 
 
 def test_an_empty_language_fails_at_once() -> None:
