@@ -8,9 +8,18 @@ here because something reads it.
 import ipaddress
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ByteSize, ConfigDict, Field, IPvAnyAddress, IPvAnyNetwork
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ByteSize,
+    ConfigDict,
+    Field,
+    IPvAnyAddress,
+    IPvAnyNetwork,
+    model_validator,
+)
 
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 
@@ -86,7 +95,7 @@ class Audit(_Section):
     retention_days: Seconds | None = Field(
         default=None, description="older records are removed, and that is recorded"
     )
-    retention_bytes: Size | None = Field(
+    retention_bytes: Annotated[ByteSize, Field(ge=1 << 20)] | None = Field(
         default=None, description="beyond this size the oldest records are removed"
     )
 
@@ -143,6 +152,14 @@ class Settings(_Section):
     isolation: Literal["container", "netns", "none"] = Field(
         default="none", description="where the appliance lives; none: no firewall, for development only"
     )
+    relaying: Literal["all", "monitored"] = Field(
+        default="all",
+        description="topics and services that go through the relay; `monitored` (those in [Monitor]) is no boundary",
+    )
+    mediation: Literal["full", "monitored"] = Field(
+        default="full",
+        description="`monitored` tells nodes each other's real URIs; needs relaying: monitored",
+    )
     relays: Count = Field(default=1, le=1, description="relay processes")
     advertise: list[Advertisement] = []
     limits: Limits = Limits()
@@ -150,6 +167,12 @@ class Settings(_Section):
     liveness: Liveness = Liveness()
     relay: Relay = Relay()
     firewall: Firewall = Firewall()
+
+    @model_validator(mode="after")
+    def _mediation_fits(self) -> Self:
+        if self.mediation == "monitored" and self.relaying == "all":
+            raise ValueError("mediation: monitored needs relaying: monitored (--relay monitored)")
+        return self
 
     @property
     def listen_address(self) -> tuple[str, int]:

@@ -119,6 +119,10 @@ class ProbePassed(Message):
     """The ROSMaster port is hidden (again)."""
 
 
+class PolicyReloadRequested(Message):
+    """Supervisor got SIGHUP: control reads the policy file again, as `rosrv policy reload` would."""
+
+
 class RouteWanted(Message):
     """Control asks which address of the machine a host uses to reach the appliance (netns isolation)."""
 
@@ -339,7 +343,8 @@ class TrafficReported(Message):
 
 Lifeline = (
     Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
-    | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | RouteWanted
+    | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | PolicyReloadRequested
+    | RouteWanted
     | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip
 

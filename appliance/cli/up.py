@@ -38,6 +38,10 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     ] = None,
     rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROSMaster; 0: any")] = None,
     isolation: Annotated[str | None, typer.Option(help="container, netns or none")] = None,
+    relay: Annotated[str | None, typer.Option(help="all, or monitored: only what [Monitor] names")] = None,
+    mediation: Annotated[
+        str | None, typer.Option(help="full, or monitored: nodes are told real URIs (with --relay monitored)")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Say in JSON when nodes may connect")] = False,
 ) -> None:
     """Start the appliance; ends on SIGTERM or Ctrl-C.
@@ -50,6 +54,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         "listen": listen,
         "rosmaster_port": rosmaster_port,
         "isolation": isolation,
+        "relaying": relay,
+        "mediation": mediation,
     }
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")

@@ -8,6 +8,7 @@ from appliance.master.faces import Faces
 from appliance.master.gate import Gate
 from appliance.master.graph import Graph
 from appliance.master.liveness import Liveness
+from appliance.master.mediation import Mediation
 from appliance.master.parameters import ParameterMirror
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Registry
@@ -30,6 +31,7 @@ class Master:
     faces: Faces
     liveness: Liveness
     parameters: ParameterMirror
+    mediation: Mediation
     addresses: Addresses
     policy: Callable[[], Policy]
     stop: Callable[[str], None]

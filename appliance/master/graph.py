@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 
 from appliance.audit.record import Severity
 from appliance.master.delivery import Delivery, NodeCall
+from appliance.master.mediation import Mediation
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Incarnation, Kind, Registration, Registry
 from appliance.master.relays import RelayControl
@@ -26,6 +27,7 @@ class Graph:
         relay: RelayControl,
         delivery: Delivery,
         recorder: Recorder,
+        mediation: Mediation,
         *,
         closed: Callable[[Incarnation], None],
     ) -> None:
@@ -33,6 +35,7 @@ class Graph:
         self._relay = relay
         self._delivery = delivery
         self._recorder = recorder
+        self._mediation = mediation
         self._closed = closed
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
@@ -89,7 +92,7 @@ class Graph:
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
         """Another incarnation took the name; ROSMaster tells the old one to shut down."""
         lost = self._registry.replace(incarnation, time.time())
-        self._withdraw(incarnation, lost)
+        self._tell_withdrawn(lost)
         self._relay.forgotten(incarnation)
         self._closed(incarnation)
         other = by.host != incarnation.host
@@ -106,7 +109,7 @@ class Graph:
     def lost(self, incarnation: Incarnation, why: str) -> None:
         """The node does not answer any more: what it had counts for nobody until it returns."""
         lost = self._registry.overshadow(incarnation, time.time())
-        self._withdraw(incarnation, lost)
+        self._tell_withdrawn(lost)
         self._relay.node_withdrawn(incarnation)
         self._delivery.drop(incarnation)
         self._recorder.happened(
@@ -142,7 +145,7 @@ class Graph:
         """An incarnation is dropped for good."""
         registrations = list(incarnation.registrations.values())
         self._registry.forget(incarnation)
-        self._withdraw(incarnation, registrations)
+        self._tell_withdrawn(registrations)
         self._relay.forgotten(incarnation)
         self._delivery.drop(incarnation)
         self._closed(incarnation)
@@ -162,17 +165,21 @@ class Graph:
 
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
         """The list that answers a registration: what the subscriber is told from here on is relative to it."""
-        uris = self._registry.publishers_for(subscriber, topic)
+        uris = self._publishers_for(subscriber, topic)
         subscriber.told_lists[topic] = uris
         return list(uris)
 
     def _tell_one(self, subscriber: Incarnation, topic: str, *, always: bool) -> None:
-        uris = self._registry.publishers_for(subscriber, topic)
+        uris = self._publishers_for(subscriber, topic)
         if always or subscriber.told_lists.get(topic) != uris:
             subscriber.told_lists[topic] = uris
             self._delivery.push(subscriber, NodeCall("publisherUpdate", (topic, list(uris))))
 
-    def _withdraw(self, incarnation: Incarnation, registrations: Iterable[Registration]) -> None:
+    def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
+        hidden = self._mediation.hides_publishers(topic)
+        return self._registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
+
+    def _tell_withdrawn(self, registrations: Iterable[Registration]) -> None:
         for registration in registrations:
             if registration.kind is Kind.PUBLICATION:
                 self.tell(registration.resource)

@@ -24,7 +24,6 @@ import structlog
 
 from appliance.policy.model import Address
 
-
 _log = structlog.get_logger()
 
 
@@ -214,7 +213,7 @@ class _Connection(asyncio.Protocol):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._parser = httptools.HttpRequestParser(self)
 
-    def connection_lost(self, error: Exception | None) -> None:
+    def connection_lost(self, _error: Exception | None) -> None:
         self._closing = True
         if self._counted:
             self.server.visitors.leave(self.peer.host)

@@ -26,6 +26,7 @@ class ControlLifeline:
         self.links: dict[str, Callable[[int], None]] = {}
         self.stopped: Callable[[], None] = lambda: None
         self.processes_changed: Callable[[], None] = lambda: None
+        self.reload_requested: Callable[[], None] = lambda: None
         self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
         self._early_links: list[tuple[str, int]] = []
@@ -81,9 +82,19 @@ class ControlLifeline:
                 self.restored.set()
             case messages.LinkOpened(role):
                 self._open_link(role, descriptors[0])
+            case _ if not descriptors:
+                self._learned(message)
+            case _:
+                _not_for_us(message)
+
+    def _learned(self, message: Any) -> None:
+        """What only changes what control knows of its surroundings, or asks it to do something."""
+        match message:
             case messages.ProcessesChanged(processes):
                 self.surroundings.processes = processes
                 self.processes_changed()
+            case messages.PolicyReloadRequested():
+                self.reload_requested()
             case messages.FirewallReported():
                 self.surroundings.firewall = message
             case messages.ProbeFailed(reason):
@@ -97,11 +108,7 @@ class ControlLifeline:
                     if not future.done():
                         future.set_result(address)
             case _:
-                for descriptor in descriptors:
-                    os.close(descriptor)
-                _log.error(
-                    "the supervisor said something that is not for control", message=type(message).__name__
-                )
+                _not_for_us(message)
 
     def _open_link(self, role: str, descriptor: int) -> None:
         serve = self.links.get(role)
@@ -109,3 +116,7 @@ class ControlLifeline:
             serve(descriptor)
         else:
             self._early_links.append((role, descriptor))
+
+
+def _not_for_us(message: Any) -> None:
+    _log.error("the supervisor said something that is not for control", message=type(message).__name__)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from appliance.master.call import Answer, Caller
 from appliance.master.registration import key_of_stand_in
+from appliance.master.registry import Kind
 from appliance.ros.uris import node_uri, service_uri
 
 if TYPE_CHECKING:
@@ -18,7 +19,8 @@ async def lookup_node(master: "Master", caller: Caller, arguments: tuple[object,
         incarnation = master.faces.by_inner_uri(str(answer[2]))
         if incarnation is None:
             return [-1, f"unknown node [{arguments[0]}]", ""]
-        answer[2] = incarnation.outer_uri(master.addresses.told_to(caller.peer))
+        outer = incarnation.outer_uri(master.addresses.told_to(caller.peer))
+        answer[2] = outer if master.mediation.stand_ins else incarnation.real_uri
     return answer
 
 
@@ -28,10 +30,14 @@ async def lookup_service(master: "Master", caller: Caller, arguments: tuple[obje
     answer = await master.rosmaster.call("lookupService", caller.caller_id, service)
     if answer[0] == 1:
         incarnation = master.registry.by_key(key_of_stand_in(str(answer[2])))
-        if incarnation is None:
+        if incarnation is None or (Kind.SERVICE, service) not in incarnation.registrations:
             return [-1, "no provider", ""]
-        master.relay.grant_service(incarnation, service, caller.peer.host)
-        uri = service_uri(master.addresses.told_to(caller.peer), incarnation.relay_port)
+        if master.mediation.carries_service(service):
+            master.relay.grant_service(incarnation, service, caller.peer.host)
+            uri = service_uri(master.addresses.told_to(caller.peer), incarnation.relay_port)
+        else:
+            port = int(incarnation.registrations[Kind.SERVICE, service].detail)
+            uri = service_uri(str(incarnation.host), port)
         answer[1], answer[2] = f"rosrpc URI: [{uri}]", uri
     return answer
 

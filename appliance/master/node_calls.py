@@ -12,6 +12,7 @@ from appliance.master.call import Answer, Call, Caller, Identity
 from appliance.master.client import CallFailedError
 from appliance.master.registry import Incarnation, Kind
 from appliance.master.relays import TOPIC as TOPIC_CONNECTION
+from appliance.master.relays import tcpros_port
 from appliance.policy.model import Category
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Value
@@ -30,9 +31,24 @@ async def request_topic(master: "Master", caller: Caller, arguments: tuple[objec
     if "TCPROS" not in names:
         offered = ", ".join(str(one)[:40] for one in names) or "nothing"
         return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
+    if not master.mediation.carries_topic(topic):
+        return await _negotiated_directly(master, target, topic, caller)
     master.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
     address = master.addresses.told_to(caller.peer)
     return [1, f"ready on {address}:{target.relay_port}", ["TCPROS", address, target.relay_port]]
+
+
+async def _negotiated_directly(master: "Master", target: Incarnation, topic: str, caller: Caller) -> Answer:
+    """The node's own TCPROS port at its peer address; the host in its answer is never followed."""
+    try:
+        answer = await master.liveness.client(target).call(
+            "requestTopic", caller.caller_id, topic, [["TCPROS"]]
+        )
+        port = tcpros_port(answer)
+    except CallFailedError:
+        master.liveness.look_at(target)
+        return [0, f"{target.name} does not answer", []]
+    return [1, f"ready on {target.host}:{port}", ["TCPROS", str(target.host), port]]
 
 
 async def get_pid(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:

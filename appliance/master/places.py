@@ -10,7 +10,7 @@ knocks at a dead node's port finds nobody, not somebody else.
 import errno
 from collections import deque
 from collections.abc import Callable
-from socket import socket as Socket
+from socket import socket as TcpSocket
 
 from appliance.master.http import listen
 from appliance.master.registry import Incarnation
@@ -31,7 +31,7 @@ class Places:
         host: str,
         ports: range,
         *,
-        keep: Callable[[str, Socket], None],
+        keep: Callable[[str, TcpSocket], None],
         drop: Callable[[str], None],
     ) -> None:
         self._host = host
@@ -39,7 +39,7 @@ class Places:
         self._drop = drop
         self._range = ports
         self._unused = deque(ports)
-        self._sockets: dict[str, Socket] = {}
+        self._sockets: dict[str, TcpSocket] = {}
 
     def set_range(self, ports: range) -> None:
         """Take new ports from this range from now on; those in use stay."""
@@ -64,11 +64,11 @@ class Places:
         self._keep(f"port:{ports[1]}", relay)
         return ports
 
-    def socket(self, port: int) -> Socket:
+    def socket(self, port: int) -> TcpSocket:
         """The listening socket of a port that was opened or adopted."""
         return self._sockets[f"port:{port}"]
 
-    def adopt(self, name: str, sock: Socket) -> None:
+    def adopt(self, name: str, sock: TcpSocket) -> None:
         """Take a kept socket back after a restart of control."""
         self._sockets[name] = sock
         port = sock.getsockname()[1]
@@ -77,7 +77,7 @@ class Places:
 
     def reopen(self, incarnation: Incarnation) -> bool:
         """Open the same ports again (after a restart of the appliance); False when another process has one."""
-        opened: list[Socket] = []
+        opened: list[TcpSocket] = []
         for port in (incarnation.outer_port, incarnation.relay_port):
             if f"port:{port}" in self._sockets:
                 continue
@@ -114,7 +114,7 @@ class Places:
                 self._drop(name)
                 self._unused.append(port)
 
-    def _listen(self) -> Socket:
+    def _listen(self) -> TcpSocket:
         for _ in range(len(self._unused)):
             port = self._unused.popleft()
             try:

@@ -16,6 +16,7 @@ import uvloop
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
+from appliance.audit.retention import Retention
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
@@ -32,6 +33,7 @@ from appliance.master.inner import InnerFace
 from appliance.master.journal import StoreJournal, restore
 from appliance.master.lifeline import ControlLifeline
 from appliance.master.liveness import Liveness, LivenessSettings
+from appliance.master.mediation import Mediation
 from appliance.master.node_calls import NODE_CALLS
 from appliance.master.parameters import ParameterMirror, Tree
 from appliance.master.pipeline import Pipeline
@@ -123,6 +125,7 @@ class _Control:
         self._lifeline.links["signer"] = self._signer_link
         self._lifeline.probed = self._probed
         self._lifeline.processes_changed = self._reconciler.wake
+        self._lifeline.reload_requested = self._reload_on_signal
         self._lifeline.open_links()
         for work in (
             self._reconciler.run(), self._liveness.run(), self._visitors.sweep(), self._save_parameters()
@@ -139,6 +142,10 @@ class _Control:
             checkpoint_every=audit.checkpoint_records,
             checkpoint_seconds=audit.checkpoint_seconds,
             signer=self._want_signature,
+            retention=Retention(
+                days=audit.retention_days,
+                size=None if audit.retention_bytes is None else int(audit.retention_bytes),
+            ),
         )
         self._recorder = Recorder(
             self._audit,
@@ -187,8 +194,18 @@ class _Control:
         relay = RelayControl(
             registry, self._places, self._store, self._delivery, self._recorder, broken=self._look_at
         )
+        mediation = Mediation(
+            lambda: self._policies.current,
+            relay_all=settings.relaying == "all",
+            stand_ins=settings.mediation == "full",
+        )
         graph = Graph(
-            registry, relay, self._delivery, self._recorder, closed=lambda one: self._faces.close(one)
+            registry,
+            relay,
+            self._delivery,
+            self._recorder,
+            mediation,
+            closed=self._close_faces,
         )
         rosmaster = RosMaster(settings.rosmaster_port, lost=self._rosmaster_lost, limits=self._limits)
         self._faces = Faces(
@@ -244,6 +261,7 @@ class _Control:
             faces=self._faces,
             liveness=self._liveness,
             parameters=parameters,
+            mediation=mediation,
             addresses=addresses,
             policy=lambda: self._policies.current,
             stop=lambda reason: self._lifeline.say(messages.ApplianceStopRequested(reason)),
@@ -317,6 +335,7 @@ class _Control:
             "revision": self._policies.revision,
             "rosout_master": own.rstrip("/"),
             "inner_port": inner_port,
+            "own_port": self._lifeline.sockets[_OWN].getsockname()[1],
         }
         self._lifeline.say(messages.Ready(detail))
 
@@ -365,6 +384,9 @@ class _Control:
         _log.info("a node could not be told", node=incarnation.name, why=why)
         self._liveness.look_at(incarnation)
 
+    def _close_faces(self, incarnation: Incarnation) -> None:
+        self._faces.close(incarnation)
+
     def _look_at(self, incarnation: Incarnation) -> None:
         self._liveness.look_at(incarnation)
 
@@ -379,6 +401,12 @@ class _Control:
     def _policy_changed(self, ports: range) -> int:
         self._places.set_range(ports)
         return self._revocation.redecide()
+
+    def _reload_on_signal(self) -> None:
+        try:
+            self._policies.reload()
+        except PolicyRefusedError as error:
+            _log.error("the policy was refused, the last good one stays in force", findings=error.findings)
 
     def _probed(self, reason: str) -> None:
         if bool(reason) != bool(self._unhidden):

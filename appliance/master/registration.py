@@ -19,10 +19,8 @@ async def register_publisher(master: "Master", caller: Caller, arguments: tuple[
     answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
-        subscribers = master.registry.registered(Kind.SUBSCRIPTION, topic)
-        answer[2] = [
-            one.api_text if one is incarnation else one.outer_uri(incarnation.told) for one in subscribers
-        ]
+        hidden = master.mediation.hides_publishers(topic)
+        answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
     return answer
 
 

@@ -76,6 +76,11 @@ class Incarnation:
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
+    def real_uri(self) -> str:
+        """The node's own API at its peer address (told only where nothing is mediated)."""
+        return node_uri(str(self.host), self.api.port, self.api.path)
+
+    @property
     def call_uri(self) -> NodeUri:
         """Where the appliance calls the node: at its peer address, whatever host it claimed."""
         return NodeUri("http", str(self.host), self.api.port, self.api.path)
@@ -158,11 +163,14 @@ class Registry:
         pairs = [(one, each) for one in self._live.values() for each in one.registrations.values()]
         return iter(sorted(pairs, key=lambda pair: pair[1].order))
 
-    def publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
-        """The list of publisher URIs as this subscriber must see it: its own entry is its own real URI."""
+    def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
+        """The URIs of a topic's publishers or subscribers as `reader` is told them.
+
+        Its own entry is its own real URI, as it gave it; the others' are their outer ones when `hidden`.
+        """
         return tuple(
-            one.api_text if one is subscriber else one.outer_uri(subscriber.told)
-            for one in self.registered(Kind.PUBLICATION, topic)
+            one.api_text if one is reader else one.outer_uri(reader.told) if hidden else one.real_uri
+            for one in self.registered(kind, topic)
         )
 
     # --- changing ---

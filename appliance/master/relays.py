@@ -244,7 +244,7 @@ class RelayControl:
             answer = await self._delivery.client(incarnation).call(
                 "requestTopic", RELAY_NAME, topic, [["TCPROS"]]
             )
-            port = _tcpros_port(answer)
+            port = tcpros_port(answer)
         except CallFailedError as error:
             self._send(messages.UpstreamRefused(key, topic, str(error)))
             self._broken(incarnation)
@@ -298,7 +298,7 @@ class RelayControl:
         return incarnation.name if incarnation is not None else ""
 
 
-def _tcpros_port(answer: Value) -> int:
+def tcpros_port(answer: Value) -> int:
     """The port in a node's answer to `requestTopic`; the host in it is never followed."""
     match answer:
         case [1, str(), ["TCPROS", str(), int(port)]] if 0 < port < 65536:

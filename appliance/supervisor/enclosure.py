@@ -32,12 +32,13 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class Ports:
-    """The ports that the surroundings are about; `inner` is known when control is ready."""
+    """The ports that the surroundings are about; `inner` and `own` are known when control is ready."""
 
     master: int
     rosmaster: int
     nodes: range
     inner: int | None = None
+    own: int | None = None
 
 
 class Enclosure:
@@ -57,8 +58,11 @@ class Enclosure:
     def remove(self) -> None:
         """Take it away."""
 
-    def control_ready(self, inner_port: int) -> None:
-        """Control's inner face is at this port now. Raises `NetworkError` when others cannot be kept out."""
+    def control_ready(self, inner_port: int, own_port: int) -> None:
+        """Control's inner face, and the master for the appliance's own nodes, are at these ports now.
+
+        Raises `NetworkError` when others cannot be kept out.
+        """
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
         """The machine's address by which `host` reaches the appliance; None: the one it used."""
@@ -106,10 +110,10 @@ class Contained(Enclosure):
         except NetworkError as error:
             log.error("rules of the firewall may be left", error=str(error))
 
-    def control_ready(self, inner_port: int) -> None:
-        """Close the inner face to everybody but rosmaster."""
-        if self._firewall is not None and inner_port != self._ports.inner:
-            self._ports = replace(self._ports, inner=inner_port)
+    def control_ready(self, inner_port: int, own_port: int) -> None:
+        """Close both to everybody but rosmaster's user."""
+        if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
+            self._ports = replace(self._ports, inner=inner_port, own=own_port)
             self._firewall.update(self._settings())
 
     def report(self) -> dict[str, Any]:
@@ -128,8 +132,12 @@ class Contained(Enclosure):
     def probe(self) -> str | None:
         """Try to reach ROSMaster and the inner face as another local user."""
         found = [self._probe("ROSMaster", self._ports.rosmaster)]
-        if self._ports.inner is not None:
-            found.append(self._probe("the inner node face", self._ports.inner))
+        for what, port in (
+            ("the inner node face", self._ports.inner),
+            ("the own nodes' master", self._ports.own),
+        ):
+            if port is not None:
+                found.append(self._probe(what, port))
         return "; ".join(filter(None, found)) or None
 
     def _probe(self, what: str, port: int) -> str | None:
@@ -150,6 +158,7 @@ class Contained(Enclosure):
             rosmaster_uid=account_of("rosmaster").uid,
             rosmaster_port=self._ports.rosmaster,
             inner_port=self._ports.inner,
+            own_port=self._ports.own,
             master_port=self._ports.master,
             node_ports=PortRange(nodes.start, nodes.stop - 1),
         )

@@ -53,13 +53,13 @@ class Guard:
             self._tell(message)
         return reason
 
-    async def control_ready(self, inner_port: int) -> str | None:
-        """Close control's inner face to others and look whether it is; the reason when it is not."""
+    async def control_ready(self, inner_port: int, own_port: int) -> str | None:
+        """Close control's inner ports to others and look whether they are; the reason when not."""
         try:
             async with self._one_at_a_time:
-                await in_thread(lambda: self.enclosure.control_ready(inner_port))
+                await in_thread(lambda: self.enclosure.control_ready(inner_port, own_port))
         except NetworkError as error:
-            return f"the inner node face cannot be closed to others: {error}"
+            return f"control's inner ports cannot be closed to others: {error}"
         return await self.look()
 
     async def route_to(self, host: str) -> str | None:

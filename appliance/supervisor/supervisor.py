@@ -28,6 +28,7 @@ from appliance.channel.messages import (
     ApplianceStopRequested,
     Failed,
     Message,
+    PolicyReloadRequested,
     Pong,
     ProcessesChanged,
     ProcessInfo,
@@ -72,6 +73,7 @@ class ControlReady(msgspec.Struct, frozen=True):
     revision: int
     rosout_master: str
     inner_port: int
+    own_port: int
 
 
 @dataclass
@@ -116,14 +118,15 @@ class Supervisor:
         self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
-        """Start everything, keep it running, and end it on SIGTERM, SIGINT or SIGHUP.
+        """Start everything, keep it running, and end it on SIGTERM or SIGINT; SIGHUP reloads the policy.
 
         Raises `StartError` when the appliance cannot start or go on; by then everything is stopped.
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_log_fault)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
+        loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(PolicyReloadRequested()))
         self._spawn(self._watch())
         try:
             await self._start()
@@ -279,7 +282,7 @@ class Supervisor:
         self._spawn(self._control_ready(life, said))
 
     async def _control_ready(self, life: Life, said: ControlReady) -> None:
-        reason = await self._guard.control_ready(said.inner_port)
+        reason = await self._guard.control_ready(said.inner_port, said.own_port)
         if reason is not None and not self._is_ready:
             self.stop(reason)
         if self._stopping.is_set() or not life.alive:

@@ -161,7 +161,7 @@ class Rule:
 class FirewallSettings:
     """What the rules of the appliance's own namespace are built from.
 
-    `rosmaster_port` and `inner_port` may be unknown (None) before their processes run: `Firewall.update`
+    `rosmaster_port`, `inner_port` and `own_port` may be unknown (None) before their processes run: `Firewall.update`
     adds them. Hosts in `tunnel_only` are accepted through IPsec only: by the kernel's policy, or, when ESP
     runs in user space, on `tunnel_interface`. `api_networks` says who reaches the REST port besides
     loopback: nobody, if empty.
@@ -171,6 +171,7 @@ class FirewallSettings:
     rosmaster_uid: int
     rosmaster_port: int | None = None
     inner_port: int | None = None
+    own_port: int | None = None
     master_port: int = 11311
     node_ports: PortRange | None = None
     api_port: int | None = None
@@ -180,7 +181,13 @@ class FirewallSettings:
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
-        for port in (self.rosmaster_port, self.inner_port, self.master_port, self.api_port):
+        for port in (
+            self.rosmaster_port,
+            self.inner_port,
+            self.own_port,
+            self.master_port,
+            self.api_port,
+        ):
             if port is not None:
                 PortRange.one(port)
         for network in (*self.api_networks, *self.tunnel_only):
@@ -204,6 +211,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
         ),
         *inner_port("ROSMaster port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
+        *inner_port("own nodes' master", settings.own_port, "rosmaster", settings.rosmaster_uid),
         *_api(settings),
         *_rate_limits(settings),
     )

@@ -177,6 +177,7 @@ class _Control(_Actor):
             # rosout talks to ROSMaster itself here.
             "rosout_master": f"http://127.0.0.1:{self.rosmaster_port}",
             "inner_port": 1,
+            "own_port": 2,
         }
         self.lifeline.send(Ready(detail))
 

@@ -66,7 +66,7 @@ def test_the_inner_face_is_closed_once_it_is_known(host: Host, enclosure: Contai
     with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as inner:
         port = inner.getsockname()[1]
         assert reachable(host, port)
-        enclosure.control_ready(port)
+        enclosure.control_ready(port, port + 1)
         assert not reachable(host, port)
         assert enclosure.probe() is None
 
@@ -87,5 +87,5 @@ def test_what_listens_on_more_than_loopback_is_not_hidden(host: Host, enclosure:
     """A port on every address is a finding, even while the firewall keeps others out."""
     enclosure.build()
     with host.run(lambda: socket.create_server(("0.0.0.0", 0))) as listener:
-        enclosure.control_ready(listener.getsockname()[1])
+        enclosure.control_ready(listener.getsockname()[1], 1)
         assert "not on loopback only" in str(enclosure.probe())

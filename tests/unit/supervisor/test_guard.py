@@ -35,7 +35,7 @@ class Surroundings(Enclosure):
             raise finding
         return finding
 
-    def control_ready(self, inner_port: int) -> None:
+    def control_ready(self, inner_port: int, own_port: int) -> None:
         """Fails for port 0."""
         if inner_port == 0:
             raise NetworkError("the kernel says no")
@@ -94,8 +94,8 @@ def test_the_inner_face_is_closed_and_then_probed(surroundings: Surroundings) ->
 
     async def scene() -> None:
         guard = Guard(surroundings, lambda _message: None)
-        assert await guard.control_ready(4711) is None
-        assert "the kernel says no" in str(await guard.control_ready(0))
+        assert await guard.control_ready(4711, 4712) is None
+        assert "the kernel says no" in str(await guard.control_ready(0, 4712))
 
     asyncio.run(scene())
     assert surroundings.closed == [4711]
