@@ -45,7 +45,8 @@ class RelayProcess:
             "connections": self._limits.connections,
             "descriptors": _raise_descriptor_limit(2 * self._limits.connections + _DESCRIPTORS_BESIDE),
         }
-        logging.getLogger(__name__).info("relay %s serves: %s", self._index, detail)
+        level = logging.INFO if detail["congestion"] == "cubic" else logging.WARNING
+        logging.getLogger(__name__).log(level, "relay %s serves: %s", self._index, detail)
         self._lifeline.send(Ready(detail))
         self._loop.run()
         self._engine.close()

@@ -90,6 +90,7 @@ class RelayedTopic:
         self._latched: Batch | None = None
         self._latching = False
         self._paused = False
+        self._connected = False
         self._reported = True
         self._messages = self._bytes = self._dropped = 0
 
@@ -112,6 +113,7 @@ class RelayedTopic:
         self._waiting = tuple(one for one in self._waiting if one is not member)
         self._served = tuple(one for one in self._served if one is not member)
         self._reported = False
+        self._forget_header()
         self.relieve()
         if not self.members and self.upstream is not None:
             self.upstream.spare()
@@ -121,6 +123,7 @@ class RelayedTopic:
         header = {**header, "callerid": self._name, "topic": self.topic}
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
+        self._connected = True
         if before is not None and _identity(before) != _identity(header):
             for member in self._served:
                 member.cut("the publisher has come back with another type")
@@ -134,8 +137,8 @@ class RelayedTopic:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
         self._latch(None)
         self._paused = False
-        if not self._served:
-            self._header = None
+        self._connected = False
+        self._forget_header()
 
     def received(self, batch: Batch) -> None:
         """Frames have come from the publisher: through the middle, to the subscribers."""
@@ -185,6 +188,11 @@ class RelayedTopic:
         if self._latched is not None:
             member.deliver(self._latched)
         self.relieve()
+
+    def _forget_header(self) -> None:
+        """Without a connection the header is only good for those who have been given it."""
+        if not self._connected and not self._served:
+            self._header = None
 
     def _latch(self, batch: Batch | None) -> None:
         """Remember the last message; it counts as memory in use."""

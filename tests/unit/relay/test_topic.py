@@ -181,6 +181,19 @@ def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -
     assert "another type" in member.was_cut
 
 
+def test_an_old_header_is_not_given_once_nobody_stands_on_it() -> None:
+    """Whoever comes when the publisher is lost and its last subscriber gone waits for a new header."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    story.topic.leave(first)
+    late = story.join()
+    assert late.header == {}
+    story.topic.upstream_opened(HEADER | {"md5sum": "other"})
+    assert late.header["md5sum"] == "other"
+
+
 def test_a_subscriber_of_another_type_is_not_served() -> None:
     """It refuses itself, and gets nothing."""
     story = Story()
