@@ -92,7 +92,12 @@ def test_service(ros: RosSession, by: Client, to: Client) -> None:
         client.send(given)
         answers = client.wait_for_count(number + 1, event="answered")
         assert answers[-1]["success"] is (given != "true")
-    assert {event["client"] for event in server.seen(event="called")} == {"/asker"}
+    calls = server.wait_for_count(3, event="called")
+    assert [(event["data"], event["client"]) for event in calls] == [
+        (True, "/asker"),
+        (False, "/asker"),
+        (True, "/asker"),
+    ]
 
 
 @pytest.mark.parametrize("client", CLIENTS)
