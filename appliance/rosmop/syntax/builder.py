@@ -1,0 +1,483 @@
+"""Makes the tree of `tree.py` from lark's parse tree.
+
+One method for each rule of the grammar. Walked without recursion, so that no nesting can exhaust the stack.
+"""
+
+# ruff: noqa: D102  a method is the rule of the grammar that has its name
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from lark import Token, Transformer_NonRecursive, v_args
+from lark.tree import Meta
+
+from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.syntax import literals, tree
+from appliance.rosmop.syntax.complaints import FORBIDDEN
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_T = TypeVar("_T", bound=tree.Node)
+_Path = tuple[tree.PathStep, ...]
+
+
+class _Unsaid:
+    """Something that needs nothing: a stray `;`, a `using` line."""
+
+
+def _binary(operator: str) -> Callable[..., tree.Binary]:
+    def build(self: "Builder", meta: Meta, children: list[Any]) -> tree.Binary:
+        return tree.Binary(self.at(meta), operator, children[0], children[-1])
+
+    return build
+
+
+def _word(kind: Callable[[Position], _T]) -> Callable[..., _T]:
+    def build(self: "Builder", meta: Meta, children: list[Any]) -> _T:
+        del children
+        return kind(self.at(meta))
+
+    return build
+
+
+@v_args(meta=True)
+class Builder(Transformer_NonRecursive[Token, Any]):
+    """Builds the tree of one file; `findings` are the literals that mean nothing."""
+
+    def __init__(self, file: str, text: str) -> None:
+        super().__init__()
+        self._file = file
+        self._text = text
+        self.findings: list[Finding] = []
+
+    def at(self, meta: Meta | Token) -> Position:
+        """Where a rule or token begins."""
+        if isinstance(meta, Token):
+            return Position(self._file, meta.line or 1, meta.column or 1)
+        if meta.empty:
+            return Position(self._file, 1, 1)
+        return Position(self._file, meta.line, meta.column)
+
+    def refuse(self, place: Meta | Token, text: str) -> None:
+        """Remember an error."""
+        self.findings.append(Finding(self.at(place), "error", text))
+
+    # Files and specifications
+
+    def file(self, meta: Meta, children: list[Any]) -> tree.File:
+        del meta
+        found = tuple(child for child in children if isinstance(child, tree.Specification))
+        return tree.File(self._file, self._text, found)
+
+    def using(self, meta: Meta, children: list[Any]) -> _Unsaid:
+        del meta, children
+        return _Unsaid()
+
+    def nothing(self, meta: Meta, children: list[Any]) -> tree.Statement:
+        del children
+        return tree.Block(self.at(meta), ())
+
+    def specification(self, meta: Meta, children: list[Any]) -> tree.Specification:
+        names = [
+            child for child in children if isinstance(child, Token) and child.type in ("NAME", "MODIFIER")
+        ]
+        parameters = next((child for child in children if isinstance(child, tuple)), ())
+        *modifiers, name = names
+
+        def items(kind: type[_T]) -> tuple[_T, ...]:
+            return tuple(child for child in children if isinstance(child, kind))
+
+        return tree.Specification(
+            self.at(name) if not modifiers else self.at(meta),
+            tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers),
+            str(name),
+            parameters,
+            items(tree.Declaration),
+            items(tree.Function),
+            items(tree.Init),
+            items(tree.Event),
+            items(tree.Property),
+        )
+
+    def function(self, meta: Meta, children: list[Any]) -> tree.Function:
+        kind, name, parameters, body = children
+        return tree.Function(self.at(meta), kind, str(name), parameters or (), body)
+
+    def procedure(self, meta: Meta, children: list[Any]) -> tree.Function:
+        name, parameters, body = children
+        return tree.Function(self.at(meta), None, str(name), parameters or (), body)
+
+    def init(self, meta: Meta, children: list[Any]) -> tree.Init:
+        return tree.Init(self.at(meta), children[0])
+
+    def parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
+        del meta
+        return tuple(children)
+
+    def parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
+        kind, name = children
+        return tree.Parameter(self.at(meta), kind, str(name))
+
+    def reference_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
+        return tree.Parameter(self.at(meta), _referenced(children[0]), str(children[-1]))
+
+    def array_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
+        kind, name = children
+        array = tree.TypeName(kind.position, ("std", "vector"), element=kind)
+        return tree.Parameter(self.at(meta), array, str(name))
+
+    array_parameter_behind = array_parameter
+
+    # Events and properties
+
+    def event(self, meta: Meta, children: list[Any]) -> tree.Event:
+        *modifiers, name, parameters, trigger, action = children
+        words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
+        return tree.Event(self.at(meta), words, str(name), parameters or (), trigger, action)
+
+    def trigger(self, meta: Meta, children: list[Any]) -> tree.MessageTrigger:
+        topic, kind, pattern, when = children
+        name = str(kind).replace("::", "/")
+        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), None, pattern, when)
+
+    def service_trigger(self, meta: Meta, children: list[Any]) -> tree.MessageTrigger:
+        _, topic, kind, part, pattern, when = children
+        name = str(kind).replace("::", "/")
+        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), str(part), pattern, when)
+
+    def timer(self, meta: Meta, children: list[Any]) -> tree.TimerTrigger:
+        duration = children[1]
+        try:
+            return tree.TimerTrigger(self.at(meta), literals.duration_ns(duration.strip()))
+        except literals.BadLiteralError as error:
+            self.refuse(duration, str(error))
+            return tree.TimerTrigger(self.at(meta), 10**9)
+
+    def pattern(self, meta: Meta, children: list[Any]) -> tuple[tree.Binding, ...]:
+        del meta
+        return tuple(children[1] or ())
+
+    def fields(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
+        del meta
+        return [binding for group in children for binding in group]
+
+    def bind(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
+        path, name = children
+        if name in ("true", "false"):
+            constant = tree.Name(self.at(name), (str(name),))
+            return [tree.Binding(self.at(meta), path, None, constant, self.at(name))]
+        return [tree.Binding(self.at(meta), path, str(name), None, self.at(name))]
+
+    def constrain(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
+        path, constant = children
+        if isinstance(constant, list | tuple):
+            constant = tree.Name(self.at(meta), tuple(constant))
+        return [tree.Binding(self.at(meta), path, None, constant, constant.position)]
+
+    def nest(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
+        del meta
+        path, inner = children
+        return [replace(binding, path=(*path, *binding.path)) for binding in inner or ()]
+
+    def path(self, meta: Meta, children: list[Any]) -> _Path:
+        del meta
+        return tuple(children)
+
+    def path_step(self, meta: Meta, children: list[Any]) -> tree.PathStep:
+        name, index = children
+        if index is None:
+            return tree.PathStep(self.at(meta), str(name), None)
+        if not index.isdigit() or len(index) > 10:
+            self.refuse(index, f"`{index[:20]}` is no index; write a whole number")
+            return tree.PathStep(self.at(meta), str(name), 0)
+        return tree.PathStep(self.at(meta), str(name), int(index))
+
+    def property(self, meta: Meta, children: list[Any]) -> tree.Property:
+        logic, formula, *handlers = children
+        stripped = formula.lstrip()
+        origin = self.at(formula).within(formula, len(formula) - len(stripped))
+        return tree.Property(self.at(meta), str(logic), stripped.rstrip(), origin, tuple(handlers))
+
+    def handler(self, meta: Meta, children: list[Any]) -> tree.Handler:
+        _, category, body = children
+        return tree.Handler(self.at(meta), str(category), body)
+
+    # Types
+
+    def type(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        core = next(child for child in children if isinstance(child, tree.TypeName))
+        constant = core.constant or "const" in children
+        return tree.TypeName(self.at(meta), core.name, core.element, constant, core.pointer, core.reference)
+
+    def qualifier(self, meta: Meta, children: list[Any]) -> str:
+        del meta
+        return str(children[0])
+
+    def core(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), tuple(map(str, children)))
+
+    def pointer(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), tuple(map(str, children)), pointer=True)
+
+    def named(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), children[0])
+
+    def message(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), tuple(str(children[0]).replace("::", "/").split("/")))
+
+    def vector(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), ("std", "vector"), element=children[-1])
+
+    def automatic(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        del children
+        return tree.TypeName(self.at(meta), ("auto",))
+
+    def scoped(self, meta: Meta, children: list[Any]) -> tuple[str, ...]:
+        del meta
+        return tuple(str(child) for child in children if child is not None)
+
+    # Statements
+
+    def block(self, meta: Meta, children: list[Any]) -> tree.Block:
+        return tree.Block(self.at(meta), tuple(children))
+
+    def evaluate(self, meta: Meta, children: list[Any]) -> tree.Evaluate:
+        return tree.Evaluate(self.at(meta), children[0])
+
+    def if_(self, meta: Meta, children: list[Any]) -> tree.If:
+        _, condition, yes, no = children
+        return tree.If(self.at(meta), condition, yes, no)
+
+    def while_(self, meta: Meta, children: list[Any]) -> tree.While:
+        _, condition, body = children
+        return tree.While(self.at(meta), condition, body)
+
+    def do_(self, meta: Meta, children: list[Any]) -> tree.While:
+        _, body, condition = (child for child in children if not _is_word(child, "WHILE"))
+        return tree.While(self.at(meta), condition, body, at_end=True)
+
+    def for_(self, meta: Meta, children: list[Any]) -> tree.For:
+        _, start, condition, step, body = children
+        empty = isinstance(start, tree.Block)
+        return tree.For(self.at(meta), None if empty else start, condition, step, body)
+
+    def range_for(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
+        _, kind, *more = children
+        name, values, body = more[-3:]
+        named = _referenced(kind) if len(more) == 4 else kind
+        return tree.RangeFor(self.at(meta), named, str(name), values, body)
+
+    def switch(self, meta: Meta, children: list[Any]) -> tree.Switch:
+        _, value, *cases = children
+        return tree.Switch(self.at(meta), value, tuple(cases))
+
+    def case(self, meta: Meta, children: list[Any]) -> tree.Case:
+        _, value, *statements = children
+        return tree.Case(self.at(meta), value, tuple(statements))
+
+    def default(self, meta: Meta, children: list[Any]) -> tree.Case:
+        return tree.Case(self.at(meta), None, tuple(children[1:]))
+
+    break_ = _word(tree.Break)
+    continue_ = _word(tree.Continue)
+    drop = _word(tree.Drop)
+    reset = _word(tree.Reset)
+
+    def return_(self, meta: Meta, children: list[Any]) -> tree.Return:
+        return tree.Return(self.at(meta), children[1])
+
+    def delete(self, meta: Meta, children: list[Any]) -> tree.Delete:
+        return tree.Delete(self.at(meta), children[-1])
+
+    def publish(self, meta: Meta, children: list[Any]) -> tree.Publish:
+        _, topic, kind, value = children
+        names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (topic, kind)]
+        return tree.Publish(self.at(meta), names[0], names[1].replace("::", "/"), self.at(kind), value)
+
+    def declaration(self, meta: Meta, children: list[Any]) -> tree.Declaration:
+        kind, *declarators = children
+        return tree.Declaration(self.at(meta), kind, tuple(declarators))
+
+    def plain_declarator(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        return tree.Declarator(self.at(meta), str(children[0]))
+
+    def initialized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, value = children
+        return tree.Declarator(self.at(meta), str(name), value=value)
+
+    def constructed(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, arguments = children
+        return tree.Declarator(self.at(meta), str(name), arguments=arguments)
+
+    def braced(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, items = children
+        value = tree.Elements(self.at(meta), items or ())
+        return tree.Declarator(self.at(meta), str(name), value=value)
+
+    def sized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, size = children
+        return tree.Declarator(self.at(meta), str(name), size=size, is_array=True)
+
+    def sized_initialized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, size, items = children
+        value = tree.Elements(self.at(meta), items or ())
+        return tree.Declarator(self.at(meta), str(name), value=value, size=size, is_array=True)
+
+    def sized_assigned(self, meta: Meta, children: list[Any]) -> tree.Declarator:
+        name, size, value = children
+        return tree.Declarator(self.at(meta), str(name), value=value, size=size, is_array=True)
+
+    def elements(self, meta: Meta, children: list[Any]) -> tuple[tree.Expression, ...]:
+        del meta
+        return tuple(child for child in children if child is not None)
+
+    def elements_in_braces(self, meta: Meta, children: list[Any]) -> tree.Elements:
+        return tree.Elements(self.at(meta), children[-1] or ())
+
+    # Expressions
+
+    def sequence(self, meta: Meta, children: list[Any]) -> tree.Sequence:
+        return tree.Sequence(self.at(meta), tuple(children))
+
+    def assign(self, meta: Meta, children: list[Any]) -> tree.Assign:
+        target, operator, value = children
+        return tree.Assign(self.at(meta), str(operator), target, value)
+
+    def set(self, meta: Meta, children: list[Any]) -> tree.Assign:
+        target, value = children
+        return tree.Assign(self.at(meta), "=", target, value)
+
+    def conditional(self, meta: Meta, children: list[Any]) -> tree.Conditional:
+        return tree.Conditional(self.at(meta), *children)
+
+    def binary(self, meta: Meta, children: list[Any]) -> tree.Binary:
+        left, operator, right = children
+        return tree.Binary(self.at(meta), str(operator), left, right)
+
+    bit_or_ = _binary("|")
+    bit_xor_ = _binary("^")
+    bit_and_ = _binary("&")
+    less = _binary("<")
+    greater = _binary(">")
+    shift_left = _binary("<<")
+    shift_right = _binary(">>")
+    add = _binary("+")
+    subtract = _binary("-")
+    multiply = _binary("*")
+    divide = _binary("/")
+    remainder = _binary("%")
+
+    def prefix(self, meta: Meta, children: list[Any]) -> tree.Unary:
+        operator, operand = children
+        return tree.Unary(self.at(meta), str(operator), operand)
+
+    def step_before(self, meta: Meta, children: list[Any]) -> tree.Step:
+        operator, target = children
+        return tree.Step(self.at(meta), str(operator), target, prefix=True)
+
+    def step_after(self, meta: Meta, children: list[Any]) -> tree.Step:
+        target, operator = children
+        return tree.Step(self.at(meta), str(operator), target, prefix=False)
+
+    def parenthesis(self, meta: Meta, children: list[Any]) -> tree.Expression:
+        del meta
+        inner: tree.Expression = children[-1]
+        return inner
+
+    def cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
+        words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
+        return tree.Cast(self.at(meta), tree.TypeName(self.at(meta), words), children[-1])
+
+    def static_cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
+        return tree.Cast(self.at(meta), *(child for child in children if not isinstance(child, Token)))
+
+    def convert(self, meta: Meta, children: list[Any]) -> tree.Construct:
+        words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
+        return tree.Construct(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
+
+    def construct_vector(self, meta: Meta, children: list[Any]) -> tree.Construct:
+        _, element, *arguments = (child for child in children if not _is_word(child, "LPAR"))
+        kind = tree.TypeName(self.at(meta), ("std", "vector"), element=element)
+        return tree.Construct(self.at(meta), kind, arguments[0] or ())
+
+    def construct_elements(self, meta: Meta, children: list[Any]) -> tree.Construct:
+        _, element, *items = (child for child in children if not _is_word(child, "LBRACE"))
+        kind = tree.TypeName(self.at(meta), ("std", "vector"), element=element)
+        return tree.Construct(self.at(meta), kind, (tree.Elements(self.at(meta), items[0] or ()),))
+
+    def new(self, meta: Meta, children: list[Any]) -> tree.NewCharacters:
+        words = [str(child) for child in children if _is_word(child, "BUILTIN")]
+        if words != ["char"]:
+            self.refuse(
+                meta, f"`new {' '.join(words)}[…]` is not part of the language; write a `std::vector`"
+            )
+        return tree.NewCharacters(self.at(meta), children[-1])
+
+    def limit(self, meta: Meta, children: list[Any]) -> tree.Limit:
+        _, kind, name = children
+        return tree.Limit(self.at(meta), kind, str(name))
+
+    def index(self, meta: Meta, children: list[Any]) -> tree.Index:
+        return tree.Index(self.at(meta), *children)
+
+    def member(self, meta: Meta, children: list[Any]) -> tree.Member:
+        base, name = children
+        return tree.Member(self.at(meta), base, str(name))
+
+    def call(self, meta: Meta, children: list[Any]) -> tree.Call:
+        callee, *arguments = (child for child in children if not isinstance(child, Token))
+        return tree.Call(self.at(meta), callee, arguments[0] or ())
+
+    def arguments(self, meta: Meta, children: list[Any]) -> tuple[tree.Expression, ...]:
+        del meta
+        return tuple(children)
+
+    def number(self, meta: Meta, children: list[Any]) -> tree.Number:
+        return tree.Number(self.at(meta), str(children[-1]))
+
+    def negative(self, meta: Meta, children: list[Any]) -> tree.Unary:
+        number = tree.Number(self.at(children[-1]), str(children[-1]))
+        return tree.Unary(self.at(meta), "-", number)
+
+    def name(self, meta: Meta, children: list[Any]) -> tree.Name:
+        parts = children[0] if isinstance(children[0], tuple) else tuple(map(str, children))
+        if len(parts) == 1 and parts[0] in FORBIDDEN:
+            self.refuse(meta, f"`{parts[0]}` is not part of the language; {FORBIDDEN[parts[0]]}")
+        return tree.Name(self.at(meta), parts)
+
+    def string(self, meta: Meta, children: Sequence[Token]) -> tree.Text:
+        value = b""
+        for part in children:
+            try:
+                value += literals.string_bytes(part[1:-1])
+            except literals.BadLiteralError as error:
+                self.refuse(part, str(error))
+        return tree.Text(self.at(meta), value)
+
+    def character(self, meta: Meta, children: list[Token]) -> tree.Character:
+        try:
+            return tree.Character(self.at(meta), literals.character_value(children[0][1:-1]))
+        except literals.BadLiteralError as error:
+            self.refuse(meta, str(error))
+            return tree.Character(self.at(meta), 0)
+
+
+def _referenced(kind: tree.TypeName) -> tree.TypeName:
+    return tree.TypeName(kind.position, kind.name, kind.element, kind.constant, kind.pointer, reference=True)
+
+
+def _is_word(child: Any, kind: str) -> bool:
+    return isinstance(child, Token) and child.type == kind
+
+
+def _unquoted(token: Token) -> str:
+    try:
+        return literals.string_bytes(token[1:-1]).decode("utf-8", "replace")
+    except literals.BadLiteralError:
+        return str(token)
+
+
+def check(builder: Builder) -> None:
+    """Raise what the builder found."""
+    if builder.findings:
+        raise SpecificationError(builder.findings)

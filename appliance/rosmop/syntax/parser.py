@@ -1,0 +1,106 @@
+"""Reads the text of an ``.rv`` file into a tree, or says where and why it cannot.
+
+Bounds: a file has at most `MAX_CHARACTERS`, and nests at most `MAX_DEPTH` deep; time and memory are linear in
+its length, and no later pass meets anything deeper.
+"""
+
+from functools import lru_cache
+
+from lark import Lark, Token, Tree
+from lark.exceptions import UnexpectedInput, UnexpectedToken
+
+from appliance.rosmop.positions import Position
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.builder import Builder, check
+from appliance.rosmop.syntax.complaints import FORBIDDEN, describe
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.grammar import GRAMMAR
+
+MAX_CHARACTERS = 512 * 1024
+MAX_DEPTH = 100
+"""Statements and operators inside each other."""
+
+
+class _ForbiddenWordError(Exception):
+    def __init__(self, token: Token) -> None:
+        super().__init__(str(token))
+        self.token = token
+
+
+def parse(text: str, file: str) -> tree.File:
+    """Parse a file; `file` is its name in positions. Raises `SpecificationError`."""
+    start = Position(file, 1, 1)
+    if len(text) > MAX_CHARACTERS:
+        raise SpecificationError.at(
+            start, f"the file has more than {MAX_CHARACTERS // 1024} Ki characters; split it into several"
+        )
+    parsed = _parse(text, file)
+    _check_depth(parsed, file)
+    builder = Builder(file, text)
+    result: tree.File = builder.transform(parsed)
+    check(builder)
+    if not result.specifications:
+        raise SpecificationError.at(
+            start, "there is no specification in this file; write `name() { event … }`"
+        )
+    return result
+
+
+def _parse(text: str, file: str) -> Tree[Token]:
+    try:
+        return _parser().parse(text)
+    except _ForbiddenWordError as error:
+        word = error.token
+        position = Position(file, word.line or 1, word.column or 1)
+        raise SpecificationError.at(
+            position, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
+        ) from None
+    except UnexpectedInput as error:
+        at_end = isinstance(error, UnexpectedToken) and error.token.type == "$END"
+        offset = len(text) if at_end or error.pos_in_stream is None else error.pos_in_stream
+        message = describe(text, offset, _accepted(error))
+        raise SpecificationError.at(start_of(file, text, offset), message) from None
+
+
+def start_of(file: str, text: str, offset: int) -> Position:
+    """The position of a character; that of the last thing in the text for its end."""
+    return Position(file, 1, 1).within(text, min(offset, len(text)))
+
+
+def _accepted(error: UnexpectedInput) -> set[str]:
+    interactive = getattr(error, "interactive_parser", None)
+    if interactive is not None:
+        return set(interactive.accepts())
+    return set(getattr(error, "allowed", None) or ())
+
+
+def _check_depth(parsed: Tree[Token], file: str) -> None:
+    waiting: list[tuple[Tree[Token], int]] = [(parsed, 0)]
+    while waiting:
+        node, depth = waiting.pop()
+        if depth > MAX_DEPTH:
+            position = Position(file, node.meta.line, node.meta.column)
+            raise SpecificationError.at(
+                position,
+                f"nested more than {MAX_DEPTH} deep; use variables for parts of it, or helper functions",
+            )
+        waiting += [(child, depth + 1) for child in node.children if isinstance(child, Tree)]
+
+
+def _allow(token: Token) -> Token:
+    if token in FORBIDDEN:
+        raise _ForbiddenWordError(token)
+    return token
+
+
+@lru_cache(maxsize=1)
+def _parser() -> Lark:
+    """The parser, made at the first use: it is always the same and keeps no state between files."""
+    return Lark(
+        GRAMMAR,
+        start="file",
+        parser="lalr",
+        propagate_positions=True,
+        maybe_placeholders=True,
+        lexer_callbacks={"NAME": _allow},
+    )
