@@ -27,7 +27,7 @@ class FoldSettings:
     seconds: float = 10.0
     keys: int = 4096
     keys_per_host: int = 256
-    events: frozenset[str] = frozenset({"connection refused", "limit exceeded"})
+    events: frozenset[str] = frozenset({"connection refused", "limit exceeded", "malformed"})
 
     def __post_init__(self) -> None:
         if self.seconds < 0 or self.keys < 1 or self.keys_per_host < 1:

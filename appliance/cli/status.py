@@ -46,6 +46,8 @@ def _troubles(body: dict[str, Any]) -> list[str]:
     found = []
     if body["audit"]["failed"]:
         found.append(f"the audit log cannot be written: {body['audit']['failed']}")
+    if body["audit"]["degraded"]:
+        found.append(f"the audit log is behind: {body['audit']['degraded']}")
     if body["probe"] not in ("", "passed"):
         found.append(f"the ROS Master is not hidden: {body['probe']}")
     if body["relay"] != "connected":

@@ -42,12 +42,14 @@ class AdminServer:
         *,
         lag: Callable[[], tuple[int, float]],
         audit_failed: Callable[[], str | None],
+        audit_degraded: Callable[[], str | None],
     ) -> None:
         self._master = master
         self._policies = policies
         self._surroundings = surroundings
         self._lag = lag
         self._audit_failed = audit_failed
+        self._audit_degraded = audit_degraded
         self._started = time.time()
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
         self._server: asyncio.Server | None = None  # held: a server that nobody holds is closed
@@ -123,7 +125,12 @@ class AdminServer:
             "connections": len(relay.connections),
             "messages": sum(one.messages for one in relay.traffic.values()),
             "dropped": sum(one.dropped for one in relay.traffic.values()),
-            "audit": {"lag_records": lag_records, "lag_seconds": lag_seconds, "failed": self._audit_failed()},
+            "audit": {
+                "lag_records": lag_records,
+                "lag_seconds": lag_seconds,
+                "failed": self._audit_failed(),
+                "degraded": self._audit_degraded(),
+            },
         }
 
     def _revision(self, row: Any) -> dict[str, Any]:

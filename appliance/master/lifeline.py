@@ -1,7 +1,6 @@
 """Control's end of its lifeline: what the supervisor tells it, and what it asks of the supervisor."""
 
 import asyncio
-import os
 import socket
 from collections.abc import Callable
 from typing import Any

@@ -45,7 +45,7 @@ from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.master.revocation import Revocation
-from appliance.master.robot import robot_addresses
+from appliance.master.robot import own_address, robot_addresses
 from appliance.master.rosmaster import RosMaster
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Limits, build_fault
@@ -304,6 +304,7 @@ class _Control:
                 self._lifeline.surroundings,
                 lag=lambda: self._audit.lag,
                 audit_failed=lambda: self._audit.failed,
+                audit_degraded=lambda: self._audit.degraded,
             )
             await self._admin.start(sockets[_ADMIN].dup())
 
@@ -322,7 +323,7 @@ class _Control:
 
     def _say_ready(self, restarted: bool) -> None:
         host = self._settings.listen_address[0]
-        told = "127.0.0.1" if host == "0.0.0.0" else "::1" if host == "::" else host  # noqa: S104 - compared only
+        told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
         uri = node_uri(told, self._port)
         own = node_uri("127.0.0.1", self._lifeline.sockets[_OWN].getsockname()[1])
         inner_port = self._lifeline.sockets[_INNER].getsockname()[1]
@@ -427,6 +428,8 @@ class _Control:
         def received(message: object, _descriptors: tuple[int, ...]) -> None:
             if isinstance(message, messages.SignatureMade):
                 self._audit.signed(message.number, message.signature, message.public_key)
+            elif isinstance(message, messages.SignatureRefused):
+                self._audit.refused(message.number, message.reason)
 
         def closed() -> None:
             if self._signer is channel:

@@ -3,7 +3,6 @@
 import time
 from typing import Any
 
-from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record, RuleReference, Severity
 from appliance.master.call import Caller
@@ -19,7 +18,7 @@ class Recorder:
 
     def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
         self._log = log
-        self._ids = IdSource()
+        self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
         self.revision = 0

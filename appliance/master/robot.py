@@ -19,6 +19,19 @@ def robot_addresses(settings: Settings) -> list[Address]:
     return [gateway] if gateway is not None else []
 
 
+def own_address(settings: Settings) -> str:
+    """The address at which the robot reaches the appliance when it listens on all of them."""
+    robots = robot_addresses(settings)
+    if settings.isolation == "none" or not robots:
+        return "127.0.0.1"
+    family = socket.AF_INET if robots[0].version == 4 else socket.AF_INET6
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        sock.connect(
+            (str(robots[0]), 9)
+        )  # a datagram socket that connects sends nothing: it only picks a route
+        return str(sock.getsockname()[0])
+
+
 def _default_gateway(table: str) -> Address | None:
     """The gateway in the kernel's routing table (`/proc/net/route`)."""
     for line in table.splitlines()[1:]:
