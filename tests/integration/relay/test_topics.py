@@ -87,11 +87,12 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
     first.wait_for(event="received")
     second = ros.listener("roscpp", "/map")
     second.wait_for(event="received")
-    assert len(talker.seen(event="connected")) == 1, "the publisher sees one connection"
+    talker.wait_for(event="connected")
     third = ros.listener("rospy", "/map")
     third.wait_for(event="received")
     for listener in (first, second, third):
         assert [event["data"] for event in listener.seen(event="received")] == ["hello 1"]
+    assert len(talker.seen(event="connected")) == 1, "the publisher sees one connection"
 
 
 def test_a_stopped_subscriber_delays_nobody_and_grows_nothing(driver: RelayDriver, ros: RosSession) -> None:
