@@ -34,6 +34,7 @@ from appliance.network.lab import Lab
 from appliance.network.namespaces import NetworkError, has_privileges
 
 RIGHTFUL = "watch the battery"  # what the policy lets the attacker's host do
+AROUND = "go past the master"  # does not come to the appliance at all
 ATTACKS = (
     "look around",
     "take over the operator",
@@ -86,6 +87,7 @@ class Show:
         self.permit(self.stage.attack(RIGHTFUL))
         for name in ATTACKS:
             self.refuse(self.stage.attack(name))
+        self.shut_out(self.stage.attack(AROUND))
         self.aftermath(operator, before)
         self.summary()
         return all(result.good for result in self.results)
@@ -101,6 +103,8 @@ class Show:
         self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
         self.robot = self.stage.start_robot()
         self.say(", ".join(actor.name for actor in self.robot))
+        self.stage.protect_robot()
+        self.say("its own ports answer the appliance only: rosrv protect --apply")
 
     def mission(self) -> Actor:
         """The operator drives, aims and fires."""
@@ -143,6 +147,12 @@ class Show:
         why = rule_of(record) if record else f"not in the audit log: {attack.answer}"
         self.decided("refused", f"{attack.name}: {attack.tried}", why)
         self.results.append(Result(f"attack: {attack.name}", good=record is not None, remark=why))
+
+    def shut_out(self, attack: Attack) -> None:
+        """The attack that goes around the appliance: the robot's own packet filter is to stop it."""
+        outcome = "SUCCEEDED" if attack.succeeded else "refused"
+        self.decided(outcome, f"{attack.name}: {attack.tried}", f"rosrv protect: {attack.answer}")
+        self.results.append(Result(f"attack: {attack.name}", not attack.succeeded, attack.answer))
 
     def record_of(self, attack: Attack) -> Record | None:
         """The denial of this attack: a new record of what was tried, or the one that its answer repeats.

