@@ -1,0 +1,117 @@
+"""What the thesis tried on the LandShark (its research question 3), with real nodes on two machines.
+
+A second machine may not publish where only the first may, and may not end a node of the first.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.rosmaster import call_on
+
+POLICY = """\
+[Groups]
+first  = 10.77.0.10
+second = 10.77.0.66
+
+[Nodes]
+default = first second
+
+[Publishers]
+default = first second
+/topic1 = first
+
+[Subscribers]
+default = first second
+
+[Commands]
+default  = first second
+shutdown = first
+"""
+
+
+@pytest.fixture
+def appliance(lab: Lab) -> Iterator[Appliance]:
+    """An appliance with the policy of this file."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
+        yield running
+
+
+@pytest.fixture
+def ros(appliance: Appliance, robot: Host, tmp_path: Path) -> Iterator[RosSession]:
+    """The nodes of the first machine; `ros.on(second)` starts them on the second."""
+    with RosSession(appliance.master_uri, tmp_path, robot) as session:
+        yield session
+
+
+@pytest.fixture
+def second(lab: Lab) -> Host:
+    """The machine with fewer rights."""
+    return lab.host("second", "10.77.0.66/24")
+
+
+def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
+    """Only the first machine is heard on the topic; the refusal names the rule, in the answer and the log."""
+    listener = ros.listener("roscpp", "/topic1")
+    ros.talker("rospy", "/topic1", name="rightful")
+    answer = call_on(
+        second,
+        appliance.master_uri,
+        "registerPublisher",
+        "/forged",
+        "/topic1",
+        "*",
+        "http://10.77.0.66:40404/",
+    )
+    assert (answer[0], type(answer[2])) == (0, list)
+    assert "[Publishers] /topic1" in answer[1]
+    heard = listener.wait_for_count(5, event="received")
+    assert {event["publisher"] for event in heard} == {"/rightful"}
+    (record,) = appliance.audit("--deny", resource="/topic1")
+    assert (record["host"], record["caller_id"], record["category"]) == ("10.77.0.66", "/forged", "publish")
+    assert (record["rule"]["section"], record["rule"]["key"]) == ("Publishers", "/topic1")
+    assert record["rule"]["line"] == POLICY.splitlines().index("/topic1 = first") + 1
+
+
+def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> None:
+    """What the policy grants the second machine works as with any master."""
+    listener = ros.listener("rospy", "/topic2")
+    ros.on(second).talker("roscpp", "/topic2", name="guest")
+    assert listener.wait_for(event="received")["publisher"] == "/guest"
+
+
+def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
+    """`rosnode kill` from the second machine ends nothing; from the first it does, as ever."""
+    talker = ros.talker("roscpp", "/topic1", name="driver")
+    listener = ros.listener("rospy", "/topic1")
+    ros.on(second).run("rosnode", "kill", "/driver", check=False)
+    assert appliance.audit("--deny", host="10.77.0.66", resource="shutdown")
+    listener.wait_for(event="received", since=listener.mark())
+    assert talker.running
+    ros.run("rosnode", "kill", "/driver")
+    talker.wait()
+
+
+def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, second: Host) -> None:
+    """A name that lives on one machine cannot be taken over from another, though the policy lets both use it."""
+    listener = ros.listener("rospy", "/topic2")
+    ros.talker("rospy", "/topic2", "--text", "mine", name="voice")
+    listener.wait_for(event="received")
+    answer = call_on(
+        second,
+        appliance.master_uri,
+        "registerPublisher",
+        "/voice",
+        "/topic2",
+        "*",
+        "http://10.77.0.66:40404/",
+    )
+    assert answer[0] == 0
+    after = listener.wait_for(event="received", since=listener.mark())
+    assert after["data"].startswith("mine")
