@@ -197,7 +197,12 @@ class Engine:
     # --- peers --------------------------------------------------------------------------------------------
 
     def _arrived(self, key: str, sock: socket.socket, host: str) -> None:
-        tune(sock)
+        try:
+            tune(sock)
+        except OSError:
+            sock.close()
+            self._ports.left(host)
+            return
         visitor = Visitor(
             self._context, sock, key, host, introduced=self._introduced, failed=self._visitor_failed
         )

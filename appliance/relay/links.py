@@ -1,5 +1,7 @@
 """A `Channel` served by the relay's loop: messages in, messages out, the end noticed once."""
 
+import os
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -7,13 +9,16 @@ import msgspec
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Message
-from appliance.relay.loop import READ, WRITE, Loop
+from appliance.relay.loop import READ, WRITE, Loop, Timer
+
+_SLICE = 256
 
 
 class Link:
     """One end of a lifeline or link. `ended(reason)` is called once, when it is of no use any more.
 
     A message that is not of the link, or a backlog beyond its limit, ends it as the other end's death does.
+    A restatement of thousands of messages is carried out in slices, so that it holds up nothing else.
     """
 
     def __init__(
@@ -29,6 +34,8 @@ class Link:
         self._ended = ended
         self._writing = False
         self._live = True
+        self._arrived: deque[tuple[Any, tuple[int, ...]]] = deque()
+        self._slice: Timer | None = None
         loop.watch(channel.fileno(), READ, self._ready)
 
     def send(self, message: Message) -> None:
@@ -43,9 +50,11 @@ class Link:
             self._watch()
 
     def catch_up(self) -> None:
-        """Carry out what the other end has sent and the loop has not come to yet."""
+        """Carry out everything the other end has sent and the loop has not come to yet."""
         if self._live:
-            self._ready(READ)
+            self._take_in()
+            while self._arrived:
+                self._carry_out()
 
     def close(self) -> None:
         """Close this end; `ended` is not called."""
@@ -53,18 +62,41 @@ class Link:
             self._live = False
             self._loop.unwatch(self._channel.fileno())
             self._channel.close()
+            if self._slice is not None:
+                self._slice.cancel()
+            for _message, descriptors in self._arrived:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+            self._arrived.clear()
 
     def _ready(self, events: int) -> None:
-        try:
-            if events & WRITE:
+        if events & WRITE:
+            try:
                 self._channel.flush()
-            messages = self._channel.receive() if events & ~WRITE else []
+            except ChannelClosedError as error:
+                self._end(str(error))
+                return
+            self._watch()
+        if events & ~WRITE:
+            self._take_in()
+            self._carry_out()
+
+    def _take_in(self) -> None:
+        """Read what is there. At the end of the link, what came before it is carried out first."""
+        try:
+            self._arrived += self._channel.receive()
         except (ChannelClosedError, msgspec.DecodeError) as error:
+            while self._arrived:
+                self._carry_out()
             self._end(str(error))
-            return
-        self._watch()
-        for message, descriptors in messages:
-            self._received(message, descriptors)
+
+    def _carry_out(self) -> None:
+        for _ in range(min(_SLICE, len(self._arrived))):
+            if self._arrived:
+                self._received(*self._arrived.popleft())
+        if self._slice is not None:
+            self._slice.cancel()
+        self._slice = self._loop.after(0, self._carry_out) if self._arrived else None
 
     def _watch(self) -> None:
         if self._writing != self._channel.pending:
@@ -72,5 +104,6 @@ class Link:
             self._loop.change(self._channel.fileno(), READ | WRITE if self._writing else READ)
 
     def _end(self, reason: str) -> None:
-        self.close()
-        self._ended(reason)
+        if self._live:
+            self.close()
+            self._ended(reason)

@@ -7,6 +7,7 @@ Invariants:
   has no descriptor left, listening pauses instead of spinning.
 """
 
+import errno
 import socket
 from collections import Counter
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from appliance.relay.loop import READ, Loop
 
 _ACCEPTS_PER_TURN = 32
 _NO_DESCRIPTOR_PAUSE = 0.2
+_EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
 class Ports:
@@ -72,11 +74,13 @@ class Ports:
         for _ in range(_ACCEPTS_PER_TURN):
             try:
                 sock, address = listening.accept()
-            except (BlockingIOError, ConnectionAbortedError):
+            except BlockingIOError:
                 return
-            except OSError:
-                self._pause(key, listening)
-                return
+            except OSError as error:
+                if error.errno in _EXHAUSTED:
+                    self._pause(key, listening)
+                    return
+                continue  # this peer is gone already; the next may be well
             host = address[0].removeprefix("::ffff:")
             reason = self._no_room(host)
             if reason:

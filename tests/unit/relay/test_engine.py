@@ -4,6 +4,7 @@ The engine runs in the test's own thread; every step lets the loop turn until wh
 """
 
 import contextlib
+import random
 import socket
 import struct
 import time
@@ -429,6 +430,41 @@ def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world:
     assert "limit" in world.hears(UpstreamLost).reason
     subscriber.read()
     assert not subscriber.ended
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> None:
+    """Random bytes and broken headers from publisher, service, subscribers and clients; then a normal life."""
+    chance = random.Random(seed)  # noqa: S311 - a test that can be repeated
+    pieces = [encode_header(HEADER), encode_header(ASK), encode_header(CALL), encode_frame(b"x" * 300)]
+    world.connect(encode_header(ASK))
+    for _ in range(40):
+        data = bytearray(chance.choice(pieces) * chance.randrange(1, 3))
+        for _ in range(chance.randrange(4)):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+        peer = world.connect(bytes(data[: chance.randrange(len(data) + 1)]))
+        world.loop.turn(0.005)
+        world.told += [message for message, _fds in world.control.receive()]
+        if any(isinstance(message, UpstreamWanted) for message in world.told):
+            world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
+        for listening in (world.publisher, world.service):
+            with contextlib.suppress(BlockingIOError), listening.accept()[0] as sock:
+                sock.setblocking(False)
+                sock.send(data)
+                world.loop.turn(0.005)
+        chance.choice((peer.reset, peer.sock.close, lambda: None))()
+    world.state(NodeWithdrawn("k"))
+    world.until(lambda: not (world.engine._farewells or world.engine._visitors or world.engine._clients))
+    assert world.engine._context.budget.used == 0
+    assert world.engine._ports._total == 0
+    world.publisher = world.listen()
+    world.state(NodePlaced("k", "/talker", LOOPBACK), world.port)
+    world.state(PublicationPlaced("k", "/chatter", "*"))
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/listener"))
+    world.told.clear()
+    publisher, subscriber = world.subscribed()
+    publisher.send(encode_frame(b"well"))
+    world.gets(subscriber, encode_frame(b"well"))
 
 
 def test_the_publisher_is_let_go_some_time_after_the_last_subscriber(world: World) -> None:
