@@ -27,10 +27,11 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamRefused,
 )
+from appliance.relay.admission import asked_for, flaw, missing
 from appliance.relay.client import ServiceClient, ServiceTraffic
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import SCRATCH, MemoryBudget
-from appliance.relay.grants import StatedTable, is_statement
+from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
 from appliance.relay.links import Link
 from appliance.relay.loop import Loop
@@ -58,6 +59,7 @@ class Engine:
         self._clients: set[ServiceClient] = set()
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self._visitors: set[Visitor] = set()
+        self._waiting: dict[str, set[Visitor]] = {}
         self._farewells: set[Farewell] = set()
         self._link: Link | None = None
         self._last_rows: list[TopicTraffic] = []
@@ -74,7 +76,7 @@ class Engine:
             self._table.begin(message.epoch)
         elif isinstance(message, StateEnded):
             self._restated(message.epoch)
-        elif is_statement(message):
+        elif isinstance(message, Statement):
             self._state(message, descriptors)
         elif isinstance(message, UpstreamFound):
             self._upstream_found(message)
@@ -99,12 +101,14 @@ class Engine:
 
     # --- what control states ------------------------------------------------------------------------------
 
-    def _state(self, message: Message, descriptors: tuple[int, ...]) -> None:
+    def _state(self, message: Statement, descriptors: tuple[int, ...]) -> None:
         self._table.state(message)
         if isinstance(message, NodePlaced):
             self._ports.open(message.key, descriptors[0])
         elif isinstance(message, PublicationPlaced):
             self._place_topic(message.key, message.topic)
+        if self._waiting and message.key in self._waiting:
+            self._judge_waiting(message.key)
 
     def _restated(self, epoch: int) -> None:
         for message in self._table.end(epoch):
@@ -213,64 +217,49 @@ class Engine:
 
     def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
         visitor.close()
-        self._visitors.discard(visitor)
+        self._forget_visitor(visitor)
         self._ports.left(visitor.host)
         if reason:
             self._reporter.refused(visitor.key, "", visitor.host, "", reason)
 
-    def _introduced(self, visitor: Visitor, fields: Mapping[str, str], rest: bytes) -> None:
+    def _introduced(self, visitor: Visitor) -> None:
         if self._link is not None:
             self._link.catch_up()
-        if visitor not in self._visitors:
-            return
-        self._visitors.discard(visitor)
+        if visitor in self._visitors:
+            self._judge(visitor, patient=True)
+
+    def _judge(self, visitor: Visitor, *, patient: bool) -> None:
+        """Serve the visitor, or refuse it; a `patient` one waits for what the table does not have yet."""
+        fields, rest = visitor.fields, visitor.rest
+        reason = flaw(fields, rest)
+        if not reason:
+            reason = missing(self._table, visitor.key, visitor.host, fields)
+            if reason and (patient or self._table.restating):
+                visitor.wait(self._limits.grant_seconds, lambda: self._judge(visitor, patient=False))
+                self._waiting.setdefault(visitor.key, set()).add(visitor)
+                return
+        self._forget_visitor(visitor)
         sock = visitor.take()
-        if "topic" in fields:
-            reason = self._objection_to_subscriber(visitor, fields, rest)
-            if not reason:
-                self._subscribe(visitor, sock, fields)
-                return
-            resource = fields["topic"]
-        elif "service" in fields:
-            reason = self._objection_to_client(visitor, fields)
-            if not reason:
-                self._serve_client(visitor, sock, fields, rest)
-                return
-            resource = fields["service"]
+        if reason:
+            self._refuse(visitor, asked_for(fields), fields.get("callerid", ""), sock, reason)
+        elif "topic" in fields:
+            self._subscribe(visitor, sock, fields)
         else:
-            reason, resource = "its header names neither a topic nor a service", ""
-        self._refuse(visitor, resource, fields.get("callerid", ""), sock, reason)
+            self._serve_client(visitor, sock, fields, rest)
 
-    def _objection_to_subscriber(self, visitor: Visitor, fields: Mapping[str, str], rest: bytes) -> str:
-        for required in ("topic", "md5sum", "callerid"):
-            if required not in fields:
-                return f"Missing required '{required}' field"
-        topic, caller_id = fields["topic"], fields["callerid"]
-        if "service" in fields:
-            return "its header names a topic and a service; a connection is for one of them"
-        if rest:
-            return "sent data after its header; a connection is for one topic"
-        if self._table.publication(visitor.key, topic) is None:
-            node = self._table.node(visitor.key)
-            return f"[{node.name if node else visitor.key}] is not a publisher of [{topic}]"
-        if not self._table.may_subscribe(visitor.key, topic, visitor.host, caller_id):
-            return (
-                f"no grant for [{caller_id}] at {visitor.host} to subscribe to [{topic}];"
-                " a subscriber asks with requestTopic first"
-            )
-        return ""
+    def _judge_waiting(self, key: str) -> None:
+        """Something new is stated of this incarnation: who can be served now is served."""
+        for visitor in list(self._waiting.get(key, ())):
+            if not missing(self._table, key, visitor.host, visitor.fields):
+                self._judge(visitor, patient=True)
 
-    def _objection_to_client(self, visitor: Visitor, fields: Mapping[str, str]) -> str:
-        for required in ("service", "md5sum", "callerid"):
-            if required not in fields:
-                return f"Missing required '{required}' field"
-        service = fields["service"]
-        if self._table.service(visitor.key, service) is None:
-            node = self._table.node(visitor.key)
-            return f"[{node.name if node else visitor.key}] is not a provider of [{service}]"
-        if not self._table.may_call(visitor.key, service, visitor.host):
-            return f"no grant for {visitor.host} to call [{service}]; a client asks with lookupService first"
-        return ""
+    def _forget_visitor(self, visitor: Visitor) -> None:
+        self._visitors.discard(visitor)
+        waiting = self._waiting.get(visitor.key)
+        if waiting is not None:
+            waiting.discard(visitor)
+            if not waiting:
+                del self._waiting[visitor.key]
 
     def _serve_client(
         self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str], rest: bytes

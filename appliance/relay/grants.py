@@ -27,7 +27,7 @@ from appliance.channel.messages import (
     ServiceWithdrawn,
 )
 
-_STATED = (NodePlaced, PublicationPlaced, ServicePlaced, GrantInstalled, ClientGranted)
+Statement = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
 _Fact = tuple[str, ...]
 
 
@@ -49,6 +49,11 @@ class StatedTable:
         self._restated: set[_Fact] | None = None
         self._epoch = 0
 
+    @property
+    def restating(self) -> bool:
+        """Whether a restatement is under way."""
+        return self._restated is not None
+
     def begin(self, epoch: int) -> None:
         """A restatement starts."""
         self._restated = set()
@@ -66,7 +71,7 @@ class StatedTable:
             self.withdraw(message)
         return withdrawals
 
-    def state(self, message: Message) -> None:
+    def state(self, message: Statement) -> None:
         """Control says that something is so."""
         fact = _fact(message)
         self._facts[fact] = message
@@ -112,12 +117,7 @@ class StatedTable:
             self._restated.discard(fact)
 
 
-def is_statement(message: Message) -> bool:
-    """Whether the message states something that holds until it is withdrawn."""
-    return isinstance(message, _STATED)
-
-
-def _fact(message: Message) -> _Fact:
+def _fact(message: Statement) -> _Fact:
     match message:
         case NodePlaced(key=key):
             return ("node", key)
@@ -129,7 +129,6 @@ def _fact(message: Message) -> _Fact:
             return ("grant", key, topic, host, caller_id)
         case ClientGranted(key=key, service=service, host=host):
             return ("client", key, service, host)
-    raise TypeError(f"{type(message).__name__} states nothing")
 
 
 def _withdrawn_fact(message: Message) -> _Fact:

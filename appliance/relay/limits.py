@@ -24,6 +24,9 @@ class Limits:
     header_seconds: float = 10.0
     """From accepting a connection to its whole header."""
 
+    grant_seconds: float = 0.5
+    """A peer whose grant is not there yet is kept waiting so long before it is refused."""
+
     message_bytes: int = 256 * MIB
     """One message, request or response; a peer that declares more is cut. At least 1 MiB."""
 

@@ -21,8 +21,8 @@ from appliance.ros.tcpros import HeaderParser, encode_header
 class Visitor:
     """A peer that has connected to a relay port and has not said yet what it wants.
 
-    `introduced(visitor, fields, rest)` is called with its header and what followed it; `failed(visitor,
-    reason)` when there will be none. Either ends this stage.
+    `introduced(visitor)` is called when its header (`fields`) and what followed it (`rest`) are there;
+    `failed(visitor, reason)` when there will be none. Either ends this stage.
     """
 
     def __init__(
@@ -32,11 +32,14 @@ class Visitor:
         key: str,
         host: str,
         *,
-        introduced: Callable[["Visitor", Mapping[str, str], bytes], None],
+        introduced: Callable[["Visitor"], None],
         failed: Callable[["Visitor", str], None],
     ) -> None:
         self.key = key
         self.host = host
+        self.fields: Mapping[str, str] = {}
+        self.rest = b""
+        self._loop = context.loop
         self._limits = limits = context.limits
         self._introduced = introduced
         self._failed = failed
@@ -48,6 +51,12 @@ class Visitor:
         """Give the socket to whoever serves it."""
         self._timer.cancel()
         return self._stream.take()
+
+    def wait(self, seconds: float, callback: Callable[[], None]) -> None:
+        """Neither served nor refused yet: call back, unless it is taken or gone by then."""
+        self._timer.cancel()
+        self._timer = self._loop.after(seconds, callback)
+        self._stream.read(False)
 
     def close(self) -> None:
         """Cut the connection."""
@@ -64,7 +73,8 @@ class Visitor:
             self._failed(self, f"its header cannot be read: {error}")
             return
         if fields is not None:
-            self._introduced(self, fields, self._parser.rest)
+            self.fields, self.rest = fields, self._parser.rest
+            self._introduced(self)
 
     def _broken(self, _reason: str) -> None:
         self._failed(self, "")

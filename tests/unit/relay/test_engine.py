@@ -55,6 +55,7 @@ LIMITS = replace(
     queue_messages=50,
     queue_bytes=8 * MIB,
     header_seconds=0.3,
+    grant_seconds=0.1,
     connect_seconds=0.3,
     linger=0.2,
     farewell=0.2,
@@ -298,12 +299,42 @@ def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World
 
 
 def test_a_grant_that_was_sent_before_the_peer_came_counts(world: World) -> None:
-    """Even when the loop sees the peer first: the link is read before anybody is refused."""
+    """Even when the peer is faster than the grant: it is kept waiting for a moment."""
     peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
-    world.until(lambda: world.engine._visitors)
+    world.until(lambda: world.engine._waiting)
     world.control.send(GrantInstalled("k", "/chatter", LOOPBACK, "/late"))
     world.upstream()
     assert world.gets_header(peer) == HEADER
+    assert not world.engine._waiting
+
+
+def test_nobody_is_refused_while_control_restates(world: World) -> None:
+    """A subscriber that comes between two statements of a new control is served when its grant is stated."""
+    world.state(NodeWithdrawn("k"))
+    world.state(StateBegan(2))
+    world.state(NodePlaced("k", "/talker", LOOPBACK), world.port)
+    early, stranger = (
+        world.connect(encode_header(ASK)),
+        world.connect(encode_header(ASK | {"callerid": "/x"})),
+    )
+    world.until(lambda: len(world.engine._waiting.get("k", ())) == 2)
+    done = world.loop.clock() + 3 * LIMITS.grant_seconds
+    world.until(lambda: world.loop.clock() > done)
+    world.state(PublicationPlaced("k", "/chatter", "*"))
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/listener"))
+    world.state(StateEnded(2))
+    world.upstream()
+    assert world.gets_header(early) == HEADER
+    assert "no grant" in world.gets_header(stranger)["error"]
+
+
+def test_a_peer_that_leaves_while_it_waits_leaves_nothing(world: World) -> None:
+    """Its place is free at once."""
+    peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
+    world.until(lambda: world.engine._waiting)
+    peer.sock.close()
+    world.until(lambda: not world.engine._waiting and not world.engine._visitors)
+    assert world.engine._ports._total == 0
 
 
 @pytest.mark.parametrize(
@@ -332,8 +363,8 @@ def test_who_may_not_is_told_why(world: World, fields: dict[str, str], reason: s
 
 def test_equal_refusals_are_folded(world: World) -> None:
     """The first at once, the others with a count."""
-    for _ in range(5):
-        world.ends(world.connect(encode_header(ASK | {"callerid": "/x"})))
+    for peer in [world.connect(encode_header(ASK | {"callerid": "/x"})) for _ in range(5)]:
+        world.ends(peer)
     counts = [world.hears(ConnectionRefused).count]
     while sum(counts) < 5:
         counts.append(world.hears(ConnectionRefused).count)

@@ -2,9 +2,11 @@
 
 import os
 import socket
+import struct
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.channel.channel import Channel
@@ -21,6 +23,7 @@ class Ends:
         self.loop = Loop()
         self.received: list[Any] = []
         self.ended: list[str] = []
+        self.raw = ours
         self.other = Channel(ours, RelayLink)
         self.link = Link(self.loop, Channel(theirs, RelayLink), self._take, self.ended.append)
 
@@ -36,6 +39,13 @@ class Ends:
         self.loop.close()
 
 
+def send(sock: socket.socket, count: int) -> None:
+    """So many withdrawals in one piece, as the kernel takes them at once."""
+    bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
+    data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
+    assert sock.send(data) == len(data)
+
+
 @pytest.fixture
 def ends() -> Iterator[Ends]:
     """Both ends."""
@@ -46,8 +56,7 @@ def ends() -> Iterator[Ends]:
 
 def test_thousands_of_messages_are_carried_out_in_slices_and_in_order(ends: Ends) -> None:
     """Other sockets have their turn between the slices."""
-    for number in range(1000):
-        ends.other.send(NodeWithdrawn(str(number)))
+    send(ends.raw, 1000)
     ends.loop.turn(1)
     assert 0 < len(ends.received) < 1000
     while len(ends.received) < 1000:
@@ -57,16 +66,14 @@ def test_thousands_of_messages_are_carried_out_in_slices_and_in_order(ends: Ends
 
 def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
     """Whoever is to be judged by the grants is judged by the latest."""
-    for number in range(1000):
-        ends.other.send(NodeWithdrawn(str(number)))
+    send(ends.raw, 1000)
     ends.link.catch_up()
     assert len(ends.received) == 1000
 
 
 def test_what_was_sent_before_the_end_counts(ends: Ends) -> None:
     """Then the end is told, once."""
-    for number in range(600):
-        ends.other.send(NodeWithdrawn(str(number)))
+    send(ends.raw, 600)
     ends.other.close()
     for _ in range(4):
         ends.loop.turn(0.1)
@@ -79,8 +86,6 @@ def test_closing_closes_descriptors_that_nobody_took(ends: Ends) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         for number in range(40):
             ends.other.send(NodePlaced(str(number), "/n", "h"), (listening.fileno(),))
-        for number in range(400):
-            ends.other.send(NodeWithdrawn(str(number)))
         before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - of the kernel, not a folder
         ends.link.close()
         assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208 - of the kernel, not a folder
