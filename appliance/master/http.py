@@ -3,18 +3,21 @@
 httptools (llhttp) parses; this module bounds. Invariants:
 
 1. Nothing is buffered beyond the limits: head 64 KiB within 10 s, body by `Limits.body`, one request in
-   flight per connection (reading pauses meanwhile), one response in the write buffer.
+   flight per connection (reading pauses meanwhile), one response in the write buffer (the next request is not
+   served before it is sent). What all connections of a host hold together is bounded, too.
 2. A connection that makes no progress is closed by the sweep, whatever state it is in.
 3. An address that no rule names is answered before its body is read.
-4. Hosts are served in turn: when all slots are busy, the next slot goes to the host that waited longest since
-   its last turn, so one host's flood costs the others one slot's time.
+4. Hosts are served in turn: one host has at most `slots_per_host` requests being served; when all slots are busy,
+   the next slot goes to the host that waited longest since its last turn. So one host's flood, even of requests
+   that take long, costs the others little.
+5. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
 """
 
 import asyncio
 import ipaddress
 import socket
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import cast
@@ -39,6 +42,15 @@ class HttpLimits:
     connections_per_host: int = 512
     connections: int = 4096
     slots: int = 64
+    slots_per_host: int = 16
+    held_bytes_per_host: int = 64 << 20
+    held_bytes: int = 512 << 20
+    linger_seconds: float = 2.0
+
+    @property
+    def framing_bytes(self) -> int:
+        """What a request may have beside its body: the head, chunk sizes, trailers."""
+        return self.head_bytes + self.body_bytes // 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +76,17 @@ Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
 
 class Visitors:
-    """All connections of every listener that shares it: counted per host, and swept of those that are stuck."""
+    """All connections of every listener that shares it, and the bytes they hold (bodies that are not answered yet,
+    answers that are not taken yet): counted per host, and swept of those that are stuck.
+    """
 
     def __init__(self, limits: HttpLimits) -> None:
         self._limits = limits
         self.connections: set[_Connection] = set()
         self._per_host: dict[Address, int] = {}
         self._total = 0
+        self._held: Counter[Address] = Counter()
+        self._held_in_all = 0
 
     def enter(self, host: Address) -> str | None:
         """Count a connection in; a sentence instead when the host or the appliance has too many."""
@@ -92,6 +108,23 @@ class Visitors:
         else:
             del self._per_host[host]
 
+    def hold(self, host: Address, size: int) -> str | None:
+        """Count bytes in that are kept for a host; a sentence instead (nothing is counted) when it is too much."""
+        if self._held[host] + size > self._limits.held_bytes_per_host:
+            return f"{host} has {self._held[host]} bytes in requests and answers under way, the limit for one host"
+        if self._held_in_all + size > self._limits.held_bytes:
+            return f"{self._held_in_all} bytes of requests and answers are under way, the limit for all hosts"
+        self._held[host] += size
+        self._held_in_all += size
+        return None
+
+    def release(self, host: Address, size: int) -> None:
+        """Count bytes out."""
+        self._held_in_all -= size
+        self._held[host] -= size
+        if not self._held[host]:
+            del self._held[host]
+
     async def sweep(self) -> None:
         """Every second, close the connections whose deadline has passed; runs until cancelled."""
         while True:
@@ -102,16 +135,21 @@ class Visitors:
 
 
 class Turns:
-    """Slots for requests being served; when all are taken, hosts wait in turn."""
+    """Slots for requests being served, at most `per_host` of them for one host; who gets none waits in turn.
 
-    def __init__(self, slots: int) -> None:
+    Whenever a slot is free, everybody who waits does so because of his own host's share.
+    """
+
+    def __init__(self, slots: int, per_host: int) -> None:
         self._free = slots
+        self._per_host = per_host
+        self._taken: Counter[Address] = Counter()
         self._waiting: OrderedDict[Address, deque[asyncio.Future[None]]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
         """Take a slot, waiting for this host's turn when there is none."""
-        if self._free and not self._waiting:
-            self._free -= 1
+        if self._free and self._taken[host] < self._per_host:
+            self._take(host)
             return
         turn = asyncio.get_running_loop().create_future()
         self._waiting.setdefault(host, deque()).append(turn)
@@ -119,20 +157,36 @@ class Turns:
             await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled():
-                self.leave()
+                self.leave(host)
+            else:
+                self._give_up(host, turn)
             raise
 
-    def leave(self) -> None:
-        """Give the slot to the next host in turn, or back."""
-        while self._waiting:
-            host, queue = self._waiting.popitem(last=False)
-            turn = queue.popleft()
-            if queue:
-                self._waiting[host] = queue  # to the end of the line: its next request waits a round
-            if not turn.done():
-                turn.set_result(None)
-                return
+    def leave(self, host: Address) -> None:
+        """Give the slot back: the host that waited longest and is within its share gets it."""
         self._free += 1
+        self._taken[host] -= 1
+        if not self._taken[host]:
+            del self._taken[host]
+        following = next((one for one in self._waiting if self._taken[one] < self._per_host), None)
+        if following is None:
+            return
+        queue = self._waiting.pop(following)
+        turn = queue.popleft()
+        if queue:
+            self._waiting[following] = queue  # to the end of the line: its next request waits a round
+        self._take(following)
+        turn.set_result(None)
+
+    def _take(self, host: Address) -> None:
+        self._free -= 1
+        self._taken[host] += 1
+
+    def _give_up(self, host: Address, turn: asyncio.Future[None]) -> None:
+        queue = self._waiting[host]
+        queue.remove(turn)
+        if not queue:
+            del self._waiting[host]
 
 
 class HttpServer:
@@ -185,9 +239,13 @@ class _Connection(asyncio.Protocol):
         self.deadline = time.monotonic() + server.limits.head_seconds
         self._counted = False
         self._busy: asyncio.Task[None] | None = None
+        self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
-        self._head_bytes = 0
+        self._received = 0  # bytes of the request that is being read, framing included
+        self._body = bytearray()
         self._head_done = False
+        self._unsent = 0  # bytes of an answer that the peer does not take, as they were counted
+        self._writable = True
         self._closing = False
 
     # --- asyncio.Protocol ---
@@ -218,37 +276,57 @@ class _Connection(asyncio.Protocol):
         if self._counted:
             self.server.visitors.leave(self.peer.host)
             self._counted = False
+            self._release(len(self._body) + self._unsent + sum(len(one.body) for one, _ in self._pending))
+            self._body, self._unsent = bytearray(), 0
         self.server.visitors.connections.discard(self)
         self._pending.clear()
+        if self._busy is not None and self._waiting:
+            self._busy.cancel()
 
     def data_received(self, data: bytes) -> None:
-        if self._closing:
-            return
+        if not self._closing:
+            self._feed(data)
+        if not self._closing:
+            self._bound(len(data))
+
+    def _feed(self, data: bytes) -> None:
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade:
-            self._reject(b"501 Not Implemented", "asked for another protocol")
+            pass  # refused when its head was complete
         except httptools.HttpParserError as error:
             if not self._closing:
                 self._reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
-        if not self._head_done and not self._closing:
-            self._head_bytes += len(data)
-            if self._head_bytes > self._limits.head_bytes:
+
+    def _bound(self, size: int) -> None:
+        self._received += size
+        if not self._head_done:
+            if self._received > self._limits.head_bytes:
                 self._reject(b"431 Request Header Fields Too Large", "sent a request head beyond the limit")
-        elif self._head_done and self._busy is None:
+        elif self._received - len(self._body) > self._limits.framing_bytes:
+            self._reject(b"400 Bad Request", "sent more chunk sizes and trailers than a request may have")
+        elif self._busy is None and self._writable:
             self.deadline = time.monotonic() + self._limits.stall_seconds
+
+    def pause_writing(self) -> None:
+        self._writable = False
+        self.deadline = time.monotonic() + self._limits.stall_seconds
+
+    def resume_writing(self) -> None:
+        self._writable = True
+        self._release(self._unsent)
+        self._unsent = 0
+        if not self._closing and self._busy is None:
+            self._go_on()
 
     # --- httptools callbacks ---
 
     def on_message_begin(self) -> None:
         self._url = b""
-        self._body: list[bytes] = []
-        self._size = 0
-        self._head_bytes = 0
+        self._received = 0
         self._head_done = False
         self._expects = False
-        self._refused = False
-        if self._busy is None:
+        if self._busy is None and self._writable:
             self.deadline = time.monotonic() + self._limits.head_seconds
 
     def on_url(self, url: bytes) -> None:
@@ -271,35 +349,47 @@ class _Connection(asyncio.Protocol):
         if self._parser.get_method() != b"POST":
             self._reject(b"405 Method Not Allowed", "did not POST")
             return
+        if self._parser.should_upgrade():
+            self._reject(b"501 Not Implemented", "asked for another protocol")
+            return
         refusal = self.server.refuse(self.peer)
         if refusal is not None:
-            self._closing = True
-            self._write(b"200 OK", refusal, keep=False)
+            self._write(b"200 OK", refusal, keep=False, unread=True)
         elif self._expects:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, piece: bytes) -> None:
         if self._closing:
             return
-        self._size += len(piece)
-        if self._size > self._limits.body_bytes:
+        if len(self._body) + len(piece) > self._limits.body_bytes:
             self._reject(b"413 Content Too Large", f"sent a body beyond {self._limits.body_bytes} bytes")
             return
-        self._body.append(piece)
+        too_much = self.server.visitors.hold(self.peer.host, len(piece))
+        if too_much is not None:
+            self._reject(b"503 Service Unavailable", f"sent a body while {too_much}")
+            return
+        self._body += piece
 
     def on_message_complete(self) -> None:
         if self._closing:
             return
-        body = self._body[0] if len(self._body) == 1 else b"".join(self._body)
-        self._body = []
+        body, self._body = bytes(self._body), bytearray()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), body, time.monotonic_ns())
         self._pending.append((request, self._parser.should_keep_alive()))
-        if self._busy is None:
+        if self._busy is None and self._writable:
             self._serve_next()
         else:
             self._transport.pause_reading()
 
     # --- serving ---
+
+    def _go_on(self) -> None:
+        """The answer is sent: the next request, if it is there, or wait for one."""
+        self.deadline = time.monotonic() + self._limits.idle_seconds
+        if self._pending:
+            self._serve_next()
+        elif not self._transport.is_closing():
+            self._transport.resume_reading()
 
     def _serve_next(self) -> None:
         request, keep = self._pending.popleft()
@@ -307,43 +397,78 @@ class _Connection(asyncio.Protocol):
         self._busy = asyncio.get_running_loop().create_task(self._serve(request, keep))
 
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
-        turns = self.server.turns
-        await turns.enter(request.peer.host)
-        status = b"200 OK"
         try:
-            body = await self.server.handler(request)
-        except Exception:  # noqa: BLE001 - a defect of ours must not leave the peer without an answer
-            _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
-            status, body = b"500 Internal Server Error", b""
+            status, body = await self._answer(request)
         finally:
-            turns.leave()
             self._busy = None
+            self._release(len(request.body))
         if self._closing:
             return
         self._write(status, body, keep=keep)
-        self.deadline = time.monotonic() + self._limits.idle_seconds
-        if keep and self._pending:
-            self._serve_next()
+        if not self._writable:
+            self._hold_unsent()
         elif keep:
-            self._transport.resume_reading()
+            self._go_on()
 
-    def _write(self, status: bytes, body: bytes, *, keep: bool) -> None:
+    async def _answer(self, request: HttpRequest) -> tuple[bytes, bytes]:
+        turns, host = self.server.turns, request.peer.host
+        self._waiting = True
+        try:
+            await turns.enter(host)
+        finally:
+            self._waiting = False
+        try:
+            return b"200 OK", await self.server.handler(request)
+        except Exception:  # noqa: BLE001 - a defect of ours must not leave the peer without an answer
+            _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
+            return b"500 Internal Server Error", b""
+        finally:
+            turns.leave(host)
+
+    def _hold_unsent(self) -> None:
+        unsent = self._transport.get_write_buffer_size()
+        too_much = self.server.visitors.hold(self.peer.host, unsent)
+        if too_much is not None:
+            self.server.troubled(self.peer, f"an answer is not taken while {too_much}")
+            self.abort()
+            return
+        self._unsent = unsent
+
+    def _release(self, size: int) -> None:
+        self.server.visitors.release(self.peer.host, size)
+
+    def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
+        """Send a response. `unread`: the request was not read to its end, and what comes of it is thrown away,
+        because closing right away would reset the connection and take the answer from the peer.
+        """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
+        if self._transport.is_closing():
+            return
         self._transport.write(head % (status, len(body), connection) + body)
-        if not keep:
-            self._closing = True
+        if keep:
+            return
+        self._closing = True
+        if unread:
+            self.deadline = time.monotonic() + self._limits.linger_seconds
+            self._transport.write_eof()
+        else:
             self.deadline = time.monotonic() + self._limits.stall_seconds
             self._transport.close()
 
     def _reject(self, status: bytes, what: str) -> None:
-        self._closing = True
         self.server.troubled(self.peer, f"{self.peer.text} {what}")
-        self._write(status, b"", keep=False)
+        self._write(status, b"", keep=False, unread=True)
 
     def expire(self) -> None:
         """Called by the sweep when the deadline passed."""
-        if not self._head_done and self._head_bytes:
+        unsent = self._transport.get_write_buffer_size()
+        if unsent < self._unsent:  # slow, but it moves
+            self._release(self._unsent - unsent)
+            self._unsent = unsent
+            self.deadline = time.monotonic() + self._limits.stall_seconds
+            return
+        if not self._closing and not self._head_done and self._received:
             self.server.troubled(self.peer, f"{self.peer.text} did not finish a request in time")
         self.abort()
 

@@ -85,7 +85,8 @@ class _Control:
             connections_per_host=settings.limits.connections_per_host,
             connections=settings.limits.connections,
         )
-        self._visitors, self._turns = Visitors(self._http), Turns(self._http.slots)
+        self._visitors = Visitors(self._http)
+        self._turns = Turns(self._http.slots, self._http.slots_per_host)
         self._stopping = asyncio.Event()
         self._signer: Channel | None = None
         self._servers: list[HttpServer] = []
@@ -314,7 +315,7 @@ class _Control:
             handler,
             limits=self._http,
             visitors=self._visitors if guarded else Visitors(self._http),
-            turns=self._turns if guarded else Turns(self._http.slots),
+            turns=self._turns if guarded else Turns(self._http.slots, self._http.slots),
             refuse=self._refuse if guarded else _refuse_nobody,
             troubled=self._peer_troubled,
         )
