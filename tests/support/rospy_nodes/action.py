@@ -15,8 +15,9 @@ def serve():
 
     def execute(goal):
         for number in range(1, goal.goal + 1):
+            rospy.sleep(0.2)  # the work; the client must know its goal, and feedback overtakes no result
             server.publish_feedback(TestFeedback(feedback=number))
-            rospy.sleep(0.2)  # the work; feedback and result travel on different connections
+        rospy.sleep(0.2)
         report("executed", goal=goal.goal)
         server.set_succeeded(TestResult(result=goal.goal))
 
