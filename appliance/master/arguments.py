@@ -94,7 +94,7 @@ def _list(value: Value, _caller_id: str) -> list[Value]:
 TOPIC = Parameter("topic", _name)
 TOPIC_TYPE = Parameter("topic_type", _type)
 SERVICE = Parameter("service", _name)
-NODE = Parameter("node_name", _name)
+NODE = Parameter("node", _name)
 CALLER_API = Parameter("caller_api", _node_api)
 SERVICE_API = Parameter("service_api", _service_api)
 SUBGRAPH = Parameter("subgraph", _subgraph)
@@ -112,8 +112,7 @@ def canonicalise(
     parameters: tuple[Parameter, ...], required: int, caller_id: str, values: tuple[Value, ...]
 ) -> tuple[object, ...]:
     """The canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
-    if not required <= len(values) <= len(parameters):
-        raise ProtocolError("Error: bad call arity")
+    check_arity(parameters, required, values)
     canonical = []
     for parameter, value in zip(parameters, values, strict=False):
         try:
@@ -121,6 +120,12 @@ def canonicalise(
         except PeerError as error:
             raise type(error)(f"ERROR: parameter [{parameter.name}] {error}") from error
     return tuple(canonical)
+
+
+def check_arity(parameters: tuple[Parameter, ...], required: int, values: tuple[Value, ...]) -> None:
+    """Raise `ProtocolError`, with ROSMaster's words, unless there are as many values as the call takes."""
+    if not required <= len(values) <= len(parameters):
+        raise ProtocolError("Error: bad call arity")
 
 
 def _filled(value: Value) -> str:

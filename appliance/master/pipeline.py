@@ -5,6 +5,7 @@ an answer of the right shape for the caller, and a record; never an exception fo
 """
 
 import asyncio
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,8 +13,9 @@ from typing import TYPE_CHECKING
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.master.arguments import canonicalise
-from appliance.master.call import Answer, Call, Caller, Identity
+from appliance.master.arguments import KEY, NODE, SEARCH_KEY, SUBGRAPH, canonicalise, check_arity
+from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError
+from appliance.master.claims import Claims
 from appliance.master.client import CallFailedError
 from appliance.master.gate import Contest, contested
 from appliance.master.http import Handler, HttpRequest
@@ -28,6 +30,10 @@ if TYPE_CHECKING:
     from appliance.master.core import Master
 
 _log = structlog.get_logger()
+_MULTICALL = "system.multicall"
+_LONGEST_STRETCH = 0.005  # seconds of a multicall without a look at anybody else
+_RECORDED = (KEY, SEARCH_KEY, NODE, SUBGRAPH)  # resolved names: short, and what a reviewer asks for
+_CLAIM_SHOWN = 1024  # characters of a caller_id that is no name
 _PARSE_FAULT, _LIMIT_FAULT, _INTERNAL_FAULT = -32700, -32600, -32603
 
 
@@ -38,6 +44,7 @@ class Pipeline:
         self._master = master
         self._limits = limits
         self._offload = offload
+        self._claims = Claims()
 
     def handler(
         self, calls: Mapping[str, Call], *, own: bool = False, target: Incarnation | None = None
@@ -63,6 +70,8 @@ class Pipeline:
             return self._not_understood(caller, error)
         try:
             answer = await self._answer_all(calls, caller, method_call)
+            if len(body) > self._offload:
+                return await asyncio.to_thread(build_response, answer)
             return build_response(answer)
         except EncodingError as error:
             _log.error("answer cannot be written", call=method_call.method, error=str(error))
@@ -84,22 +93,40 @@ class Pipeline:
     # --- one call, or the parts of a multicall ---
 
     async def _answer_all(self, calls: Mapping[str, Call], caller: Caller, call: MethodCall) -> Value:
-        if call.method != "system.multicall" or caller.target is not None:
+        if call.method != _MULTICALL or caller.target is not None:
             return await self._answer(calls, caller, call.method, call.params)
         if len(call.params) != 1 or not isinstance(call.params[0], list):
-            return [-1, "system.multicall takes one list of calls", 0]
+            why = "system.multicall takes one list of calls"
+            self._part_refused(caller, why)
+            return [-1, why, 0]
         results: list[Value] = []
+        since = time.monotonic()  # not the loop's time, which stands still meanwhile
         for part in call.params[0]:
-            match part:
-                case {"methodName": "system.multicall", **_rest}:
-                    results.append(_part_fault("a multicall inside a multicall is not served"))
-                case {"methodName": str(method), "params": list(params), **rest} if not rest:
-                    results.append([await self._answer(calls, caller, method, tuple(params))])
-                case _:
-                    results.append(
-                        _part_fault("a part of a multicall has methodName and params, nothing else")
-                    )
+            results.append(await self._answer_part(calls, caller, part))
+            if time.monotonic() - since > _LONGEST_STRETCH:
+                await asyncio.sleep(0)
+                since = time.monotonic()
         return results
+
+    async def _answer_part(self, calls: Mapping[str, Call], caller: Caller, part: Value) -> Value:
+        match part:
+            case {"methodName": "system.multicall", **_rest}:
+                return self._part_refused(caller, "a multicall inside a multicall is not served")
+            case {"methodName": str(method), "params": list(params), **rest} if not rest:
+                return [await self._answer(calls, caller, method, tuple(params))]
+        return self._part_refused(caller, "a part of a multicall has methodName and params, nothing else")
+
+    def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:
+        record = self._master.recorder.happened(
+            "malformed",
+            why,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=caller.peer.text,
+            category=Category.COMMAND.value,
+            resource=_MULTICALL,
+        )
+        return {"faultCode": _PARSE_FAULT, "faultString": f"{why} [{record}]"}
 
     async def _answer(
         self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
@@ -111,10 +138,19 @@ class Pipeline:
             caller, arguments = _canonical(call, caller, params)
         except PeerError as error:
             return self._malformed(call, caller, params, error)
-        decision = await self._decide(caller, call, arguments)
+        if call.identity is not Identity.NODE or caller.target is not None:
+            return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
+        gone = await self._gone(caller, call, arguments)
+        async with self._claims.alone(caller.caller_id):
+            return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments, gone))
+
+    async def _carry_out(
+        self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision
+    ) -> Value:
         category, resource = self._master.gate.asked(call, arguments)
         recorder = self._master.recorder
-        record = recorder.decided(caller, method, category.value, resource, decision)
+        asked_of = _asked_of(call, arguments)
+        record = recorder.decided(caller, call.name, category.value, resource, decision, **asked_of)
         if recorder.strict:
             obstacle = await recorder.durable()
             if obstacle is not None:
@@ -123,38 +159,48 @@ class Pipeline:
             return [0, denial_text(decision, record), call.denial]
         return await self._perform(call, caller, arguments)
 
-    async def _decide(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision:
+    async def _gone(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Incarnation | None:
+        """The incarnation that holds the name the caller wants, if its node is gone."""
+        outcome = self._master.gate.decide(caller, call, arguments)
+        if isinstance(outcome, Contest) and await self._master.liveness.is_gone(outcome.holder):
+            return outcome.holder
+        return None
+
+    def _decide(
+        self, caller: Caller, call: Call, arguments: tuple[object, ...], gone: Incarnation | None = None
+    ) -> Decision:
         obstacle = self._master.recorder.obstacle
         if obstacle is not None:
             return Decision(False, None, obstacle)
         outcome = self._master.gate.decide(caller, call, arguments)
-        if isinstance(outcome, Contest):
-            gone = await self._master.liveness.is_gone(outcome.holder)
-            return contested(outcome, gone)
-        return outcome
+        return contested(outcome, outcome.holder is gone) if isinstance(outcome, Contest) else outcome
 
     async def _perform(self, call: Call, caller: Caller, arguments: tuple[object, ...]) -> Value:
         try:
             return await call.perform(self._master, caller, arguments)
-        except NoPortError as error:
-            self._master.recorder.happened(
+        except (NoPortError, LimitReachedError) as error:
+            record = self._master.recorder.happened(
                 "limit exceeded", str(error), severity=Severity.ALARM, decision="deny", host=caller.peer.text
             )
-            return [0, str(error), call.denial]
+            return [0, f"{error} [{record}]", call.denial]
+        except EncodingError as error:
+            return self._malformed(
+                call, caller, (caller.caller_id,), ProtocolError(f"cannot be passed on: {error}")
+            )
         except CallFailedError as error:
             # The text names the hidden ROSMaster's address: it is for our log, not for a node.
             _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
             return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
 
     def _unknown(self, caller: Caller, method: str, params: tuple[Value, ...]) -> Answer:
-        claimed = params[0] if params and isinstance(params[0], str) else ""
+        claimed = _claimed(params)
         caller = replace(caller, caller_id=claimed)
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
         record = self._master.recorder.decided(caller, method, Category.COMMAND.value, method[:200], decision)
         return [0, denial_text(decision, record), 0]
 
     def _malformed(self, call: Call, caller: Caller, params: tuple[Value, ...], error: PeerError) -> Answer:
-        claimed = params[0] if params and isinstance(params[0], str) else ""
+        claimed = _claimed(params)
         self._master.recorder.happened(
             "malformed",
             str(error),
@@ -180,6 +226,7 @@ def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[C
         return caller, canonicalise(call.parameters, required, "", params)
     if not params:
         raise ProtocolError("missing required caller_id parameter")
+    check_arity(call.parameters, required, params[1:])
     caller_id = params[0]
     if not isinstance(caller_id, str):
         raise ProtocolError("caller_id must be a string")
@@ -191,5 +238,17 @@ def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[C
     return caller, canonicalise(call.parameters, required, caller_id, params[1:])
 
 
-def _part_fault(text: str) -> dict[str, Value]:
-    return {"faultCode": _PARSE_FAULT, "faultString": text}
+def _asked_of(call: Call, arguments: tuple[object, ...]) -> dict[str, str]:
+    """What a command is about (a parameter's key, a node's name), for the record: its resource is the command."""
+    if call.resource is not None:
+        return {}
+    return {
+        parameter.name: str(value)
+        for parameter, value in zip(call.parameters, arguments, strict=False)
+        if parameter in _RECORDED
+    }
+
+
+def _claimed(params: tuple[Value, ...]) -> str:
+    """Whom a call that is not understood says it is from, for the record."""
+    return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

@@ -1,0 +1,110 @@
+"""Node APIs that tests register: one server, one path per node and life; what the master calls is kept.
+
+    with FakeNodes() as nodes:
+        master.registerPublisher("/talker", "/chatter", "std_msgs/String", nodes.uri("talker"))
+        nodes.calls("talker", "publisherUpdate")
+
+They answer as real nodes do, so that the appliance, which looks after its nodes, finds them alive.
+"""
+
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from socketserver import ThreadingMixIn
+from typing import Any, Self
+from xmlrpc.server import SimpleXMLRPCDispatcher, SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from tests.support.processes import LIMIT
+
+_ANSWERS: dict[str, list[Any]] = {
+    "getPid": [1, "", os.getpid()],
+    "publisherUpdate": [1, "", 0],
+    "paramUpdate": [1, "", 0],
+    "shutdown": [1, "", 0],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCalled:
+    """A call that a master made to a fake node."""
+
+    node: str
+    method: str
+    params: tuple[Any, ...]
+
+
+class _Handler(SimpleXMLRPCRequestHandler):
+    rpc_paths = ()
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+
+class _Server(ThreadingMixIn, SimpleXMLRPCServer):
+    daemon_threads = True
+    request_queue_size = 512
+
+    def __init__(self, called: Callable[[NodeCalled], None]) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler, logRequests=False, allow_none=True)
+        self._called = called
+
+    def _marshaled_dispatch(
+        self,
+        data: Any,
+        dispatch_method: Callable[[str, tuple[Any, ...]], Any] | None = None,
+        path: Any = None,
+    ) -> Any:
+        def answer(method: str, params: tuple[Any, ...]) -> Any:
+            self._called(NodeCalled(str(path).strip("/"), method, params))
+            return _ANSWERS[method]
+
+        return SimpleXMLRPCDispatcher._marshaled_dispatch(self, data, answer, path)
+
+
+class FakeNodes:
+    """The nodes of one master; a context manager."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._calls: list[NodeCalled] = []
+        self._server = _Server(self._keep)
+        self.base = f"http://127.0.0.1:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    def uri(self, node: str) -> str:
+        """The API URI of a node; another name is another URI."""
+        return self.base + node
+
+    def calls(self, node: str, method: str) -> list[tuple[Any, ...]]:
+        """The parameters of every call of `method` to `node` so far, in order, without the caller's name."""
+        with self._changed:
+            return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
+
+    def all_calls(self) -> list[NodeCalled]:
+        """Every call so far but `getPid` (a look whether the node is there)."""
+        with self._changed:
+            return [one for one in self._calls if one.method != "getPid"]
+
+    def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
+        """Whether `wanted()` came true, looked at whenever a call arrives."""
+        with self._changed:
+            return self._changed.wait_for(wanted, timeout)
+
+    def forget(self) -> None:
+        """Forget the calls so far."""
+        with self._changed:
+            self._calls.clear()
+
+    def _keep(self, call: NodeCalled) -> None:
+        with self._changed:
+            self._calls.append(call)
+            self._changed.notify_all()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

@@ -1,0 +1,204 @@
+"""The same Master API call made to a plain ROSMaster and to RVMaster, and their answers made comparable.
+
+    answers = both.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", Api("talker"))
+    assert answers.plain == answers.appliance
+
+What must differ by design is written here once: URIs (each is turned into the name of the node behind it) and
+ids. Everything else is left as it came. `Api` and `ServiceApi` stand for URIs of fake nodes, of which each master
+has its own.
+"""
+
+import re
+import xmlrpc.client
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tests.integration.conformance.fake_nodes import FakeNodes, NodeCalled
+
+_HTTP_URI = re.compile(r"http://127\.0\.0\.1:\d+/[\w-]*")
+_SERVICE_URI = re.compile(r"rosrpc://[\w.]+:\d+")
+_UNDO = {
+    "registerPublisher": ("unregisterPublisher", (0, 1, 3)),
+    "registerSubscriber": ("unregisterSubscriber", (0, 1, 3)),
+    "registerService": ("unregisterService", (0, 1, 2)),
+    "subscribeParam": ("unsubscribeParam", (0, 1, 2)),
+}
+TESTER = "/conformance"
+
+
+@dataclass(frozen=True, slots=True)
+class Api:
+    """The API URI of a fake node: `life` 2 is another process of the same name."""
+
+    node: str
+    life: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceApi:
+    """The `rosrpc` URI of a service of a fake node."""
+
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """The answer was an XML-RPC fault."""
+
+    code: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """What the two masters answered, with names for URIs."""
+
+    plain: Any
+    appliance: Any
+
+
+class MasterSide:
+    """One of the two masters, and the fake nodes registered with it."""
+
+    def __init__(self, uri: str, nodes: FakeNodes) -> None:
+        self.uri = uri.rstrip("/")
+        self.nodes = nodes
+        self.epoch = 0  # told apart in the URIs: a node that was replaced in one test is another in the next
+        self._server = xmlrpc.client.ServerProxy(uri, allow_none=True)
+        rosout = self.call("lookupNode", [TESTER, "/rosout"])[2]
+        self._names: dict[str, str] = {rosout: "<rosout>"}
+
+    def call(self, method: str, params: Sequence[Any]) -> Any:
+        """The answer as it came, or `Fault`."""
+        try:
+            return getattr(self._server, method)(*self.given(params))
+        except xmlrpc.client.Fault as fault:
+            return Fault(fault.faultCode, fault.faultString)
+
+    def given(self, value: Any) -> Any:
+        """Put this master's URIs for `Api` and `ServiceApi`."""
+        match value:
+            case Api():
+                return self.nodes.uri(f"{value.node}-{value.life}-{self.epoch}")
+            case ServiceApi():
+                return f"rosrpc://127.0.0.1:{value.port}"
+            case dict():
+                return {key: self.given(one) for key, one in value.items()}
+            case list() | tuple():
+                return [self.given(one) for one in value]
+        return value
+
+    def last_list(self, api: Api, topic: str) -> list[str] | None:
+        """The publishers of a topic that a node was told last, by name."""
+        calls = self.nodes.calls(f"{api.node}-{api.life}-{self.epoch}", "publisherUpdate")
+        lists = [uris for given, uris in calls if given == topic]
+        return list(self.named(lists[-1])) if lists else None
+
+    def named(self, value: Any) -> Any:
+        """Put names for URIs, in texts as well."""
+        match value:
+            case str():
+                text = _HTTP_URI.sub(lambda found: self._name(found.group()), value)
+                return _SERVICE_URI.sub("<service>", text)
+            case dict():
+                return {key: self.named(one) for key, one in value.items()}
+            case list() | tuple():
+                return [self.named(one) for one in value]
+        return value
+
+    def _name(self, uri: str) -> str:
+        if uri.rstrip("/") == self.uri:
+            return "<master>"
+        if uri.startswith(self.nodes.base):
+            return f"<{uri.removeprefix(self.nodes.base).split('-')[0]}>"
+        if uri not in self._names:
+            with xmlrpc.client.ServerProxy(uri) as node:
+                answer: Any = node.getName(TESTER)
+            self._names[uri] = f"<{answer[2].rpartition('/')[2]}>"
+        return self._names[uri]
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._server("close")()
+
+
+class BothMasters:
+    """The pair; `reset` takes back what was registered and set through it."""
+
+    def __init__(self, plain: MasterSide, appliance: MasterSide) -> None:
+        self.plain, self.appliance = plain, appliance
+        self._registered: dict[tuple[str, tuple[Any, ...]], None] = {}
+        tree = self.appliance.call("getParam", [TESTER, "/"])[2]
+        self._first_tree = dict(tree)
+        self.reset()
+
+    def call(self, method: str, *params: Any) -> Answers:
+        """Call both."""
+        plain, appliance = self.plain.call(method, params), self.appliance.call(method, params)
+        if method in _UNDO and isinstance(plain, list) and plain[0] == 1:
+            undo, positions = _UNDO[method]
+            self._registered[undo, tuple(params[position] for position in positions)] = None
+        return Answers(self.plain.named(plain), self.appliance.named(appliance))
+
+    def calls_made(self, of_interest: Callable[[NodeCalled], bool]) -> Answers:
+        """What each master told its nodes, by node."""
+        return Answers(self._told(self.plain, of_interest), self._told(self.appliance, of_interest))
+
+    def _told(self, side: MasterSide, of_interest: Callable[[NodeCalled], bool]) -> dict[str, list[Any]]:
+        told: dict[str, list[Any]] = {}
+        for call in side.nodes.all_calls():
+            if of_interest(call):
+                node = call.node.rpartition("-")[0]
+                told.setdefault(node, []).append([call.method, *side.named(list(call.params[1:]))])
+        return told
+
+    def reset(self) -> None:
+        """Take everything back."""
+        for method, params in reversed(self._registered):
+            self.plain.call(method, params)
+            self.appliance.call(method, params)
+        self._registered.clear()
+        for side in (self.plain, self.appliance):
+            side.call("setParam", [TESTER, "/", self._first_tree])
+            side.nodes.forget()
+            side.epoch += 1
+
+
+def differences(answers: Answers) -> list[str]:
+    """What a client library would notice between the two answers: code, type and content of the value, message.
+
+    The words about a parameter that is not valid may differ; which parameter it is may not. A plain master answers
+    some errors with 0 whatever the call returns, the appliance with an empty value of the type it returns.
+    """
+    plain, appliance = answers.plain, answers.appliance
+    if isinstance(plain, Fault) or isinstance(appliance, Fault):
+        return [] if type(plain) is type(appliance) else [f"fault against answer: {plain} / {appliance}"]
+    if len(plain) != 3 or len(appliance) != 3:
+        return [f"not [code, message, value]: {plain} / {appliance}"]
+    found = []
+    if not same(plain[0], appliance[0]):
+        found.append(f"code {plain[0]!r} / {appliance[0]!r}")
+    if _parameter_in(plain[1]) != _parameter_in(appliance[1]):
+        found.append(f"message {plain[1]!r} / {appliance[1]!r}")
+    empty = plain[0] == -1 and same(plain[2], 0) and appliance[2] in ("", [])
+    if not same(plain[2], appliance[2]) and not empty:
+        found.append(f"value {plain[2]!r} / {appliance[2]!r}")
+    return found
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equal, types and order of keys included (`1` is not `True` or `1.0`; `nan` is `nan`)."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other) or (one != one and other != other)  # noqa: PLR0124 - nan is unlike itself
+
+
+def _parameter_in(message: str) -> str:
+    """A message without the words that say what is wrong with a parameter."""
+    found = re.match(r"ERROR: parameter \[\w+\]", message)
+    return found.group() if found else message

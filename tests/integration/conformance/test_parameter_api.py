@@ -1,0 +1,185 @@
+"""The parameter server answers as a plain ROSMaster's: values, trees, scopes, the upward search, watchers.
+
+The kinds of cases are those of ROS's own test of its parameter server (ros_comm, test_rosmaster).
+"""
+
+import math
+from typing import Any
+from xmlrpc.client import Binary, DateTime
+
+import pytest
+
+from tests.integration.conformance.side_by_side import TESTER, Api, BothMasters, MasterSide, differences
+
+Step = tuple[Any, ...]
+VALUES: list[Any] = [
+    0, 1024, 2**31 - 1, -(2**31), True, False, "", "x", "hello world", "ünïcode & <xml> ]]>", "\t two\nlines ",
+    0.0, -0.0, math.pi, 3.4028235e38, -1e-300, 1e300, math.inf, -math.inf, math.nan, [], [1, 2, 3], ["a", "b"],
+    [0.0, -4.5], [1, "a", math.pi, False], [[1, 2], ["a"], []], {}, {"a": 2, "b": 4}, {"a": {"b": {"c": "d"}}},
+    {"list": [{"x": 1}, {"y": [2]}]}, {"z": 1, "a": 2}, Binary(b""), Binary(bytes(range(256))),
+    DateTime("20051206T12:13:14"), [Binary(b"x"), DateTime("14921206T12:13:14")],
+]  # fmt: skip
+
+
+def all_names_and_values(both: BothMasters) -> list[Step]:
+    """The whole tree and the list of names; both masters must have the same."""
+    return [("getParam", TESTER, "/"), ("getParamNames", TESTER)]
+
+
+def compare(both: BothMasters, *steps: Step) -> list[Any]:
+    """Make every call to both, compare the answers and the trees after it; the appliance's answers."""
+    answers = []
+    for step in steps:
+        answer = both.call(*step)
+        assert differences(answer) == [], step
+        answers.append(answer.appliance)
+        for look in all_names_and_values(both):
+            assert differences(both.call(*look)) == [], f"{look[0]} after {step}"
+    return answers
+
+
+@pytest.mark.parametrize("value", VALUES, ids=repr)
+def test_value(both: BothMasters, value: Any) -> None:
+    """Every kind of value is kept and comes back as it was, by itself and within its tree."""
+    compare(
+        both,
+        ("setParam", TESTER, "/kept/value", value),
+        ("hasParam", TESTER, "/kept/value"),
+        ("getParam", TESTER, "/kept/value"),
+        ("getParam", TESTER, "/kept"),
+        ("deleteParam", TESTER, "/kept/value"),
+        ("hasParam", TESTER, "/kept/value"),
+        ("hasParam", TESTER, "/kept"),
+    )
+
+
+def test_tree(both: BothMasters) -> None:
+    """A dictionary is a namespace, a namespace a dictionary; a value in the way becomes a namespace."""
+    compare(
+        both,
+        ("setParam", TESTER, "/gains/P", 1),
+        ("setParam", TESTER, "/gains/I", 2),
+        ("getParam", TESTER, "/gains"),
+        ("getParam", TESTER, "/gains/"),
+        ("getParam", TESTER, "//gains//P"),
+        ("setParam", TESTER, "/gains", {"D": 3}),
+        ("getParam", TESTER, "/gains/P"),
+        ("setParam", TESTER, "/gains/D/deep/er", 4),
+        ("setParam", TESTER, "/gains/D", 5),
+        ("getParam", TESTER, "/gains/D/deep"),
+        ("hasParam", TESTER, "/gains/D/deep"),
+        ("deleteParam", TESTER, "/gains/D/deep"),
+        ("deleteParam", TESTER, "/gains/X"),
+        ("setParam", TESTER, "/gains/text", "abc"),
+        ("deleteParam", TESTER, "/gains/text/a"),
+        ("deleteParam", TESTER, "/gains"),
+        ("deleteParam", TESTER, "/gains"),
+        ("setParam", TESTER, "/", 5),
+        ("setParam", TESTER, "/", {"only": {"this": 1}}),
+        ("deleteParam", TESTER, "/"),
+        ("setParam", TESTER, "/empty", {}),
+        ("getParam", TESTER, "/empty"),
+        ("setParam", TESTER, "/", {}),
+    )
+
+
+def test_scopes(both: BothMasters) -> None:
+    """A relative key is in the caller's namespace, a private one in the caller's name; nothing is searched for."""
+    compare(
+        both,
+        ("setParam", "/down/one/two/node", "depth", 3),
+        ("getParam", "/down/one/two/node", "depth"),
+        ("getParam", "/down/one/node", "depth"),
+        ("getParam", "/down/one/node", "two/depth"),
+        ("hasParam", "/down/one/two/other/node", "depth"),
+        ("setParam", "/node", "down/one/two/depth", 4),
+        ("getParam", "/down/one/two/node", "depth"),
+        ("setParam", "/down/node", "~mine", 5),
+        ("getParam", "/down/node", "~mine"),
+        ("getParam", "/down/other", "~mine"),
+        ("getParam", "/down/other", "node/mine"),
+        ("deleteParam", "/down/node", "~mine"),
+        ("deleteParam", "/down/node", "one/two/depth"),
+        ("getParam", "", "down"),
+        ("hasParam", "", "down/one"),
+    )
+
+
+def test_search(both: BothMasters) -> None:
+    """`searchParam` looks upwards for the first part of the key and joins the rest, there or not."""
+    leaf = {"p1": 1, "p2": {"q": 2}}
+    callers = [
+        "/root", "/l1/node", "/l1/l2/node", "/l1/l2/l3/l4/node", "/l1/other/l3/node", "/not/l1/l2/node", "/l1",
+    ]  # fmt: skip
+    for place in ("/param", "/l1/param", "/l1/l2/param", "/l1/l2/l3/l4/param", "/l1/node/param"):
+        compare(both, ("setParam", TESTER, place, leaf))
+        for caller in callers:
+            for key in (
+                "param",
+                "param/p1",
+                "param/p2/q",
+                "param/p2/missing",
+                "missing",
+                "/param/p1",
+                "/missing",
+            ):
+                answer = both.call("searchParam", caller, key)
+                assert differences(answer) == [], (caller, key)
+    compare(both, ("deleteParam", TESTER, "/l1/l2/param/p2"), ("searchParam", "/l1/l2/node", "param/p2/q"))
+
+
+def test_search_for_a_private_name(both: BothMasters) -> None:
+    """A private name cannot be searched for: an error on both (a plain master calls it its own failure)."""
+    answers = both.call("searchParam", TESTER, "~param")
+    assert (answers.plain[0], answers.appliance[0]) == (0, -1)
+
+
+@pytest.mark.parametrize("watched", ["/arm", "/arm/", "/arm/speed", "/", "arm/joint", "~own"])
+def test_watchers_are_told_alike(both: BothMasters, watched: str) -> None:
+    """Who subscribed to a key hears of the same changes, with the same values, in the same order."""
+    ear = Api("ear")
+    compare(both, ("setParam", TESTER, "/arm/speed", 0), ("subscribeParam", "/ear", ear, "/settled"))
+    for number, step in enumerate(
+        (
+            ("subscribeParam", "/ear", ear, watched),
+            ("subscribeParam", "/ear", ear, watched),
+            ("setParam", TESTER, "/arm/speed", 1),
+            ("setParam", TESTER, "/arm/joint/left", [1, 2]),
+            ("setParam", TESTER, "/arm", {"speed": 2, "joint": {"left": 3, "right": 4}}),
+            ("setParam", TESTER, "/other", 1),
+            ("setParam", "/ear", "/arm/speed", 5),
+            ("setParam", "/ear", "~own", {"a": 1}),
+            ("deleteParam", TESTER, "/arm/joint"),
+            ("deleteParam", TESTER, "/arm"),
+            ("unsubscribeParam", "/ear", ear, watched),
+            ("setParam", TESTER, "/arm/speed", 10),
+        )
+    ):
+        # A plain master sends a tree as it is when it comes to it: let it come to it before the next change.
+        compare(both, step, ("setParam", TESTER, "/settled", number))
+        for side in (both.plain, both.appliance):
+            assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]
+    told = both.calls_made(lambda call: call.method == "paramUpdate")
+    assert told.plain == told.appliance
+
+
+def _has_settled(side: MasterSide, number: int) -> bool:
+    return any(call.params[1:] == ("/settled/", number) for call in side.nodes.all_calls())
+
+
+def test_ten_thousand_parameters(both: BothMasters) -> None:
+    """A tree of 10,000 parameters is set, listed, read and cleared, whole and one by one."""
+    tree = {f"group_{group}": {f"p{number}": number for number in range(100)} for group in range(100)}
+    compare(
+        both,
+        ("setParam", TESTER, "/large", tree),
+        ("getParam", TESTER, "/large/group_99/p99"),
+        ("setParam", TESTER, "/large/group_99/p99", "changed"),
+        ("searchParam", "/large/group_5/node", "p7"),
+    )
+    parts = [
+        {"methodName": "setParam", "params": [TESTER, f"/many/p{number}", number]} for number in range(2000)
+    ]
+    answers = both.call("system.multicall", parts)
+    assert answers.plain == answers.appliance
+    compare(both, ("deleteParam", TESTER, "/large"), ("deleteParam", TESTER, "/many"))
