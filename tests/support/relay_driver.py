@@ -243,6 +243,10 @@ class RelayDriver:
 
     def __init__(self, port: int = 0, rosmaster_port: int = 0, limits: str = "None") -> None:
         self.granting = True
+        self._server = _Server((LOOPBACK, port), _Handler, logRequests=False, allow_none=True)
+        self._server.register_instance(self)
+        self.uri = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self.faces: dict[str, Face] = {}
         self.numbers = itertools.count()
         self._gone: list[Face] = []
@@ -257,10 +261,6 @@ class RelayDriver:
         self._master_uri = f"http://{LOOPBACK}:{self._rosmaster_port}/"
         self.relay = RelayProcess(limits)
         self.link = self.relay.open_link(self._received)
-        self._server = _Server((LOOPBACK, port), _Handler, logRequests=False, allow_none=True)
-        self._server.register_instance(self)
-        self.uri = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def __enter__(self) -> "RelayDriver":
         wait_until(lambda: _answers(self._rosmaster_port), "rosmaster answers")
