@@ -28,6 +28,8 @@ from appliance.rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
 """How many continuations a frame may have; only ambiguous grammars come near."""
+MAX_STEP_WORK = 300_000
+"""How many items the completions of one step may bring; bounds its time to a fraction of a second."""
 MAX_DEPTH = 1_000_000
 """How many frames may wait for each other: the nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
@@ -145,6 +147,7 @@ class Recogniser:
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
+        work = 0
         while waiting:
             cont = waiting.pop()
             if cont is None:
@@ -152,6 +155,9 @@ class Recogniser:
                 continue
             below, symbol = cont
             returned, references = self._return(below.shape, symbol)
+            work += len(returned.items) + len(references)
+            if work > MAX_STEP_WORK:
+                raise RunFaultError("the trace can be read in too many ways by this grammar")
             others = below.resolve(references)
             items.update((item, others[reference]) for item, reference in returned.items)
             fresh = {others[reference] for reference in returned.done} - completed
