@@ -8,11 +8,24 @@ that registers in that moment notices nothing but a delay. The reconcile loop sh
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 
+from appliance.master.batch import BatchingClient
 from appliance.master.call import Answer
 from appliance.master.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import Limits, Value
+
+
+def limits_of_answers(limits: Limits, parameters: int) -> Limits:
+    """What ROSMaster may answer: the whole parameter tree of `parameters` bytes, which `limits` let in by parts."""
+    return replace(
+        limits,
+        body=4 * parameters + limits.body,
+        elements=parameters,
+        depth=limits.depth + 2,
+        string=limits.string + 64,
+    )
 
 
 class RosMaster:
@@ -36,6 +49,7 @@ class RosMaster:
             limits=limits,
             disconnected=lost,
         )
+        self._calls = BatchingClient(self._client)
         self._open = asyncio.Event()
         self._alone = asyncio.Lock()
         self._inside = 0
@@ -52,7 +66,7 @@ class RosMaster:
         try:
             async with asyncio.timeout(self._hold):
                 while True:
-                    if not self._open.is_set():
+                    while not self._open.is_set():  # it may be shut again before we are woken
                         await self._open.wait()
                     self._enter()
                     try:
@@ -67,7 +81,7 @@ class RosMaster:
 
     async def call_now(self, method: str, *params: Value) -> Answer:
         """Call whether or not the door is open: for the reconcile loop."""
-        answer = await self._client.call(method, *params)
+        answer = await self._calls.call(method, *params)
         if isinstance(answer, list) and len(answer) == 3 and isinstance(answer[0], int):
             return answer
         raise CallFailedError(

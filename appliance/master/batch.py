@@ -1,0 +1,81 @@
+"""Calls that are made in the same turn of the loop travel to ROSMaster as one `system.multicall`, in their order.
+
+Under load this saves most of the system calls between the two processes; a call that is alone travels alone. The
+answers are taken apart again, so that nobody notices: a fault of one part is that part's fault.
+"""
+
+import asyncio
+
+from appliance.master.client import CallFailedError, XmlRpcClient
+from appliance.ros.xmlrpc import Value
+
+_LARGEST = 64  # parts of one multicall: what one slow part can hold up
+_Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
+
+
+class BatchingClient:
+    """Makes the calls of one turn of the loop together, over `client`."""
+
+    def __init__(self, client: XmlRpcClient) -> None:
+        self._client = client
+        self._waiting: list[_Waiting] = []
+        self._sending: set[asyncio.Task[None]] = set()
+
+    async def call(self, method: str, *params: Value) -> Value:
+        """Call `method` and return its value. Raises `CallFailedError`."""
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[Value] = loop.create_future()
+        self._waiting.append((method, params, answer))
+        if len(self._waiting) == 1:
+            loop.call_soon(self._send)
+        return await answer
+
+    def _send(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for begin in range(0, len(waiting), _LARGEST):
+            part = waiting[begin : begin + _LARGEST]
+            task = asyncio.get_running_loop().create_task(
+                self._one(part[0]) if len(part) == 1 else self._many(part)
+            )
+            self._sending.add(task)
+            task.add_done_callback(self._sending.discard)
+
+    async def _one(self, waiting: _Waiting) -> None:
+        method, params, answer = waiting
+        try:
+            value = await self._client.call(method, *params)
+        except CallFailedError as error:
+            _settle(answer, error)
+        else:
+            _settle(answer, value)
+
+    async def _many(self, waiting: list[_Waiting]) -> None:
+        calls: list[Value] = [
+            {"methodName": method, "params": list(params)} for method, params, _answer in waiting
+        ]
+        try:
+            values = await self._client.call("system.multicall", calls)
+            if not isinstance(values, list) or len(values) != len(waiting):
+                raise CallFailedError("the ROS Master answered a multicall with another number of answers")
+        except CallFailedError as error:
+            for _method, _params, answer in waiting:
+                _settle(answer, error)
+            return
+        for (method, _params, answer), value in zip(waiting, values, strict=True):
+            match value:
+                case [one]:
+                    _settle(answer, one)
+                case {"faultString": str(text)}:
+                    _settle(answer, CallFailedError(f"the ROS Master answered {method} with a fault: {text}"))
+                case _:
+                    _settle(answer, CallFailedError(f"the ROS Master answered {method} with nonsense"))
+
+
+def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError") -> None:
+    if answer.done():
+        return
+    if isinstance(outcome, CallFailedError):
+        # Each caller raises an exception of its own: one object raised in many tasks would mix their tracebacks.
+        answer.set_exception(type(outcome)(*outcome.args))
+    else:
+        answer.set_result(outcome)

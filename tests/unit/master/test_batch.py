@@ -1,0 +1,84 @@
+"""Calls of one turn of the loop travel together."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from appliance.master.batch import BatchingClient
+from appliance.master.client import BrokenOffError, CallFailedError
+
+
+class Server:
+    """Answers as ROSMaster would, and remembers what travelled."""
+
+    def __init__(self) -> None:
+        self.travelled: list[tuple[str, tuple[Any, ...]]] = []
+        self.broken = False
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """Echo; a method `bad` is a fault."""
+        self.travelled.append((method, params))
+        if self.broken:
+            raise BrokenOffError("gone")
+        if method != "system.multicall":
+            return [1, method, params[0]]
+        return [
+            {"faultCode": 1, "faultString": "no such thing"}
+            if part["methodName"] == "bad"
+            else [[1, part["methodName"], part["params"][0]]]
+            for part in params[0]
+        ]
+
+
+def run(server: Server, *calls: tuple[str, Any]) -> list[Any]:
+    """Make all calls in one turn; their outcomes."""
+
+    async def scene() -> list[Any]:
+        client = BatchingClient(server)  # type: ignore[arg-type]  # the server stands for the connection
+        return await asyncio.gather(*(client.call(*one) for one in calls), return_exceptions=True)
+
+    return asyncio.run(scene())
+
+
+def test_a_call_alone_travels_alone() -> None:
+    """No multicall is made of one call."""
+    server = Server()
+    assert run(server, ("getPid", 7)) == [[1, "getPid", 7]]
+    assert server.travelled == [("getPid", (7,))]
+
+
+def test_calls_of_one_turn_travel_as_one_in_their_order() -> None:
+    """Each caller gets its own answer; the order is the order of the calls."""
+    server = Server()
+    assert run(server, ("a", 1), ("b", 2), ("a", 3)) == [[1, "a", 1], [1, "b", 2], [1, "a", 3]]
+    [(method, (parts,))] = server.travelled
+    assert method == "system.multicall"
+    assert [part["methodName"] for part in parts] == ["a", "b", "a"]
+
+
+def test_a_fault_is_its_own_callers_only() -> None:
+    """One part fails, the others have their answers."""
+    first, second, third = run(Server(), ("a", 1), ("bad", 2), ("b", 3))
+    assert first == [1, "a", 1]
+    assert isinstance(second, CallFailedError)
+    assert "no such thing" in str(second)
+    assert third == [1, "b", 3]
+
+
+def test_a_broken_connection_is_everybodys_as_what_it_is() -> None:
+    """Each caller learns that the connection broke, so that each can try again."""
+    server = Server()
+    server.broken = True
+    outcomes = run(server, ("a", 1), ("b", 2))
+    assert [type(one) for one in outcomes] == [BrokenOffError, BrokenOffError]
+    assert outcomes[0] is not outcomes[1]
+
+
+@pytest.mark.parametrize("count", [63, 64, 65, 200])
+def test_many_calls_are_split(count: int) -> None:
+    """No multicall has more than 64 parts, and every call has its answer."""
+    server = Server()
+    outcomes = run(server, *((f"m{one}", one) for one in range(count)))
+    assert outcomes == [[1, f"m{one}", one] for one in range(count)]
+    assert max(len(params[0]) for method, params in server.travelled if method == "system.multicall") <= 64

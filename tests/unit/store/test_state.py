@@ -1,0 +1,74 @@
+"""The tables of control's state file."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.store.state import IncarnationRow, PermissionRow, RegistrationRow, RevisionRow, StateStore
+
+
+def incarnation(key: str) -> IncarnationRow:
+    """A row that differs by its key."""
+    return IncarnationRow(
+        key, "/talker", "10.0.0.1", "http://robot:4711/", "10.0.0.2", 19001, 19002, False, "live", 1.5
+    )
+
+
+def reopened(directory: Path) -> StateStore:
+    """The store as the next control finds it."""
+    return StateStore(directory, failed=pytest.fail)
+
+
+def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
+    """Incarnations with all their fields, registrations in the order they were made."""
+    store = reopened(tmp_path)
+    store.save_incarnation(incarnation("k1"))
+    second = RegistrationRow("k1", "publication", "/b", "std_msgs/String", 2)
+    first = RegistrationRow("k1", "subscription", "/a", "std_msgs/String", 1)
+    store.save_registration(second)
+    store.save_registration(first)
+    store.close()
+    again = reopened(tmp_path)
+    assert again.load_registry() == ([incarnation("k1")], [first, second])
+    again.close()
+
+
+def test_a_forgotten_incarnation_takes_all_it_had_with_it(tmp_path: Path) -> None:
+    """Registrations and grants of a forgotten incarnation are gone, another's stay."""
+    store = reopened(tmp_path)
+    for key in ("k1", "k2"):
+        store.save_incarnation(incarnation(key))
+        store.save_registration(RegistrationRow(key, "publication", "/a", "*", 1))
+        store.save_permission(PermissionRow(key, "topic", "/a", "10.0.0.9", "/listener"))
+    store.forget_incarnation("k1")
+    store.close()
+    again = reopened(tmp_path)
+    incarnations, registrations = again.load_registry()
+    assert [row.key for row in incarnations] == ["k2"]
+    assert [row.key for row in registrations] == ["k2"]
+    assert [row.key for row in again.permissions()] == ["k2"]
+    again.close()
+
+
+def test_parameters_keep_their_types(tmp_path: Path) -> None:
+    """A tree with every kind of value comes back equal; without one it is empty."""
+    store = reopened(tmp_path)
+    assert store.load_parameters() == {}
+    tree = {"a": {"b": [1, 2.5, True, "x", b"\x00\xff"]}, "empty": {}, "nan_free": -(2**31)}
+    store.save_parameters(tree)
+    store.close()
+    again = reopened(tmp_path)
+    assert again.load_parameters() == tree
+    again.close()
+
+
+def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
+    """Every policy that was in force is kept with who loaded it."""
+    store = reopened(tmp_path)
+    rows = [RevisionRow(n, f"text {n}", "p.ini", float(n), "disk", "note") for n in (1, 2, 3)]
+    for row in rows:
+        store.save_revision(row)
+    store.close()
+    again = reopened(tmp_path)
+    assert again.revisions() == rows[::-1]
+    again.close()
