@@ -12,11 +12,11 @@ MIB = 1 << 20
 class Limits:
     """Bounds of one relay process; lengths in bytes, times in seconds."""
 
-    connections: int = 4096
+    connections: int = 16_384
     """Subscribers and clients connected at once, those that have not sent their header yet included."""
 
-    connections_per_host: int = 512
-    """The same, of one host."""
+    connections_per_host: int = 8_192
+    """The same, of one host: a robot whose nodes all live on one machine has one connection a subscription."""
 
     header_bytes: int = 64 << 10
     """A TCPROS connection header, its length field not counted."""
