@@ -68,6 +68,9 @@ class Limits(_Section):
     nesting: Count = Field(default=100, description="arrays and structs inside each other")
     string_bytes: Size = Field(default=ByteSize(8 << 20), description="one string")
     multicall_parts: Count = Field(default=100_000, description="calls in one system.multicall")
+    parameter_bytes: Size = Field(
+        default=ByteSize(64 << 20), description="all parameters together, as they are sent"
+    )
     header_bytes: Size = Field(default=ByteSize(64 << 10), description="request line and headers")
     header_seconds: Seconds = Field(default=10, description="until request line and headers must be there")
     idle_seconds: Seconds = Field(default=300, description="a kept-alive connection without a request")

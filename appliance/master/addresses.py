@@ -4,12 +4,17 @@ It is the one the host reached us at; unless `advertise:` names another for its 
 own, behind address translation) the machine's address that the host really used.
 """
 
+import asyncio
 import ipaddress
 from collections.abc import Awaitable, Callable, Sequence
+
+import structlog
 
 from appliance.master.http import Peer
 from appliance.policy.model import Address
 
+_log = structlog.get_logger()
+_ANSWER_SECONDS = 3.0
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
@@ -38,4 +43,8 @@ class Addresses:
             return
         if len(self._routes) > 10_000:
             self._routes.clear()
-        self._routes[peer.host] = await self._route_to(peer.text)
+        try:
+            async with asyncio.timeout(_ANSWER_SECONDS):
+                self._routes[peer.host] = await self._route_to(peer.text)
+        except TimeoutError:
+            _log.warning("the supervisor does not say how a host reaches us", host=peer.text)

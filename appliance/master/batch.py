@@ -2,14 +2,23 @@
 
 Under load this saves most of the system calls between the two processes; a call that is alone travels alone. The
 answers are taken apart again, so that nobody notices: a fault of one part is that part's fault.
+
+Only calls whose parameters and answers are a few names travel together. What may be large, slow or impossible to write
+(a parameter's value) travels alone: it could fail, and would take the calls of others with it.
 """
 
 import asyncio
 
 from appliance.master.client import CallFailedError, XmlRpcClient
+from appliance.ros.errors import EncodingError
 from appliance.ros.xmlrpc import Value
 
 _LARGEST = 64  # parts of one multicall: what one slow part can hold up
+_TOGETHER = frozenset({
+    "registerPublisher", "unregisterPublisher", "registerSubscriber", "unregisterSubscriber",
+    "registerService", "unregisterService", "lookupNode", "lookupService", "hasParam", "searchParam",
+    "unsubscribeParam",
+})  # fmt: skip
 _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
@@ -22,7 +31,9 @@ class BatchingClient:
         self._sending: set[asyncio.Task[None]] = set()
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Call `method` and return its value. Raises `CallFailedError`."""
+        """Call `method` and return its value. Raises `CallFailedError`, `EncodingError`."""
+        if method not in _TOGETHER:
+            return await self._client.call(method, *params)
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[Value] = loop.create_future()
         self._waiting.append((method, params, answer))
@@ -44,7 +55,7 @@ class BatchingClient:
         method, params, answer = waiting
         try:
             value = await self._client.call(method, *params)
-        except CallFailedError as error:
+        except (CallFailedError, EncodingError) as error:
             _settle(answer, error)
         else:
             _settle(answer, value)
@@ -57,7 +68,7 @@ class BatchingClient:
             values = await self._client.call("system.multicall", calls)
             if not isinstance(values, list) or len(values) != len(waiting):
                 raise CallFailedError("the ROS Master answered a multicall with another number of answers")
-        except CallFailedError as error:
+        except (CallFailedError, EncodingError) as error:
             for _method, _params, answer in waiting:
                 _settle(answer, error)
             return
@@ -71,10 +82,10 @@ class BatchingClient:
                     _settle(answer, CallFailedError(f"the ROS Master answered {method} with nonsense"))
 
 
-def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError") -> None:
+def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError | EncodingError") -> None:
     if answer.done():
         return
-    if isinstance(outcome, CallFailedError):
+    if isinstance(outcome, CallFailedError | EncodingError):
         # Each caller raises an exception of its own: one object raised in many tasks would mix their tracebacks.
         answer.set_exception(type(outcome)(*outcome.args))
     else:

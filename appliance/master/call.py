@@ -23,6 +23,10 @@ Answer = list[Value]
 Perform = Callable[["Master", "Caller", tuple[object, ...]], Awaitable[Value]]
 
 
+class LimitReachedError(Exception):
+    """A call would take more than there is for all hosts; the text says what of."""
+
+
 class Identity(enum.Enum):
     """What a call claims by its `caller_id`, and so what is checked of it."""
 

@@ -72,6 +72,8 @@ class XmlRpcClient:
         except OSError as error:
             raise _kind(error)(f"{self._where} could not be called: {error.strerror or error}") from error
         try:
+            if len(response) > _OFFLOAD:
+                return await asyncio.to_thread(parse_response, response, self._limits)
             return parse_response(response, self._limits)
         except FaultReceived as fault:
             raise CallFailedError(f"{self._where} answered {method} with a fault: {fault}") from fault
@@ -202,4 +204,5 @@ def _kind(error: OSError) -> type[CallFailedError]:
 
 
 _HEAD_LIMIT = 64 << 10
+_OFFLOAD = 256 << 10  # bytes of an answer that are parsed on the event loop
 _UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH

@@ -6,27 +6,34 @@ follows it. A call that fails is tried again a few times; then the node is looke
 """
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+
+import structlog
 
 from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.master.registry import Incarnation
 from appliance.ros.xmlrpc import Limits, Value
 
+_log = structlog.get_logger()
 MASTER_NAME = "/master"
 
 
 @dataclass(frozen=True, slots=True)
 class NodeCall:
-    """One call to a node: method and parameters after the caller's name."""
+    """One call to a node: method and parameters after the caller's name, and about how many bytes it takes."""
 
     method: str
     parameters: tuple[Value, ...]
+    size: int = 0
 
 
 class Delivery:
-    """The queues. `timeout` is seconds for one call; a queue holds at most `bound` calls (the oldest go)."""
+    """The queues. `timeout` is seconds for one call.
+
+    A queue holds at most `bound` calls, all together `bound_bytes`: beyond, the oldest go, of the queue that has most.
+    """
 
     def __init__(
         self,
@@ -35,12 +42,16 @@ class Delivery:
         limits: Limits,
         troubled: Callable[[Incarnation, str], None],
         bound: int = 10_000,
+        bound_bytes: int = 256 << 20,
         tries: int = 4,
     ) -> None:
         self._timeout = timeout
         self._limits = limits
         self._troubled = troubled
         self._bound = bound
+        self._bound_bytes = bound_bytes
+        self._bytes: Counter[str] = Counter()
+        self._bytes_in_all = 0
         self._tries = tries
         self._queues: dict[str, deque[NodeCall]] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
@@ -48,17 +59,37 @@ class Delivery:
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         """Queue a call for a node."""
         queue = self._queues.setdefault(incarnation.key, deque())
-        if len(queue) >= self._bound:
-            queue.popleft()
-            self._troubled(incarnation, f"more than {self._bound} calls wait for it; the oldest was dropped")
         queue.append(call)
+        self._count(incarnation.key, call.size)
+        if len(queue) > self._bound:
+            self._take(incarnation.key)
+            self._troubled(incarnation, f"more than {self._bound} calls wait for it; the oldest was dropped")
+        while self._bytes_in_all > self._bound_bytes:
+            longest = max(self._bytes, key=lambda key: self._bytes[key])
+            self._take(longest)
+            _log.warning(
+                "calls that wait for a node take too much memory: the oldest is dropped", key=longest
+            )
         if incarnation.key not in self._workers:
             worker = asyncio.get_running_loop().create_task(self._work(incarnation))
             self._workers[incarnation.key] = worker
 
     def drop(self, incarnation: Incarnation) -> None:
         """Forget what waits for a node."""
+        while self._queues.get(incarnation.key):
+            self._take(incarnation.key)
         self._queues.pop(incarnation.key, None)
+
+    def _take(self, key: str) -> NodeCall:
+        call = self._queues[key].popleft()
+        self._count(key, -call.size)
+        return call
+
+    def _count(self, key: str, size: int) -> None:
+        self._bytes_in_all += size
+        self._bytes[key] += size
+        if not self._bytes[key]:
+            del self._bytes[key]
 
     def close(self) -> None:
         """Stop delivering."""
@@ -71,8 +102,8 @@ class Delivery:
 
     async def _work(self, incarnation: Incarnation) -> None:
         try:
-            while queue := self._queues.get(incarnation.key):
-                await self._deliver(incarnation, queue.popleft())
+            while self._queues.get(incarnation.key):
+                await self._deliver(incarnation, self._take(incarnation.key))
             self._queues.pop(incarnation.key, None)
         finally:
             self._workers.pop(incarnation.key, None)

@@ -6,7 +6,7 @@ own that other nodes call. Neither reveals the node's real URI, and neither is e
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Caller
@@ -21,7 +21,8 @@ from appliance.store.state import StateStore
 class Faces:
     """Opens and closes faces. `serve(incarnation)` makes the handler of an outer face.
 
-    `address_for(peer)` is the appliance's address that the peer is told in URIs.
+    `address_for(peer)` is the appliance's address that the peer is told in URIs; `revive(incarnation)` brings a
+    shadow back with all it had, `forget(incarnation)` drops one for good.
     """
 
     def __init__(
@@ -38,6 +39,8 @@ class Faces:
         turns: Turns,
         refuse: Callable[[Peer], bytes | None],
         troubled: Callable[[Peer, str], None],
+        revive: Callable[[Incarnation], Awaitable[None]],
+        forget: Callable[[Incarnation], None],
     ) -> None:
         self._registry = registry
         self._places = places
@@ -50,6 +53,8 @@ class Faces:
         self._turns = turns
         self._refuse = refuse
         self._troubled = troubled
+        self._revive = revive
+        self._forget = forget
         self._servers: dict[str, HttpServer] = {}
         self._coming: dict[tuple[str, Address, str], asyncio.Future[Incarnation]] = {}
 
@@ -81,9 +86,11 @@ class Faces:
             incarnation.told = self._address_for(caller.peer)
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
-            # It registers again although ROS 1 nodes never do: another process at the same URI.
-            self._registry.forget(incarnation)
-            self.close(incarnation)
+            if self._registry.holder(incarnation.name) is None:
+                # It was away and adds to what it had, before anybody saw that it is back.
+                await self._revive(incarnation)
+                return incarnation
+            self._forget(incarnation)  # another took its name meanwhile: it begins anew
         coming = self._coming.get(identity)
         if coming is None:
             coming = asyncio.ensure_future(self._make(caller, api))

@@ -5,6 +5,7 @@ question that only the network can answer (is the node that holds this name stil
 `Contest`, and asked again with the answer.
 """
 
+import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -66,7 +67,11 @@ class Gate:
             return decision
         if call.identity is Identity.NOBODY or not caller.caller_id:
             return decision
-        denial = self._late(caller, call, arguments) or self._over_limit(caller, call, arguments)
+        denial = (
+            self._late(caller, call, arguments)
+            or self._unreachable(caller, call, arguments)
+            or self._over_limit(caller, call, arguments)
+        )
         if denial is not None:
             return denial
         return self._bound(caller, call, decision)
@@ -130,6 +135,19 @@ class Gate:
             )
         return None
 
+    def _unreachable(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
+        if call.api is None or call.name.startswith("un") or caller.peer.host.is_loopback:
+            return None
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        if not _is_loopback(api.uri.host):
+            return None
+        return _no(
+            f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): nobody else can "
+            f"call it; start it with ROS_IP={caller.peer.text}, or without ROS_IP and ROS_HOSTNAME"
+        )
+
     def _bound(self, caller: Caller, call: Call, decision: Decision) -> Decision | Contest:
         holder = self._registry.holder(caller.caller_id)
         if holder is None or holder.host == caller.peer.host:
@@ -168,6 +186,15 @@ def contested(contest: Contest, gone: bool) -> Decision:
         f"{contest.holder.name} is held by a running node on {contest.holder.host}; another host may take the name "
         "over once that node is gone (or at once with [Options] takeover = granted)"
     )
+
+
+def _is_loopback(host: str) -> bool:
+    if host.lower() in ("localhost", "localhost.localdomain", "ip6-localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _both(first: Decision, second: Decision) -> Decision:

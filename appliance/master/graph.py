@@ -146,6 +146,9 @@ class Graph:
         registrations = list(incarnation.registrations.values())
         self._registry.forget(incarnation)
         self._tell_withdrawn(registrations)
+        if self._registry.holder(incarnation.name) is None:
+            for topic in (one.resource for one in registrations if one.kind is Kind.SUBSCRIPTION):
+                self._relay.revoke_subscriber(incarnation.host, incarnation.name, topic)
         self._relay.forgotten(incarnation)
         self._delivery.drop(incarnation)
         self._closed(incarnation)

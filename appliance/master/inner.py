@@ -35,14 +35,14 @@ class InnerFace:
         except PeerError as error:
             _log.error("ROSMaster's call was not understood", error=str(error))
             return build_fault(1, str(error))
-        return build_response(self._answer(incarnation, call))
+        return build_response(self._answer(incarnation, call, len(request.body)))
 
-    def _answer(self, incarnation: Incarnation, call: MethodCall) -> Value:
+    def _answer(self, incarnation: Incarnation, call: MethodCall, size: int) -> Value:
         match call.method, call.params:
             case "publisherUpdate", _:
                 return [1, "", 0]
             case "paramUpdate", (_, str(key), value):
-                self._delivery.push(incarnation, NodeCall("paramUpdate", (key, value)))
+                self._delivery.push(incarnation, NodeCall("paramUpdate", (key, value), size))
                 return [1, "", 0]
             case "shutdown", (_, str(reason)):
                 self._delivery.push(incarnation, NodeCall("shutdown", (reason,)))

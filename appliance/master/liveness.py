@@ -66,7 +66,9 @@ class Liveness:
         """Look at every incarnation every `interval` seconds, until cancelled."""
         while True:
             await asyncio.sleep(self._settings.interval)
-            for incarnation in self._registry.all():
+            known = self._registry.all()
+            self._answered = {one.key: self._answered[one.key] for one in known if one.key in self._answered}
+            for incarnation in known:
                 self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
@@ -85,6 +87,11 @@ class Liveness:
         except CallFailedError:
             return False
         return False
+
+    async def revive(self, incarnation: Incarnation) -> None:
+        """A shadow registers: it is there again, and so is all it had. Raises `CallFailedError`."""
+        self._answered[incarnation.key] = time.monotonic()
+        await self._put_back(incarnation, self._graph.returned(incarnation))
 
     async def _look(self, incarnation: Incarnation) -> None:
         async with self._slots:
@@ -149,5 +156,4 @@ class Liveness:
             _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
 
     def _forget(self, incarnation: Incarnation) -> None:
-        self._answered.pop(incarnation.key, None)
         self._graph.forgotten(incarnation)

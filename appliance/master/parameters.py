@@ -3,71 +3,133 @@
 The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
 """
 
-import copy
 from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
-from appliance.master.call import Answer, Caller
+from appliance.master.call import Answer, Caller, LimitReachedError
 from appliance.master.registry import Kind
 from appliance.policy.model import Category, Request
+from appliance.ros.errors import ProtocolError
 from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
 
 Tree = dict[str, Value]
+_NAME_WEIGHT = 40
 
 
 class ParameterMirror:
-    """A copy of ROSMaster's parameter tree; `changed()` hears of every change."""
+    """A copy of ROSMaster's parameter tree, and how much there is of it; `changed()` hears of every change.
 
-    def __init__(self, tree: Tree, changed: Callable[[], None]) -> None:
+    `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
+    tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        changed: Callable[[], None],
+        *,
+        bytes_limit: int = 64 << 20,
+        depth_limit: int = 100,
+    ) -> None:
         self.tree = tree
+        self.weight = measure(tree)[0]
         self._changed = changed
+        self._bytes_limit = bytes_limit
+        self._depth_limit = depth_limit
 
     def is_namespace(self, key: str) -> bool:
         """Whether `key` (canonical) holds other keys."""
         node: Value = self.tree
-        for part in key.split("/"):
-            if part:
-                if not isinstance(node, dict) or part not in node:
-                    return False
-                node = node[part]
+        for part in _parts(key):
+            if not isinstance(node, dict) or part not in node:
+                return False
+            node = node[part]
         return isinstance(node, dict)
+
+    def check(self, key: str, value: Value) -> None:
+        """Raise `ProtocolError` or `LimitReachedError` for a value that would be too deep or too much."""
+        weight, depth = measure(value)
+        if len(_parts(key)) + depth > self._depth_limit:
+            raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
+        if self.weight + weight > self._bytes_limit:
+            raise LimitReachedError(
+                f"all parameters together would have {self.weight + weight} bytes; the limit is {self._bytes_limit}"
+            )
 
     def replace(self, tree: Tree) -> None:
         """Take the tree that ROSMaster has."""
         self.tree = tree
+        self.weight = measure(tree)[0]
         self._changed()
 
     def set(self, key: str, value: Value) -> None:
-        """`key` (canonical) has this value; a dictionary replaces the namespace."""
-        parts = [part for part in key.split("/") if part]
-        value = copy.deepcopy(value)
+        """`key` (canonical) has this value, which is the mirror's from now on; a dictionary replaces the namespace."""
+        parts = _parts(key)
         if not parts:
-            self.tree = cast(Tree, value)
-        else:
-            node = self.tree
-            for part in parts[:-1]:
-                below = node.get(part)
-                if not isinstance(below, dict):
-                    below = node[part] = {}
-                node = below
-            node[parts[-1]] = value
+            self.replace(cast(Tree, value))
+            return
+        node = self.tree
+        for part in parts[:-1]:
+            below = node.get(part)
+            if not isinstance(below, dict):
+                below = {}
+                self._put(node, part, below)
+            node = below
+        self._put(node, parts[-1], value)
         self._changed()
 
     def delete(self, key: str) -> None:
         """`key` (canonical) is gone."""
-        parts = [part for part in key.split("/") if part]
+        parts = _parts(key)
         node: Value = self.tree
         for part in parts[:-1]:
             if not isinstance(node, dict):
                 return
             node = node.get(part)
-        if parts and isinstance(node, dict):
-            node.pop(parts[-1], None)
+        if parts and isinstance(node, dict) and parts[-1] in node:
+            self.weight -= _member(parts[-1], node.pop(parts[-1]))
             self._changed()
+
+    def _put(self, node: Tree, name: str, value: Value) -> None:
+        if name in node:
+            self.weight -= _member(name, node[name])
+        node[name] = value
+        self.weight += _member(name, value)
+
+
+def measure(value: Value) -> tuple[int, int]:
+    """About how many bytes a value takes on the wire, and how deep it is (0: no array or struct).
+
+    Raises `ProtocolError` for `<nil/>`.
+    """
+    if isinstance(value, str):
+        return 35 + len(value), 0
+    if isinstance(value, bytes):
+        return 35 + len(value) * 4 // 3, 0
+    if isinstance(value, list):
+        measured = [measure(one) for one in value]
+        return 50 + sum(weight for weight, _ in measured), 1 + max(
+            (depth for _, depth in measured), default=0
+        )
+    if isinstance(value, dict):
+        measured = [measure(one) for one in value.values()]
+        weight = 40 + sum(_NAME_WEIGHT + len(name) for name in value) + sum(weight for weight, _ in measured)
+        return weight, 1 + max((depth for _, depth in measured), default=0)
+    if value is None:
+        raise ProtocolError("a value has <nil/> in it, which neither ROSMaster nor roscpp can send")
+    return 45, 0
+
+
+def _member(name: str, value: Value) -> int:
+    return _NAME_WEIGHT + len(name) + measure(value)[0]
+
+
+def _parts(key: str) -> list[str]:
+    return [part for part in key.split("/") if part]
 
 
 async def get_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
@@ -83,6 +145,7 @@ async def has_param(master: "Master", caller: Caller, arguments: tuple[object, .
 async def set_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`setParam(caller_id, key, value)`."""
     key, value = str(arguments[0]), cast(Value, arguments[1])
+    master.parameters.check(key, value)
     answer = await master.rosmaster.call("setParam", caller.caller_id, key, value)
     if answer[0] == 1:
         master.parameters.set(key, value)

@@ -183,6 +183,8 @@ class Pipeline:
                 "limit exceeded", str(error), severity=Severity.ALARM, decision="deny", host=caller.peer.text
             )
             return [0, f"{error} [{record}]", call.denial]
+        except PeerError as error:
+            return self._malformed(call, caller, (caller.caller_id,), error)
         except EncodingError as error:
             return self._malformed(
                 call, caller, (caller.caller_id,), ProtocolError(f"cannot be passed on: {error}")

@@ -46,7 +46,7 @@ from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.master.revocation import Revocation
 from appliance.master.robot import own_address, robot_addresses
-from appliance.master.rosmaster import RosMaster
+from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.store.database import StoreError
@@ -208,7 +208,11 @@ class _Control:
             mediation,
             closed=self._close_faces,
         )
-        rosmaster = RosMaster(settings.rosmaster_port, lost=self._rosmaster_lost, limits=self._limits)
+        rosmaster = RosMaster(
+            settings.rosmaster_port,
+            lost=self._rosmaster_lost,
+            limits=limits_of_answers(self._limits, int(settings.limits.parameter_bytes)),
+        )
         self._faces = Faces(
             registry,
             self._places,
@@ -221,8 +225,15 @@ class _Control:
             turns=self._turns,
             refuse=self._refuse,
             troubled=self._peer_troubled,
+            revive=self._revive,
+            forget=graph.forgotten,
         )
-        parameters = ParameterMirror(self._store.load_parameters(), self._params_dirty.set)
+        parameters = ParameterMirror(
+            self._store.load_parameters(),
+            self._params_dirty.set,
+            bytes_limit=int(settings.limits.parameter_bytes),
+            depth_limit=settings.limits.nesting,
+        )
         self._reconciler = Reconciler(
             rosmaster,
             registry,
@@ -391,6 +402,9 @@ class _Control:
 
     def _look_at(self, incarnation: Incarnation) -> None:
         self._liveness.look_at(incarnation)
+
+    async def _revive(self, incarnation: Incarnation) -> None:
+        await self._liveness.revive(incarnation)
 
     def _rosmaster_lost(self) -> None:
         self._master.rosmaster.shut()

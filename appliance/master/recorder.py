@@ -35,11 +35,19 @@ class Recorder:
         failure = await self._log.wait_durable()
         return failure if self._deny_when_failed else None
 
-    def decided(self, caller: Caller, method: str, category: str, resource: str, decision: Decision) -> str:
-        """Record a decision; its id."""
+    def decided(
+        self,
+        caller: Caller,
+        method: str,
+        category: str,
+        resource: str,
+        decision: Decision,
+        **asked_of: str,
+    ) -> str:
+        """Record a decision; its id. `asked_of` is what a command is about: a parameter, a node."""
         record_id = self._ids.next()
         word = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
-        detail: dict[str, Any] = {"call": method}
+        detail: dict[str, Any] = {"call": method, **asked_of}
         if caller.target is not None:
             detail["node"] = caller.target.name
         self._log.record(

@@ -73,6 +73,7 @@ async def unregister_service(master: "Master", caller: Caller, arguments: tuple[
     )
     uri = stand_in(provider) if provider is not None else NO_SERVICE
     answer = await master.rosmaster.call("unregisterService", caller.caller_id, service, uri)
+    _speak_as_asked(answer, uri, service_api)
     if answer[0] == 1 and provider is not None:
         master.graph.unregistered(provider, Kind.SERVICE, service)
     return answer
@@ -85,9 +86,15 @@ async def _unregister(
     incarnation = master.faces.known(caller, api)
     inner = master.faces.inner_uri(incarnation) if incarnation is not None else master.faces.nobody()
     answer = await master.rosmaster.call(method, caller.caller_id, resource, inner)
+    _speak_as_asked(answer, inner, api)
     if answer[0] == 1 and incarnation is not None:
         master.graph.unregistered(incarnation, kind, resource)
     return answer
+
+
+def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:
+    """ROSMaster's words may repeat the URI it was told, which is nobody's business: the caller reads his own."""
+    answer[1] = str(answer[1]).replace(told, asked.text)
 
 
 async def withdraw(master: "Master", incarnation: Incarnation, kind: Kind, resource: str) -> None:

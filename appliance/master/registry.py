@@ -197,6 +197,8 @@ class Registry:
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Registration:
         """Record that ROSMaster took this registration."""
+        if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
+            self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
         known = incarnation.registrations.get((kind, resource))
         if known is not None and known.detail == detail:

@@ -22,6 +22,8 @@ from appliance.ros.xmlrpc import Value
 from appliance.store.state import PermissionRow, StateStore
 
 RELAY_NAME = "/rosrv"
+_GRANTS_PER_HOST = 20_000
+_CLEARED_AT_ONCE = 1000
 TOPIC, SERVICE = "topic", "service"
 
 
@@ -68,6 +70,7 @@ class RelayControl:
         self._channel: Channel | None = None
         self._epoch = 0
         self._permissions: dict[str, set[PermissionRow]] = {}
+        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
         self._asking: set[asyncio.Task[None]] = set()
         self.connections: dict[int, Connection] = {}
         self.traffic: dict[tuple[str, str], Traffic] = {}
@@ -83,6 +86,7 @@ class RelayControl:
         """Read the kept grants."""
         for row in self._store.permissions():
             self._permissions.setdefault(row.key, set()).add(row)
+            self._of_host.setdefault(row.host, {})[row] = None
 
     def attach(self, channel: Channel) -> None:
         """A relay is there: serve its link and state everything."""
@@ -168,7 +172,7 @@ class RelayControl:
         """The incarnation is gone for good, its grants with it."""
         self.node_withdrawn(incarnation)
         for row in self._permissions.pop(incarnation.key, ()):
-            self._store.remove_permission(row)
+            self._drop(row)
         for key in [one for one in self.traffic if one[0] == incarnation.key]:
             del self.traffic[key]
 
@@ -191,13 +195,35 @@ class RelayControl:
         if row not in rows:
             rows.add(row)
             self._store.save_permission(row)
+            mine = self._of_host.setdefault(row.host, {})
+            mine[row] = None
+            if len(mine) > _GRANTS_PER_HOST:
+                self._clear_unused(row)
         self._state(row)
+
+    def _clear_unused(self, newest: PermissionRow) -> None:
+        """A host that asks for topics under ever new names loses its oldest grants that nobody is connected by."""
+        used = {(one.key, one.kind, one.resource, one.host) for one in self.connections.values()}
+        unused = [
+            row
+            for row in self._of_host[newest.host]
+            if row != newest and (row.key, row.kind, row.resource, row.host) not in used
+        ]
+        for row in unused[:_CLEARED_AT_ONCE]:
+            self.revoke(row)
+
+    def _drop(self, row: PermissionRow) -> None:
+        self._store.remove_permission(row)
+        mine = self._of_host.get(row.host, {})
+        mine.pop(row, None)
+        if not mine:
+            self._of_host.pop(row.host, None)
 
     def revoke(self, row: PermissionRow) -> None:
         """Take a grant back; its connection is cut."""
         rows = self._permissions.get(row.key, set())
         rows.discard(row)
-        self._store.remove_permission(row)
+        self._drop(row)
         if row.kind == TOPIC:
             self._send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
         else:
@@ -224,6 +250,8 @@ class RelayControl:
                     self._broken(incarnation)
             case messages.TrafficReported():
                 for row in message.rows:
+                    if self._registry.by_key(row.key) is None:
+                        continue  # the last words about a node that is forgotten
                     traffic = self.traffic.setdefault((row.key, row.resource), Traffic())
                     traffic.messages += row.messages
                     traffic.bytes += row.bytes

@@ -54,7 +54,9 @@ class Revocation:
         if registration.kind is Kind.PARAMETER:
             decision = gate.may_be_node(Request(host, name, Category.COMMAND, "subscribeParam"))
             if decision.allowed and policy.has_section(Category.READ):
-                decision = gate.may(Request(host, name, Category.READ, registration.resource))
+                decision = policy.decide_parameter(
+                    Request(host, name, Category.READ, registration.resource), subtree=True
+                )
             return decision
         return gate.may_be_node(Request(host, name, _CATEGORIES[registration.kind], registration.resource))
 
