@@ -13,11 +13,14 @@ from typing import Annotated, Literal, Self
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ByteSize,
     ConfigDict,
     Field,
     IPvAnyAddress,
     IPvAnyNetwork,
+    ValidationInfo,
+    field_validator,
     model_validator,
 )
 
@@ -51,6 +54,24 @@ def split_address(text: str) -> tuple[str, int]:
 def _checked_address(text: str) -> str:
     split_address(text)
     return text
+
+
+def _off_as_text(value: object) -> object:
+    return "off" if value is False else value  # YAML reads a bare `off` as false
+
+
+def _checked_api(text: str) -> str:
+    return text if text == "off" else _checked_address(text)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, as configured, is this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class Advertisement(_Section):
@@ -132,6 +153,19 @@ class Firewall(_Section):
     )
 
 
+class ApiLimits(_Section):
+    """What the REST interface accepts; beyond it a client is told to come back later."""
+
+    body_bytes: Size = Field(default=ByteSize(1 << 20), description="body of a request")
+    requests_per_second: Seconds = Field(default=50, description="of one host, on average")
+    burst: Count = Field(default=200, description="requests of one host at once")
+    failures_per_minute: Count = Field(default=20, description="requests of one host without a good token")
+    connections: Count = Field(default=512, description="of all hosts")
+    connections_per_host: Count = 64
+    header_seconds: Seconds = Field(default=10, description="until the request's headers must be there")
+    streams: Count = Field(default=16, description="clients that follow the audit log, at once")
+
+
 class Settings(_Section):
     """All of it."""
 
@@ -163,6 +197,17 @@ class Settings(_Section):
         default="full",
         description="`monitored` tells nodes each other's real URIs; needs relaying: monitored",
     )
+    api: Annotated[str, BeforeValidator(_off_as_text), AfterValidator(_checked_api)] = Field(
+        default="127.0.0.1:8443",
+        description="HOST:PORT of REST, or off; unless it is given here, another free port when this one is taken",
+    )
+    api_tls: bool = Field(default=True, description="off: clear text, on a loopback address only")
+    api_networks: list[IPvAnyNetwork] = Field(
+        default=[], description="who may connect to REST besides this machine (the firewall's rule)"
+    )
+    api_names: list[str] = Field(
+        default=[], description="names REST is called by; addresses and localhost always are"
+    )
     relays: Count = Field(default=1, le=1, description="relay processes")
     advertise: list[Advertisement] = []
     limits: Limits = Limits()
@@ -170,6 +215,17 @@ class Settings(_Section):
     liveness: Liveness = Liveness()
     relay: Relay = Relay()
     firewall: Firewall = Firewall()
+    api_limits: ApiLimits = ApiLimits()
+
+    @field_validator("api_tls")
+    @classmethod
+    def _clear_text_stays_here(cls, tls: bool, info: ValidationInfo) -> bool:
+        api = info.data.get("api", "off")
+        if not tls and api != "off" and not is_loopback(split_address(api)[0]):
+            raise ValueError(
+                f"tokens would cross the network in clear text: off is for a loopback address, and api is {api}"
+            )
+        return tls
 
     @model_validator(mode="after")
     def _mediation_fits(self) -> Self:
@@ -181,6 +237,11 @@ class Settings(_Section):
     def listen_address(self) -> tuple[str, int]:
         """`listen` as host and port."""
         return split_address(self.listen)
+
+    @property
+    def api_address(self) -> tuple[str, int] | None:
+        """`api` as host and port; None when it is off."""
+        return None if self.api == "off" else split_address(self.api)
 
 
 def load_resolved(path: Path) -> Settings:

@@ -54,9 +54,14 @@ class LogUnreadableError(Exception):
 
 
 def create(path: Path, begun: int) -> None:
-    """Make a new, empty log at `path` (mode 0600); `begun` is nanoseconds since the epoch."""
+    """Make a new, empty log at `path`; `begun` is nanoseconds since the epoch.
+
+    Its group may read it (0640), and what SQLite puts beside it: who that is, if anybody, is for the folder to say.
+    """
     making = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
-    os.close(os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
+    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
+    os.fchmod(descriptor, 0o640)
+    os.close(descriptor)
     try:
         connection = sqlite3.connect(making, isolation_level=None)
         try:

@@ -123,6 +123,7 @@ def _pin_key(path: Path, public_key: bytes) -> None:
     making = path.with_name(path.name + ".new")
     descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o644)
     with os.fdopen(descriptor, "wb") as file:
+        os.fchmod(descriptor, 0o644)  # a public key; the folder says who comes by
         file.write(text)
         file.flush()
         os.fsync(file.fileno())

@@ -1,10 +1,14 @@
-"""What operators' tools ask of the running appliance over its admin socket, and what they are answered.
+"""What operators' tools ask of the running appliance, and what they are answered.
 
-One JSON document per line in each direction, one request per connection at a time. The socket is in the state
-directory, for its owner and root only.
+Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
+socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
+passes on `RestRequest`, which cannot make, list or revoke tokens: an api that fell to a stranger gains no access
+that lasts.
+
+`expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -21,16 +25,35 @@ class PolicyReload(AdminRequest, frozen=True, tag="policy reload"):
     """Read the policy file again; back by itself after `confirm_within` seconds unless confirmed."""
 
     confirm_within: float | None = None
+    expected: int | None = None
 
 
 class PolicyRollback(AdminRequest, frozen=True, tag="policy rollback"):
     """Back to a kept revision; None: the one before the present."""
 
     revision: int | None = None
+    expected: int | None = None
 
 
 class PolicyConfirm(AdminRequest, frozen=True, tag="policy confirm"):
     """Keep a change that would go back by itself."""
+
+    expected: int | None = None
+
+
+class PolicyLoad(AdminRequest, frozen=True, tag="policy load"):
+    """Bring a text into force that is not the file's: check, test, swap, decide again what is live."""
+
+    text: str
+    note: str = ""
+    confirm_within: float | None = None
+    expected: int | None = None
+
+
+class PolicyWanted(AdminRequest, frozen=True, tag="policy"):
+    """The text of a revision (None: the one in force), and with what it is judged: its tests, the robot."""
+
+    revision: int | None = None
 
 
 class PolicyRevisions(AdminRequest, frozen=True, tag="policy revisions"):
@@ -41,13 +64,51 @@ class RegistrationsWanted(AdminRequest, frozen=True, tag="registrations"):
     """What is registered now: rows of host, caller_id, category, resource."""
 
 
-AnyRequest = StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyRevisions | RegistrationsWanted
+class GraphWanted(AdminRequest, frozen=True, tag="graph"):
+    """Nodes, topics and services with who is connected to whom and how much flows."""
+
+
+TokenRole = Literal["viewer", "operator", "admin"]
+
+
+class TokenAdd(AdminRequest, frozen=True, tag="token add"):
+    """Make a token that ends after `seconds`; the answer is the only place where its text ever stands."""
+
+    name: str
+    role: TokenRole
+    seconds: float
+
+
+class TokenList(AdminRequest, frozen=True, tag="token list"):
+    """All tokens that were made, without their secrets."""
+
+
+class TokenRevoke(AdminRequest, frozen=True, tag="token revoke"):
+    """End a token now."""
+
+    name: str
+
+
+RestRequest = (
+    StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
+    | RegistrationsWanted | GraphWanted
+)  # fmt: skip
+AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke
+
+
+Trouble = Literal["", "request", "refused", "conflict", "unknown", "busy", "failed"]
 
 
 class AdminAnswer(msgspec.Struct, frozen=True):
-    """The answer: `ok` with a body, or an error with its findings."""
+    """The answer: `ok` with a body, or an error with its findings.
+
+    `trouble` says whose fault an error is: `request` (it makes no sense), `refused` (the policy or name given is
+    wrong), `conflict` (another revision is in force than was expected), `unknown` (there is no such thing), `busy`
+    (too much at once), `failed` (the appliance cannot do it now).
+    """
 
     ok: bool
     body: dict[str, Any] = {}
     error: str = ""
     findings: list[str] = []
+    trouble: Trouble = ""

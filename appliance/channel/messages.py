@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from appliance.channel.admin import AdminAnswer, RestRequest
+
 
 class Message(msgspec.Struct, frozen=True, tag=True, tag_field="message", forbid_unknown_fields=True):
     """A message between two processes of the appliance."""
@@ -41,7 +43,8 @@ class Ready(Message):
     """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports).
 
     Control's `detail` has `master` (the URI nodes are told), `revision` (of the policy), `rosout_master` (the URI
-    of the loopback listener for the appliance's own nodes) and `inner_port` (of the inner faces).
+    of the loopback listener for the appliance's own nodes), `inner_port` (of the inner faces) and `token` (the
+    first access token of REST, if it was made at this start).
     """
 
     detail: dict[str, Any] = {}
@@ -75,7 +78,7 @@ class SocketDropped(Message):
 
 
 class SocketRestored(Message):
-    """Supervisor gives a restarted control one kept socket back."""
+    """Supervisor gives a restarted control one kept socket back, or the api the one it serves (`api`)."""
 
     descriptors: ClassVar[int] = 1
     name: str
@@ -341,6 +344,58 @@ class TrafficReported(Message):
     rows: list[TopicTraffic]
 
 
+# --- link: control <-> api --------------------------------------------------------------------------------
+# The api asks on behalf of a token; what it may ask is the union `RestRequest`, which has no way to make a token.
+
+
+class RequestMade(Message):
+    """The api passes on what the holder of the token `who` asks; `number` pairs it with its answer."""
+
+    number: int
+    who: str
+    request: RestRequest
+
+
+class RequestAnswered(Message):
+    """Control's answer to `RequestMade` with the same number."""
+
+    number: int
+    answer: AdminAnswer
+
+
+class TokenKept(msgspec.Struct, frozen=True):
+    """A token that may be used, without its secret; `expires` is seconds since the epoch."""
+
+    id: str
+    name: str
+    role: str
+    salt: bytes
+    hash: bytes
+    expires: float
+
+
+class TokensStated(Message):
+    """Control tells the api every token that may be used; said at the start of a link and after every change."""
+
+    tokens: list[TokenKept]
+
+
+class RestCalled(Message):
+    """A REST call to be recorded. `who` is the token's name, empty when nobody was recognised.
+
+    `count` equal calls (of one second at least) are one message; `duration_us` is of the first.
+    """
+
+    host: str
+    who: str
+    method: str
+    path: str
+    status: int
+    reason: str
+    duration_us: int
+    count: int = 1
+
+
 Lifeline = (
     Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | PolicyReloadRequested
@@ -356,3 +411,5 @@ RelayLink = (
 )  # fmt: skip
 
 SignerLink = SignatureWanted | SignatureMade | SignatureRefused
+
+ApiLink = RequestMade | RequestAnswered | TokensStated | RestCalled

@@ -69,7 +69,13 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
     grid.add_row("appliance", f"{body['version']}, in service for {_age(body['since'])}")
     isolation = Text(_isolation(body), style=_YELLOW if body["isolation"] == "none" else _GREEN)
     grid.add_row("isolation", isolation)
-    differs = "; the file now differs: rosrv policy reload" if policy["differs_from_file"] else ""
+    differs = ""
+    if policy["differs_from_file"]:
+        theirs = policy["who"] != "disk"
+        differs = (
+            f"; loaded by {policy['who']}, not what the file has" if theirs else "; the file now differs"
+        )
+        differs += ": rosrv policy reload takes the file"
     warnings = f", {counted(policy['warnings'], 'warning')}" if policy["warnings"] else ""
     grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
     shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,9 @@ import setproctitle
 import structlog
 import typer
 
+from appliance.config import Settings
 from appliance.config_sources import resolve
+from appliance.master.robot import own_address
 from appliance.policy import PolicyError, compile_policy
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.supervisor.logs import configure_logs
@@ -42,6 +43,10 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     mediation: Annotated[
         str | None, typer.Option(help="full, or monitored: nodes are told real URIs (with --relay monitored)")
     ] = None,
+    api: Annotated[str | None, typer.Option(help="HOST:PORT of REST; port 0: any; or off")] = None,
+    api_tls: Annotated[
+        str | None, typer.Option(help="on, or off: clear text, on a loopback address only")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Say in JSON when nodes may connect")] = False,
 ) -> None:
     """Start the appliance; ends on SIGTERM or Ctrl-C.
@@ -56,13 +61,15 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         "isolation": isolation,
         "relaying": relay,
         "mediation": mediation,
+        "api": api,
+        "api_tls": api_tls,
     }
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
     run_appliance(
         settings,
-        roles_of(),
+        roles_of(api=settings.api_address is not None),
         partial(_announce, as_json=as_json),
         node_ports=_node_ports(settings.policy),
     )
@@ -76,19 +83,45 @@ def _node_ports(file: Path) -> range:
         return DEFAULT_PORTS
 
 
-def _announce(said: ControlReady, state: Path, *, as_json: bool) -> None:
+def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
+    rest = _rest_url(settings)
     if as_json:
-        event: Mapping[str, Any] = {
+        event: dict[str, Any] = {
             "event": "ready",
             "master": said.master,
-            "api": None,
+            "api": rest,
             "revision": said.revision,
         }
-        line = json.dumps(event)
+        if said.token is not None:
+            event["token"] = said.token
+        lines = json.dumps(event)
     else:
-        line = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {state})"
+        lines = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
+        if rest is not None:
+            lines += f"\nREST: {rest}"
+        if said.token is not None:
+            lines += f"\nThe first access token (admin) is in {_keep_token(settings.state, said.token)}"
     try:
-        sys.stdout.write(line + "\n")
+        sys.stdout.write(lines + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
-        log.warning("nobody reads standard output", line=line)
+        log.warning("nobody reads standard output", lines=None if said.token else lines)
+
+
+def _rest_url(settings: Settings) -> str | None:
+    if settings.api_address is None:
+        return None
+    host, port = settings.api_address
+    if host in ("0.0.0.0", "::"):  # noqa: S104  compared only
+        host = own_address(settings)
+    shown = f"[{host}]" if ":" in host else host
+    return f"{'https' if settings.api_tls else 'http'}://{shown}:{port}"
+
+
+def _keep_token(state: Path, token: str) -> Path:
+    path = state / "first-token"
+    path.unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(token + "\n")
+    return path

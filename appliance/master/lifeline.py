@@ -9,7 +9,7 @@ import structlog
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.master.admin import Surroundings
+from appliance.master.surroundings import Surroundings
 
 _log = structlog.get_logger()
 

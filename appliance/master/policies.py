@@ -32,6 +32,13 @@ class PolicyRefusedError(Exception):
         self.findings = findings
 
 
+class RevisionChangedError(Exception):
+    """Another revision came into force than the one the change was meant for; the text says which."""
+
+    def __init__(self, expected: int, found: int) -> None:
+        super().__init__(f"revision {found} is in force, not {expected}: look at it before you change it")
+
+
 @dataclass(frozen=True, slots=True)
 class Loaded:
     """What a load did: the revision in force now, the one before, the lint, and what was revoked."""
@@ -44,12 +51,15 @@ class Loaded:
 
 
 class Policies:
-    """Keeps the policy in force. `redecide()` decides again what is live and returns how much was revoked."""
+    """Keeps the policy in force. `redecide()` decides again what is live and returns how much was revoked.
+
+    Changes are made one at a time by whoever calls (`Administration` has the lock).
+    """
 
     def __init__(
         self, file: Path, store: StateStore, recorder: Recorder, *, robot: Collection[Address | Network]
     ) -> None:
-        self._file = file
+        self.file = file
         self._store = store
         self._recorder = recorder
         self._robot = robot
@@ -57,6 +67,7 @@ class Policies:
         self._revert: asyncio.Task[None] | None = None
         self.confirm_by: float | None = None
         self.revision = 0
+        self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
         self.changed: Callable[[Policy], int] = lambda policy: 0  # noqa: ARG005 - set by control when it is wired
 
     @property
@@ -70,7 +81,7 @@ class Policies:
     def differs_from_file(self) -> bool:
         """Whether the policy in force is another than the file now has."""
         try:
-            return self._file.read_text(encoding="utf-8") != self.current.text
+            return self.file.read_text(encoding="utf-8") != self.current.text
         except (OSError, UnicodeDecodeError):
             return True
 
@@ -83,32 +94,48 @@ class Policies:
         revisions = self._store.revisions()
         last = revisions[0] if revisions else None
         if last is not None and (restarted or last.who != _DISK):
-            self._enforce(self._compile(last.text, last.file), last.revision)
+            self._enforce(self._compile(last.text, last.file), last)
             self._resume_confirmation()
             return
         text = self._read()
-        policy = self._compile(text, str(self._file))
+        policy = self._compile(text, str(self.file))
         if last is not None and last.text == text:
-            self._enforce(policy, last.revision)
+            self._enforce(policy, last)
         else:
             self._keep(policy, who=_DISK, note="read at start")
 
     def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
-        """Read the file again: check, test, swap, decide again what is live. Raises `PolicyRefusedError`."""
+        """Read the file again: check, test, swap, decide again what is live. Raises `PolicyRefusedError`.
+
+        The revision is the disk's, whoever asked for it: `who` is for the record.
+        """
         before = self.revision
         try:
-            policy = self._compile(self._read(), str(self._file))
+            policy = self._compile(self._read(), str(self.file))
             self._test(policy)
         except PolicyRefusedError as error:
-            self._recorder.happened(
-                "policy refused",
-                f"revision {before} stays in force: {error.findings[0]}",
-                severity=Severity.WARNING,
-                findings=error.findings[:100],
-                who=who,
-            )
+            self._refused(error, who)
             raise
-        revoked = self._keep(policy, who=who, note="reloaded from disk")
+        revoked = self._keep(policy, who=_DISK, note="reloaded from disk", by=who)
+        return self._answer(policy, before, revoked, confirm_within)
+
+    async def load_text(
+        self, text: str, *, who: str, note: str, confirm_within: float | None = None
+    ) -> Loaded:
+        """Bring a text that is not the file's into force, as `reload` does.
+
+        Raises `PolicyRefusedError`, `RevisionChangedError`. It is compiled and tested in a thread: a long text
+        does not keep a node waiting. Its rules are cited as `revision N:line`, for the file says something else.
+        """
+        before = self.revision
+        try:
+            policy = await asyncio.to_thread(self._prepare, text, f"revision {self._next_number()}")
+        except PolicyRefusedError as error:
+            self._refused(error, who)
+            raise
+        if self.revision != before:  # a signal, or a confirmation that did not come in time
+            raise RevisionChangedError(before, self.revision)
+        revoked = self._keep(policy, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
     def rollback(self, revision: int | None, *, who: str) -> Loaded:
@@ -128,25 +155,55 @@ class Policies:
         revoked = self._keep(policy, who=who, note=f"rolled back to revision {row.revision}")
         return self._answer(policy, before, revoked, None)
 
-    def confirm(self) -> bool:
+    def confirm(self, *, who: str) -> bool:
         """Keep an unconfirmed change; False when there is none."""
         if self.confirm_by is None:
             return False
         self._end_confirmation()
-        self._recorder.happened("policy confirmed", f"revision {self.revision} was confirmed")
+        self._recorder.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
         return True
 
     def revisions(self) -> list[RevisionRow]:
         """All kept revisions, the newest first."""
         return self._store.revisions()
 
+    def revision_row(self, revision: int | None) -> RevisionRow | None:
+        """A kept revision (None: the one in force); None when it is not kept."""
+        if revision is None or revision == self.revision:
+            return self.in_force
+        return next((row for row in self._store.revisions() if row.revision == revision), None)
+
+    @property
+    def cases_file(self) -> Path:
+        """Where the tests of the policy are, if it has some."""
+        return self.file.with_name(f"{self.file.name}.tests.yaml")
+
+    @property
+    def robot(self) -> Collection[Address | Network]:
+        """What the group `robot` stands for."""
+        return self._robot
+
     # --- inside ---
+
+    def _prepare(self, text: str, file: str) -> Policy:
+        policy = self._compile(text, file)
+        self._test(policy)
+        return policy
+
+    def _refused(self, error: PolicyRefusedError, who: str) -> None:
+        self._recorder.happened(
+            "policy refused",
+            f"revision {self.revision} stays in force: {error.findings[0]}",
+            severity=Severity.WARNING,
+            findings=error.findings[:100],
+            who=who,
+        )
 
     def _read(self) -> str:
         try:
-            return self._file.read_text(encoding="utf-8")
+            return self.file.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError([f"{self._file}: the policy cannot be read: {error}"]) from error
+            raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {error}"]) from error
 
     def _compile(self, text: str, file: str) -> Policy:
         try:
@@ -155,7 +212,7 @@ class Policies:
             raise PolicyRefusedError([str(one) for one in error.findings]) from error
 
     def _test(self, policy: Policy) -> None:
-        cases = Path(f"{policy.file}.tests.yaml")
+        cases = self.cases_file
         try:
             text = cases.read_text(encoding="utf-8")
         except FileNotFoundError:
@@ -169,25 +226,28 @@ class Policies:
         if failed:
             raise PolicyRefusedError(failed)
 
-    def _keep(self, policy: Policy, *, who: str, note: str) -> int:
-        number = max((row.revision for row in self._store.revisions()), default=0)
-        number = max(number, self.revision) + 1
-        self._store.save_revision(RevisionRow(number, policy.text, policy.file, time.time(), who, note))
-        revoked = self._enforce(policy, number)
+    def _next_number(self) -> int:
+        return max([self.revision, *(row.revision for row in self._store.revisions())]) + 1
+
+    def _keep(self, policy: Policy, *, who: str, note: str, by: str | None = None) -> int:
+        number = self._next_number()
+        row = RevisionRow(number, policy.text, policy.file, time.time(), who, note)
+        self._store.save_revision(row)
+        revoked = self._enforce(policy, row)
         self._recorder.happened(
             "policy loaded",
             f"revision {number} is in force: {note}",
             severity=Severity.NOTICE,
-            who=who,
+            who=by or who,
             file=policy.file,
             revoked=revoked,
             warnings=[str(one) for one in policy.warnings][:100],
         )
         return revoked
 
-    def _enforce(self, policy: Policy, revision: int) -> int:
-        self._current = policy
-        self.revision = self._recorder.revision = revision
+    def _enforce(self, policy: Policy, row: RevisionRow) -> int:
+        self._current, self.in_force = policy, row
+        self.revision = self._recorder.revision = row.revision
         return self.changed(policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:

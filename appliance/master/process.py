@@ -22,6 +22,7 @@ from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
 from appliance.master.addresses import Addresses
 from appliance.master.admin import AdminServer
+from appliance.master.administration import Administration
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.core import Master
 from appliance.master.delivery import Delivery
@@ -44,9 +45,11 @@ from appliance.master.recorder import Recorder
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
+from appliance.master.rest import RestLink
 from appliance.master.revocation import Revocation
 from appliance.master.robot import own_address, robot_addresses
 from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.master.tokens import Tokens
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.store.database import StoreError
@@ -124,6 +127,9 @@ class _Control:
         await self._serve()
         self._lifeline.links["relay"] = self._relay_link
         self._lifeline.links["signer"] = self._signer_link
+        self._lifeline.links["api"] = lambda descriptor: self._rest.attach(
+            Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
+        )
         self._lifeline.probed = self._probed
         self._lifeline.processes_changed = self._reconciler.wake
         self._lifeline.reload_requested = self._reload_on_signal
@@ -133,7 +139,8 @@ class _Control:
         ):  # fmt: skip
             self._tasks.append(self._loop.create_task(work))
         await self._reconciler.ready.wait()
-        self._say_ready(restarted)
+        token = await self._tokens.first() if self._settings.api_address is not None else None
+        self._say_ready(restarted, token)
 
     def _make_records(self) -> None:
         audit = self._settings.audit
@@ -309,15 +316,20 @@ class _Control:
         await self._open(sockets[_RVMASTER], self._pipeline.handler(MASTER_CALLS), guarded=True)
         await self._open(sockets[_OWN], self._pipeline.handler(MASTER_CALLS, own=True), guarded=False)
         await self._open(sockets[_INNER], self._inner.handle, guarded=False)
+        self._tokens = Tokens(self._store, self._recorder)
+        administration = Administration(
+            self._master,
+            self._policies,
+            self._tokens,
+            self._store,
+            self._lifeline.surroundings,
+            lag=lambda: self._audit.lag,
+            audit_failed=lambda: self._audit.failed,
+            audit_degraded=lambda: self._audit.degraded,
+        )
+        self._rest = RestLink(administration, self._tokens, self._recorder)
         if _ADMIN in sockets:
-            self._admin = AdminServer(
-                self._master,
-                self._policies,
-                self._lifeline.surroundings,
-                lag=lambda: self._audit.lag,
-                audit_failed=lambda: self._audit.failed,
-                audit_degraded=lambda: self._audit.degraded,
-            )
+            self._admin = AdminServer(administration)
             await self._admin.start(sockets[_ADMIN].dup())
 
     async def _open(self, sock: socket.socket, handler: Handler, *, guarded: bool) -> None:
@@ -333,7 +345,7 @@ class _Control:
         self._servers.append(server)
         await server.start()
 
-    def _say_ready(self, restarted: bool) -> None:
+    def _say_ready(self, restarted: bool, token: str | None) -> None:
         host = self._settings.listen_address[0]
         told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
         uri = node_uri(told, self._port)
@@ -348,6 +360,7 @@ class _Control:
             "revision": self._policies.revision,
             "rosout_master": own.rstrip("/"),
             "inner_port": inner_port,
+            "token": token,
             "own_port": self._lifeline.sockets[_OWN].getsockname()[1],
         }
         self._lifeline.say(messages.Ready(detail))

@@ -6,12 +6,14 @@ store because a ROS node never asks twice. When a relay (re)appears everything i
 """
 
 import asyncio
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import TopicTraffic
 from appliance.master.client import CallFailedError
 from appliance.master.delivery import Delivery
 from appliance.master.places import Places
@@ -25,6 +27,7 @@ RELAY_NAME = "/rosrv"
 _GRANTS_PER_HOST = 20_000
 _CLEARED_AT_ONCE = 1000
 TOPIC, SERVICE = "topic", "service"
+_STILL_SECONDS = 3.0  # without a report: nothing flows
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,19 @@ class Traffic:
     messages: int = 0
     bytes: int = 0
     dropped: int = 0
+    seconds: float = 0.0  # monotonic, of the last report
+    messages_per_second: float = 0.0  # between the last two reports
+    bytes_per_second: float = 0.0
+
+    def add(self, row: TopicTraffic, now: float) -> None:
+        """Count what the relay reported; it reports once a second, and only what changed."""
+        self.messages += row.messages
+        self.bytes += row.bytes
+        self.dropped += row.dropped
+        passed = max(now - self.seconds, 1.0) if self.seconds else 1.0
+        self.messages_per_second = row.messages / passed
+        self.bytes_per_second = row.bytes / passed
+        self.seconds = now
 
 
 class RelayControl:
@@ -79,6 +95,18 @@ class RelayControl:
     def connected(self) -> bool:
         """Whether a relay is there."""
         return self._channel is not None
+
+    def flow(self, key: str, resource: str) -> dict[str, float]:
+        """What went and goes through a topic or service of an incarnation, in plain values."""
+        traffic = self.traffic.get((key, resource), Traffic())
+        flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
+        return {
+            "messages": traffic.messages,
+            "bytes": traffic.bytes,
+            "dropped": traffic.dropped,
+            "messages_per_second": round(traffic.messages_per_second, 2) if flows else 0.0,
+            "bytes_per_second": round(traffic.bytes_per_second, 1) if flows else 0.0,
+        }
 
     # --- the link ---
 
@@ -252,10 +280,7 @@ class RelayControl:
                 for row in message.rows:
                     if self._registry.by_key(row.key) is None:
                         continue  # the last words about a node that is forgotten
-                    traffic = self.traffic.setdefault((row.key, row.resource), Traffic())
-                    traffic.messages += row.messages
-                    traffic.bytes += row.bytes
-                    traffic.dropped += row.dropped
+                    self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, time.monotonic())
             case messages.ConnectionOpened():
                 self._opened(message)
             case messages.ConnectionClosed():

@@ -1,4 +1,4 @@
-"""The tables of control's state file: incarnations, registrations, parameters, policy revisions, settings."""
+"""The tables of control's state file: incarnations, registrations, parameters, policy revisions, tokens, settings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from appliance.store.database import Database
+from appliance.store.tokens import TokenRow
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS incarnation (
@@ -28,6 +29,10 @@ CREATE TABLE IF NOT EXISTS policy_revision (
     revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS token (
+    id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
+    created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
+) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
 
@@ -189,6 +194,19 @@ class StateStore:
             RevisionRow(*row)
             for row in self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
         ]
+
+    # --- tokens ---
+
+    def save_token(self, row: TokenRow) -> None:
+        """Keep a token, or that it is revoked."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (row.id, row.name, row.role, row.salt, row.hash, row.created, row.expires, row.revoked),
+        )
+
+    def tokens(self) -> list[TokenRow]:
+        """All tokens that were ever made, the oldest first."""
+        return [TokenRow(*row) for row in self._database.query("SELECT * FROM token ORDER BY created")]
 
     # --- settings ---
 

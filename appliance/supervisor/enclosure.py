@@ -38,6 +38,8 @@ class Ports:
     rosmaster: int
     nodes: range
     inner: int | None = None
+    api: int | None = None  # None: there is no REST
+    api_networks: tuple[str, ...] = ()  # who may connect to it besides this machine
     own: int | None = None
 
 
@@ -161,20 +163,26 @@ class Contained(Enclosure):
             own_port=self._ports.own,
             master_port=self._ports.master,
             node_ports=PortRange(nodes.start, nodes.stop - 1),
+            api_port=self._ports.api,
+            api_networks=self._api_networks(),
         )
+
+    def _api_networks(self) -> tuple[str, ...]:
+        return self._ports.api_networks
 
 
 class InNamespace(Contained):
-    """A namespace of its own on a bare host; RVMaster's port and the nodes' are forwarded to it."""
+    """A namespace of its own on a bare host; RVMaster's port, the nodes' and that of REST are forwarded to it."""
 
     kind = "netns"
 
     def __init__(self, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> None:
         super().__init__(ports, backend)
         nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
-        self._isolation = Isolation(
-            Namespace.own(), IsolationSettings(ports=(PortRange.one(ports.master), nodes))
-        )
+        forwarded = [PortRange.one(ports.master), nodes]
+        if ports.api is not None:
+            forwarded.append(PortRange.one(ports.api))
+        self._isolation = Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
         self._namespace = self._isolation.namespace
 
     @contextlib.contextmanager
@@ -198,6 +206,10 @@ class InNamespace(Contained):
             self._isolation.down()
         except NetworkError as error:
             log.error("the namespace may be left; the next start clears it", error=str(error))
+
+    def _api_networks(self) -> tuple[str, ...]:
+        # The host's own loopback arrives under the address of its end of the link.
+        return (*(ends.host for ends in self._isolation.ends.values()), *self._ports.api_networks)
 
     def route_to(self, host: str) -> str | None:
         """The host's address by which the peer reaches it."""

@@ -46,7 +46,9 @@ class Role:
     to. `path` gives the last argument of `entry`; `indexed` roles get their number. `asks` says that
     the supervisor asks it over HTTP whether it is alive (for a program that knows no lifeline). `after`
     is the role that must be ready first. `outlives_control` roles are stopped last. `files` is the
-    limit on open files.
+    limit on open files. `readable_by` is the user whose group may pass through `part` and read what there is
+    readable for it. `listens`: each of its lives is given the listening socket that the supervisor holds for it.
+    `dispensable`: when it cannot serve, the others go on without it.
     """
 
     name: str
@@ -62,13 +64,19 @@ class Role:
     after: str | None = None
     outlives_control: bool = False
     files: int = 1024
+    readable_by: str | None = None
+    listens: bool = False
+    dispensable: bool = False
 
 
-def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT) -> tuple[Role, ...]:
-    """The roles in the order they are started. Raises `StartError` when a program is missing."""
+def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = True) -> tuple[Role, ...]:
+    """The roles in the order they are started, with or without REST.
+
+    Raises `StartError` when a program is missing.
+    """
     _find(rosmaster, "python3-rosmaster")
     _find(rosout, "rosout")
-    return (
+    roles = (
         Role(
             name="rosmaster",
             user="rosmaster",
@@ -111,8 +119,9 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT) -> tuple[Rol
             part="control",
             entry="appliance.master.process:main",
             path=lambda facts: facts.config,
-            links=("relay", "signer"),
+            links=("relay", "signer", "api"),
             files=65_536,
+            readable_by="rosrv-api",
         ),
         Role(
             name="rosout",
@@ -128,7 +137,20 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT) -> tuple[Rol
             ),
             after="control",
         ),
+        Role(
+            name="api",
+            user="rosrv-api",
+            part="api",
+            entry="appliance.api.process:main",
+            path=lambda facts: facts.config,
+            links=("control",),
+            after="control",
+            listens=True,
+            dispensable=True,
+            files=4096,
+        ),
     )
+    return tuple(role for role in roles if api or role.name != "api")
 
 
 def _find(program: Path, package: str) -> None:

@@ -2,8 +2,8 @@
 
 import asyncio
 import os
+import socket
 from collections.abc import Callable
-from pathlib import Path
 
 import structlog
 
@@ -24,13 +24,14 @@ log = structlog.get_logger()
 def run_appliance(
     settings: Settings,
     roles: tuple[Role, ...],
-    ready: Callable[[ControlReady, Path], None],
+    ready: Callable[[ControlReady, Settings], None],
     *,
     node_ports: range,
 ) -> None:
     """Run the appliance until it is told to stop. Raises `StartError` when it cannot start or go on.
 
-    `ready` is called once, with what control says and the state directory, when nodes may connect.
+    `ready` is called once, with what control says and the settings, every port in them chosen, when nodes may
+    connect.
     `node_ports` are those of the policy's `[Ports] range`: what the firewall limits and `netns` forwards.
     """
     if settings.isolation == "none":
@@ -47,7 +48,13 @@ def run_appliance(
     try:
         settings = _with_ports(settings)
         master = settings.listen_address[1]
-        ports = Ports(master=master, rosmaster=settings.rosmaster_port, nodes=node_ports)
+        ports = Ports(
+            master=master,
+            rosmaster=settings.rosmaster_port,
+            nodes=node_ports,
+            api=settings.api_address[1] if settings.api_address else None,
+            api_networks=tuple(str(one) for one in settings.api_networks),
+        )
         enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
         state.write_config(settings.model_dump_json())
@@ -67,8 +74,42 @@ def _with_ports(settings: Settings) -> Settings:
     if port == 0 and settings.isolation != "none":
         port = free_port()
     rosmaster = settings.rosmaster_port or free_port()
-    shown = f"[{host}]" if ":" in host else host
-    return settings.model_copy(update={"listen": f"{shown}:{port}", "rosmaster_port": rosmaster})
+    changes = {"listen": _shown(host, port), "rosmaster_port": rosmaster, "api": _api_with_port(settings)}
+    return settings.model_copy(update=changes)
+
+
+def _api_with_port(settings: Settings) -> str:
+    """Where REST listens. Another port is taken only where nobody asked for this one, and that is said."""
+    if settings.api_address is None:
+        return settings.api
+    host, port = settings.api_address
+    if port != 0 and "api" not in settings.model_fields_set:
+        try:
+            require_free(host, port)
+        except StartError as error:
+            log.warning("REST takes another port; choose one with --api HOST:PORT", reason=str(error))
+            port = 0
+    return _shown(host, port or free_port())
+
+
+def _shown(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _listener(settings: Settings) -> socket.socket | None:
+    """The socket of REST. In a namespace of its own, who may connect is for the firewall: all addresses there."""
+    if settings.api_address is None:
+        return None
+    host, port = settings.api_address
+    if settings.isolation == "netns":
+        host = "::" if ":" in host else "0.0.0.0"  # noqa: S104  see above
+    require_free(host, port)
+    family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.bind((host, port))
+    listener.listen(256)
+    return listener
 
 
 def _supervise(
@@ -76,20 +117,22 @@ def _supervise(
     roles: tuple[Role, ...],
     state: StateDirectory,
     enclosure: Enclosure,
-    ready: Callable[[ControlReady, Path], None],
+    ready: Callable[[ControlReady, Settings], None],
 ) -> None:
     with enclosure.inside():
         require_free(*settings.listen_address)
         require_free("127.0.0.1", settings.rosmaster_port)
+        api = _listener(settings)
 
     async def supervise() -> None:
         await Supervisor(
             roles,
             Facts(state=state.path, config=state.config, rosmaster_port=settings.rosmaster_port),
             admin=state.open_admin_socket(),
-            ready=lambda said: ready(said, state.path),
+            ready=lambda said: ready(said, settings),
             relays=settings.relays,
             enclosure=enclosure,
+            listeners={"api": api} if api is not None else {},
         ).run()
 
     asyncio.run(supervise())

@@ -4,7 +4,8 @@ state/            0711  root: others may pass through, not look around
 state/lock        0600  held while an appliance runs; names its process id
 state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
 state/run/        0755  the resolved configuration for the children
-state/control/    0700  rosrv          and so on, one folder for each role, for its user only
+state/relay/      0700  rosrv-relay    and so on, one folder for each role, for its user only
+state/control/    2710  rosrv:rosrv-api  as root: new files get the group, which may read those that say so (audit log)
 """
 
 import fcntl
@@ -47,7 +48,10 @@ class StateDirectory:
         self._folder("run", os.geteuid(), os.getegid(), 0o755)
         for role in roles:
             account = account_of(role.user)
-            self._folder(role.part, account.uid, account.gid, 0o700)
+            if role.readable_by is None or os.geteuid() != 0:
+                self._folder(role.part, account.uid, account.gid, 0o700)
+            else:
+                self._folder(role.part, account.uid, account_of(role.readable_by).gid, 0o2710)
 
     def write_config(self, text: str) -> None:
         """Write what the children read."""
@@ -98,8 +102,7 @@ class StateDirectory:
         path = self.path / name
         try:
             path.mkdir(mode=0o700)
-            path.chmod(mode)  # before it is another's: afterwards that would take one more capability
-            os.chown(path, uid, gid)
+            _hand_over(path, uid, gid, mode)
         except FileExistsError:
             found = path.lstat()
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != uid:
@@ -107,5 +110,12 @@ class StateDirectory:
                     f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
                     f"run it as that user, `chown -R {uid}:{gid} {path}`, or name another --state DIR"
                 ) from None
-            if stat.S_IMODE(found.st_mode) != mode:
-                path.chmod(mode)
+            if stat.S_IMODE(found.st_mode) != mode or found.st_gid != gid:
+                _hand_over(path, uid, gid, mode)
+
+
+def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
+    """Give a folder to a user and group. Ours first: in a group of others the kernel drops the set-group-id bit."""
+    os.chown(path, os.geteuid(), os.getegid())
+    path.chmod(mode)
+    os.chown(path, uid, gid)

@@ -15,7 +15,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -74,6 +74,7 @@ class ControlReady(msgspec.Struct, frozen=True):
     rosout_master: str
     inner_port: int
     own_port: int
+    token: str | None = None
 
 
 @dataclass
@@ -100,12 +101,18 @@ class Supervisor:
         ready: Callable[[ControlReady], None],
         relays: int = 1,
         enclosure: Enclosure | None = None,
+        listeners: Mapping[str, socket.socket] | None = None,
     ) -> None:
-        """`admin` is handed to control; `ready` is called once, when nodes may connect."""
+        """`admin` is handed to control; `ready` is called once, when nodes may connect.
+
+        `listeners` are the sockets of the roles that listen; they stay open here over a role's death, so that
+        connections wait for its next life.
+        """
         self._facts = facts
         self._posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
         self._kept = KeptSockets()
         self._kept.keep(ADMIN, admin.detach())
+        self._listeners = dict(listeners or {})
         self._ready = ready
         self._is_ready = False
         self._guard = Guard(enclosure or Enclosure(), self._tell_control)
@@ -135,6 +142,8 @@ class Supervisor:
         finally:
             await self._end()
             self._kept.close()
+            for listener in self._listeners.values():
+                listener.close()
         if self._failure is not None:
             raise StartError(self._failure)
 
@@ -193,6 +202,8 @@ class Supervisor:
         log.info("process started", role=post.role.name, pid=post.life.pid, restarts=post.lives - 1)
         if post.role.name == "control":
             self._equip_control(post.life)
+        if post.role.listens:
+            post.life.send(SocketRestored(post.role.name), (self._listeners[post.role.name].fileno(),))
         self._link(post)
         self._tell_processes()
 
@@ -246,7 +257,10 @@ class Supervisor:
             case Failed(said):
                 reason = _printable(said)
                 log.error("process cannot serve", role=life.role, reason=reason)
-                self.stop(reason)
+                if next(post for post in self._posts if post.life is life).role.dispensable:
+                    life.kill()
+                else:
+                    self.stop(reason)
             case SocketKept(name):
                 self._keep(life, name, descriptors[0])
             case SocketDropped(name):

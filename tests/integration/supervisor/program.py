@@ -45,11 +45,11 @@ def main() -> None:
             continue
         role, _, entry = one.partition("=")
         actors[role] = entry
-    settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0)
+    settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0, api="off")
     try:
         run.run_appliance(
             settings,
-            tuple(_played(role, actors) for role in roles_of()),
+            tuple(_played(role, actors) for role in roles_of(api=False)),
             _ready,
             node_ports=range(19001, 19101),
         )
@@ -64,8 +64,8 @@ def _played(role: Role, actors: dict[str, str]) -> Role:
     return replace(role, entry=f"tests.integration.supervisor.actors:{actors[role.name]}")
 
 
-def _ready(said: ControlReady, state: Path) -> None:
-    _say(event="ready", master=said.master, state=str(state))
+def _ready(said: ControlReady, settings: Settings) -> None:
+    _say(event="ready", master=said.master, state=str(settings.state))
 
 
 def _say(**fields: str) -> None:

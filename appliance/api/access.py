@@ -1,0 +1,109 @@
+"""Who is asking: recognises bearer tokens and knows what each role may do.
+
+Invariants:
+
+1. Without a token that control stated, is not expired and not revoked, nobody is anybody.
+2. The costly check (scrypt) runs for one request at a time and in a thread, and a peer that keeps bringing wrong
+   tokens is made to wait before it runs again: guessing cannot keep the process busy.
+3. A token that was recognised is remembered under a key that is made anew with each process, never in the clear; a
+   change of the tokens forgets all.
+"""
+
+import asyncio
+import enum
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from appliance.api.problems import ProblemError
+from appliance.api.rates import Buckets
+from appliance.channel.messages import TokenKept
+from appliance.store.tokens import is_secret, parse_token
+
+
+class Role(enum.IntEnum):
+    """What a token may do; each role may do all that those before it may."""
+
+    VIEWER = 1  # look
+    OPERATOR = 2  # take the file's policy, or one that was in force before
+    ADMIN = 3  # bring new rules into force
+
+
+@dataclass(frozen=True, slots=True)
+class Bearer:
+    """The holder of a token; `expires` is seconds since the epoch."""
+
+    id: str
+    name: str
+    role: Role
+    expires: float
+
+
+class Doorkeeper:
+    """Recognises tokens; `failures_per_minute` wrong ones of one peer are looked at."""
+
+    def __init__(self, failures_per_minute: int) -> None:
+        self._tokens: dict[str, TokenKept] = {}
+        self._recognised: dict[bytes, str] = {}
+        self._key = secrets.token_bytes(32)
+        self._failures = Buckets(failures_per_minute / 60, failures_per_minute)
+        self._checking = asyncio.Lock()
+
+    def state(self, tokens: Iterable[TokenKept]) -> None:
+        """Only these may be used from now on."""
+        self._tokens = {one.id: one for one in tokens}
+        self._recognised.clear()
+
+    def still_good(self, bearer: Bearer) -> bool:
+        """Whether a token that was recognised before may still be used."""
+        return bearer.id in self._tokens and time.time() < bearer.expires
+
+    async def recognise(self, authorization: str | None, host: str) -> Bearer:
+        """The holder of the token in an `Authorization` header. Raises `ProblemError` (401, 429)."""
+        if authorization is None:
+            raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
+        scheme, _space, text = authorization.partition(" ")
+        parsed = parse_token(text.strip()) if scheme.lower() == "bearer" else None
+        kept = self._tokens.get(parsed[0]) if parsed is not None else None
+        if (
+            kept is not None
+            and parsed is not None
+            and await self._matches(text.strip(), parsed[1], kept, host)
+        ):
+            if time.time() < kept.expires:
+                return Bearer(kept.id, kept.name, Role[kept.role.upper()], kept.expires)
+            raise self._refusal("the token has expired: ask for another one (rosrv token add)")
+        if kept is None:
+            self._require_patience(host)
+        self._failures.take(host, time.monotonic())
+        raise self._refusal("the token is wrong, or was revoked")
+
+    async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
+        digest = hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)
+        if self._recognised.get(digest) == kept.id:
+            return True
+        self._require_patience(host)
+        async with self._checking:
+            if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
+                return False
+        if kept.id in self._tokens:
+            self._recognised[digest] = kept.id
+        return True
+
+    def _require_patience(self, host: str) -> None:
+        seconds = self._failures.wait(host, time.monotonic())
+        if seconds:
+            raise ProblemError(
+                429,
+                "too-many-failures",
+                "too many requests of this host came without a good token",
+                headers={"Retry-After": str(int(seconds) + 1)},
+            )
+
+    def _refusal(self, detail: str) -> ProblemError:
+        return ProblemError(
+            401, "not-recognised", detail, headers={"WWW-Authenticate": 'Bearer realm="rosrv"'}
+        )

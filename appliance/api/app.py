@@ -1,0 +1,101 @@
+"""The REST application: routes, how their errors are answered, and the contract (OpenAPI) made from them."""
+
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+
+import appliance
+from appliance.api import health
+from appliance.api.contract import contract_of
+from appliance.api.control import ControlAwayError
+from appliance.api.problems import REASON, BadInput, ProblemError, defect
+from appliance.api.services import Services
+
+_DESCRIPTION = """\
+The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token
+(`rosrv token add`). Errors are problem details (RFC 9457). A change needs `If-Match` with the ETag of what it changes.
+"""
+
+
+def build_app(services: Services) -> FastAPI:
+    """The application; `Gate` goes around it."""
+    app = FastAPI(
+        title="ROSRV appliance",
+        version=appliance.__version__,
+        description=_DESCRIPTION,
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        exception_handlers={
+            RequestValidationError: _invalid,
+            HTTPException: _of_http,
+            ProblemError: _of_problem,
+            ControlAwayError: _away,
+            Exception: _defect,
+        },
+    )
+    for router in (health.routes(services),):
+        app.include_router(router)
+    app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
+
+    async def contract() -> JSONResponse:
+        """The contract of this interface (OpenAPI 3.1)."""
+        return JSONResponse(app.openapi())
+
+    app.add_api_route("/v1/openapi.json", contract, include_in_schema=False)
+    return app
+
+
+def _answer(request: Request, problem: ProblemError) -> Response:
+    request.scope[REASON] = problem.detail
+    return problem.response()
+
+
+async def _of_problem(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ProblemError)  # noqa: S101  registered for it
+    return _answer(request, error)
+
+
+async def _away(request: Request, error: Exception) -> Response:
+    return _answer(request, ProblemError(503, "not-available", str(error), headers={"Retry-After": "1"}))
+
+
+async def _defect(request: Request, error: Exception) -> Response:
+    return _answer(request, defect(error))
+
+
+async def _of_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101  registered for it
+    known = {
+        404: ("unknown-path", "there is nothing here"),
+        405: ("wrong-method", "this cannot be done here"),
+    }
+    kind, detail = known.get(error.status_code, ("bad-request", str(error.detail)))
+    return _answer(request, ProblemError(error.status_code, kind, detail, headers=error.headers))
+
+
+async def _invalid(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
+    errors = error.errors()
+    for one in errors:
+        if one["type"] == "json_invalid":
+            return _answer(request, _not_json(str(error.body), one))
+    bad = [BadInput(where=".".join(map(str, one["loc"])), text=str(one["msg"])) for one in errors]
+    detail = "; ".join(f"{one.where}: {one.text}" for one in bad[:5])
+    return _answer(request, ProblemError(422, "bad-input", detail, errors=bad))
+
+
+def _not_json(body: str, one: Any) -> ProblemError:
+    position = one["loc"][-1] if isinstance(one["loc"][-1], int) else 0
+    before = body[:position]
+    return ProblemError(
+        422,
+        "not-json",
+        f"the body is not JSON: {one.get('ctx', {}).get('error', one['msg'])}",
+        line=before.count("\n") + 1,
+        column=position - (before.rfind("\n") + 1) + 1,
+    )

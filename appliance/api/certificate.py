@@ -1,0 +1,91 @@
+"""The certificate REST is served with: self-signed, made at first start, kept in the api's part of the state.
+
+The appliance has no certificate authority yet; when it has one, its certificate takes this one's place. Until then
+a client is given `certificate.pem` by hand, or pins its fingerprint.
+"""
+
+import datetime
+import ipaddress
+import os
+import socket
+import ssl
+from collections.abc import Iterable
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+CERTIFICATE = "certificate.pem"
+KEY = "key.pem"
+_DAYS = 825
+_RENEW_DAYS = 30
+_HOST_NAME_LIMIT = 64
+
+
+def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
+    """A server's context with the kept certificate; a new one when there is none, it ends soon or lacks a name.
+
+    Raises `OSError`, `ValueError` and `ssl.SSLError` when what is kept cannot be used.
+    """
+    certificate, key = home / CERTIFICATE, home / KEY
+    wanted = [*dict.fromkeys([*names, "localhost", "127.0.0.1", "::1", socket.gethostname()])]
+    if not (certificate.exists() and key.exists() and _still_good(certificate, wanted, now)):
+        _make(certificate, key, wanted, now)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.set_alpn_protocols(["http/1.1"])
+    context.load_cert_chain(certificate, key)
+    return context
+
+
+def _still_good(path: Path, names: Iterable[str], now: datetime.datetime) -> bool:
+    certificate = x509.load_pem_x509_certificate(path.read_bytes())
+    extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    in_time = (
+        certificate.not_valid_before_utc
+        <= now
+        < certificate.not_valid_after_utc - datetime.timedelta(days=_RENEW_DAYS)
+    )
+    return in_time and {_general_name(one) for one in names} <= set(extension)
+
+
+def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: datetime.datetime) -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ROSRV appliance")])
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(hours=1))
+        .not_valid_after(now + datetime.timedelta(days=_DAYS))
+        .add_extension(x509.SubjectAlternativeName([_general_name(one) for one in names]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    _write(key_path, secret, 0o600)
+    _write(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def _general_name(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name[:_HOST_NAME_LIMIT])
+
+
+def _write(path: Path, data: bytes, mode: int) -> None:
+    making = path.with_name(path.name + ".new")
+    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_NOFOLLOW, mode)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    making.replace(path)

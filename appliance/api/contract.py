@@ -1,0 +1,61 @@
+"""The contract: FastAPI's OpenAPI document, made true where FastAPI says what this application does not do."""
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from appliance.api.problems import MEDIA_TYPE, Problem
+
+# What the gate may answer to any call.
+_ALWAYS = {
+    "403": "From a page of another site, or not for this role.",
+    "408": "The body did not come in time.",
+    "413": "The body is too large.",
+    "421": "The appliance is not called by this name.",
+    "429": "Too many requests of this host.",
+}
+_WITH_TOKEN = {
+    "401": "No token, or a wrong, expired or revoked one.",
+    "503": "The appliance cannot answer now.",
+}
+_REFERENCE = {"$ref": "#/components/schemas/Problem"}
+
+
+def contract_of(app: FastAPI) -> dict[str, Any]:
+    """The document; made once."""
+    if app.openapi_schema is None:
+        app.openapi_schema = _made(app)
+    return app.openapi_schema
+
+
+def _made(app: FastAPI) -> dict[str, Any]:
+    document = get_openapi(
+        title=app.title,
+        version=app.version,
+        description=app.description,
+        routes=app.routes,
+        separate_input_output_schemas=False,
+    )
+    components = document.setdefault("components", {}).setdefault("schemas", {})
+    for name in ("HTTPValidationError", "ValidationError"):
+        components.pop(name, None)
+    schema = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+    components.update(schema.pop("$defs", {}))
+    components["Problem"] = schema
+    for path in document["paths"].values():
+        for operation in path.values():
+            _complete(operation)
+    return document
+
+
+def _complete(operation: dict[str, Any]) -> None:
+    responses = operation["responses"]
+    more = _ALWAYS | (_WITH_TOKEN if operation.get("security") else {})
+    for status, text in more.items():
+        responses.setdefault(status, {"description": text})
+    for status, response in responses.items():
+        if int(status) >= 400:
+            if response["description"] == "Validation Error":
+                response["description"] = "A parameter or the body makes no sense."
+            response["content"] = {MEDIA_TYPE: {"schema": _REFERENCE}}

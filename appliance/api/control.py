@@ -1,0 +1,122 @@
+"""The api's end of its link to control: questions with answers, and what is told without being asked.
+
+Invariants:
+
+1. At most `_MOST_OPEN` questions are open; one more is refused here and costs control nothing.
+2. A question ends: with its answer, with the link, or after `seconds`.
+3. What is told (`tell`) never waits: when control does not read, it is dropped and counted.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import structlog
+
+from appliance.channel import messages
+from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+
+_log = structlog.get_logger()
+_MOST_OPEN = 48
+ANSWER_SECONDS = 15.0
+
+
+class ControlAwayError(Exception):
+    """Control cannot be asked now; the text says why, for whoever called."""
+
+
+class ControlLink:
+    """Asks whichever control is there. `tokens_stated(tokens)` hears what tokens may be used from now on."""
+
+    def __init__(self, tokens_stated: Callable[[list[messages.TokenKept]], None]) -> None:
+        self._tokens_stated = tokens_stated
+        self._channel: Channel | None = None
+        self._open: dict[int, asyncio.Future[AdminAnswer]] = {}
+        self._number = 0
+        self._dropped = 0
+        self.known = False  # whether the tokens were told on this link
+        self.lost: Callable[[], None] = lambda: None
+
+    @property
+    def connected(self) -> bool:
+        """Whether control is there and has said what the tokens are."""
+        return self._channel is not None and self.known
+
+    def attach(self, channel: Channel) -> None:
+        """A control is there."""
+        if self._channel is not None:
+            self._channel.close()
+            self._end("control was started again")
+        self._channel, self.known = channel, False
+        channel.attach(
+            asyncio.get_running_loop(),
+            lambda message, _descriptors: self._received(message),
+            lambda: self._closed(channel, "control ended"),
+            lambda reason: self._closed(channel, reason),
+        )
+
+    async def ask(self, request: AdminRequest, who: str, seconds: float = ANSWER_SECONDS) -> AdminAnswer:
+        """Control's answer to a request on behalf of the token `who`. Raises `ControlAwayError`."""
+        if self._channel is None:
+            raise ControlAwayError("the appliance is being restarted: try again in a second")
+        if len(self._open) >= _MOST_OPEN:
+            raise ControlAwayError("too many requests wait for the appliance: try again")
+        self._number += 1
+        number = self._number
+        answer: asyncio.Future[AdminAnswer] = asyncio.get_running_loop().create_future()
+        self._open[number] = answer
+        try:
+            self._channel.send(messages.RequestMade(number, who, request))  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
+            async with asyncio.timeout(seconds):
+                return await answer
+        except TimeoutError:
+            raise ControlAwayError(f"the appliance did not answer within {seconds:g} s") from None
+        except (ChannelFullError, ChannelClosedError):
+            raise ControlAwayError("the appliance does not take requests now: try again") from None
+        finally:
+            self._open.pop(number, None)
+
+    def tell(self, call: messages.RestCalled) -> None:
+        """Have a call recorded."""
+        if self._channel is None:
+            self._dropped += call.count
+            return
+        try:
+            self._channel.send(call)
+        except (ChannelFullError, ChannelClosedError):
+            self._dropped += call.count
+            return
+        if self._dropped:
+            _log.warning("REST calls were not recorded while control was away", calls=self._dropped)
+            self._dropped = 0
+
+    def close(self) -> None:
+        """End the link."""
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+
+    def _received(self, message: Any) -> None:
+        match message:
+            case messages.RequestAnswered(number, answer):
+                waiting = self._open.get(number)
+                if waiting is not None and not waiting.done():
+                    waiting.set_result(answer)
+            case messages.TokensStated(tokens):
+                self.known = True
+                self._tokens_stated(tokens)
+            case _:
+                _log.error("control said something that is not for the api", message=type(message).__name__)
+
+    def _closed(self, channel: Channel, reason: str) -> None:
+        if self._channel is channel:
+            self._channel, self.known = None, False
+            _log.warning("no control", reason=reason)
+            self._end("the appliance is being restarted: whether the request was carried out is not known")
+            self.lost()
+
+    def _end(self, reason: str) -> None:
+        for waiting in self._open.values():
+            if not waiting.done():
+                waiting.set_exception(ControlAwayError(reason))

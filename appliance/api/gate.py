@@ -1,0 +1,213 @@
+"""What every request passes before it reaches a route: limits, where it came from, who asks; and what is recorded.
+
+Order: rate → Host → Origin → size of the body → token. Invariants:
+
+1. A request that does not pass costs no more than its headers, and no route, no parser of bodies and no question to
+   control sees it.
+2. Only `PUBLIC` answers without a token; a path that does not exist is no different from one that does.
+3. A page of another site cannot use the browser of somebody who can reach the appliance: a Host that is a foreign
+   name (DNS rebinding) and an Origin that is not the appliance's own are refused, and no CORS header is ever sent.
+4. Every answer but those of the health probes is recorded (equal reads folded, see `Journal`).
+5. A client that does not take its answer is cut off.
+"""
+
+import asyncio
+import ipaddress
+import time
+from collections.abc import Iterable
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from appliance.api.access import Bearer, Doorkeeper
+from appliance.api.journal import Journal
+from appliance.api.problems import REASON, ProblemError, defect
+from appliance.api.rates import Buckets
+from appliance.config import ApiLimits
+
+_log = structlog.get_logger()
+PUBLIC = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json"})
+BEARER = "rosrv.bearer"  # the key of a request's scope that has who asks
+_NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
+_BODY_SECONDS = 30.0
+_SEND_SECONDS = 30.0
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+}
+
+
+class Gate:
+    """ASGI middleware around the application; `names` are those REST is called by, besides addresses."""
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        limits: ApiLimits,
+        doorkeeper: Doorkeeper,
+        journal: Journal,
+        names: Iterable[str],
+    ) -> None:
+        self._app = app
+        self._limits = limits
+        self._doorkeeper = doorkeeper
+        self._journal = journal
+        self._names = {"localhost", *(name.lower() for name in names)}
+        self._rate = Buckets(limits.requests_per_second, limits.burst)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            return
+        answer = _Answer(scope, send, self._journal)
+        try:
+            bearer, body = await self._pass(scope, receive)
+            answer.bearer = scope[BEARER] = bearer
+            await self._app(scope, _replay(body, receive), answer.send)
+        except ProblemError as problem:
+            await answer.fail(problem, receive)
+        except (TimeoutError, ConnectionError) as error:
+            _log.info("a client was cut off", path=scope["path"], reason=str(error) or "it does not read")
+            raise
+        except Exception as error:  # noqa: BLE001  a defect in a route is one client's failure
+            _log.exception("a REST call failed", path=scope["path"])
+            await answer.fail(defect(error), receive)
+
+    async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
+        host = scope["client"][0]
+        wait = self._rate.take(host, time.monotonic())
+        if wait:
+            raise ProblemError(
+                429,
+                "too-many-requests",
+                "too many requests of this host",
+                headers={"Retry-After": str(int(wait) + 1)},
+            )
+        headers = Headers(scope=scope)
+        self._check_host(headers)
+        _check_origin(scope, headers)
+        bearer = None
+        if scope["path"] not in PUBLIC:
+            bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
+        return bearer, await self._read(headers, receive)
+
+    def _check_host(self, headers: Headers) -> None:
+        given = headers.getlist("host")
+        name = _host_of(given[0]) if len(given) == 1 else None
+        if name is None or not (name in self._names or _is_address(name)):
+            raise ProblemError(
+                421,
+                "wrong-host",
+                "the appliance is not called by this name: use its address, or add the name to api_names",
+            )
+
+    async def _read(self, headers: Headers, receive: Receive) -> bytes:
+        limit = int(self._limits.body_bytes)
+        too_large = ProblemError(
+            413, "too-large", f"the body is larger than {limit} bytes", headers={"Connection": "close"}
+        )
+        length = headers.get("content-length", "0")
+        if not length.isdigit() or int(length) > limit:
+            raise too_large
+        body = bytearray()
+        try:
+            async with asyncio.timeout(_BODY_SECONDS):
+                while True:
+                    message = await receive()
+                    if message["type"] == "http.disconnect":
+                        raise ConnectionResetError("the client went away")
+                    body += message.get("body", b"")
+                    if len(body) > limit:
+                        raise too_large
+                    if not message.get("more_body", False):
+                        return bytes(body)
+        except TimeoutError:
+            raise ProblemError(
+                408,
+                "too-slow",
+                f"the body was not there within {_BODY_SECONDS:g} s",
+                headers={"Connection": "close"},
+            ) from None
+
+
+class _Answer:
+    """One answer on its way out: hardened, bounded in time, reported when its status is known."""
+
+    def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
+        self._scope = scope
+        self._send = send
+        self._journal = journal
+        self._started = time.monotonic_ns()
+        self._begun = self._ended = False
+        self.bearer: Bearer | None = None
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self._begun = True
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+            self._report(message["status"])
+        async with asyncio.timeout(_SEND_SECONDS):
+            await self._send(message)
+        self._ended = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+    async def fail(self, problem: ProblemError, receive: Receive) -> None:
+        """Answer with a problem; an answer that was begun and cannot be finished is broken off."""
+        if self._ended:
+            return
+        if self._begun:
+            raise ConnectionAbortedError(problem.detail)
+        self._scope[REASON] = problem.detail
+        await problem.response()(self._scope, receive, self.send)
+
+    def _report(self, status: int) -> None:
+        if self._scope["path"] in _NOT_RECORDED and status < 400:
+            return
+        self._journal.answered(
+            host=self._scope["client"][0],
+            who=self.bearer.name if self.bearer else "",
+            method=self._scope["method"],
+            path=self._scope["path"],
+            status=status,
+            reason=self._scope.get(REASON, ""),
+            duration_us=(time.monotonic_ns() - self._started) // 1000,
+        )
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    given = False
+
+    async def next_message() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return next_message
+
+
+def _host_of(header: str) -> str | None:
+    if header.startswith("["):
+        name, bracket, rest = header[1:].partition("]")
+        return name if bracket and (not rest or rest.startswith(":")) else None
+    return header.partition(":")[0].rstrip(".").lower() or None
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_origin(scope: Scope, headers: Headers) -> None:
+    origin = headers.get("origin")
+    if origin is not None and origin.lower() != f"{scope['scheme']}://{headers['host']}".lower():
+        raise ProblemError(403, "foreign-origin", "requests that pages of other sites make are not served")

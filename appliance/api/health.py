@@ -1,0 +1,102 @@
+"""`/healthz`, `/readyz`, `/v1/status`: is the process alive, is the appliance in service, how does it stand."""
+
+from typing import Any, Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict
+
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.channel.admin import StatusWanted
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Health(_Model):
+    """The probe's answer."""
+
+    status: Literal["live", "ready"]
+
+
+class Process(_Model):
+    """One process of the appliance; `since` is RFC 3339 UTC."""
+
+    role: str
+    pid: int
+    since: str
+    restarts: int
+
+
+class PolicyState(_Model):
+    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
+
+    revision: int
+    file: str
+    source: str
+    who: str
+    differs_from_file: bool
+    warnings: int
+    confirm_by: float | None
+
+
+class AuditState(_Model):
+    """How far the audit log is behind, and why it cannot be written."""
+
+    lag_records: int
+    lag_seconds: float
+    failed: str | None
+    degraded: str | None
+
+
+class Status(_Model):
+    """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
+
+    version: str
+    since: float
+    processes: list[Process]
+    isolation: str
+    firewall: dict[str, Any]
+    probe: str
+    policy: PolicyState
+    rosmaster: str
+    relay: str
+    nodes: int
+    shadows: int
+    topics: int
+    services: int
+    connections: int
+    messages: int
+    dropped: int
+    audit: AuditState
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(tags=["status"])
+
+    async def live() -> Health:
+        """Whether REST answers at all; no token needed."""
+        return Health(status="live")
+
+    async def ready() -> Health:
+        """Whether the appliance is in service: 503 while it is not; no token needed."""
+        if not services.control.connected:
+            raise ProblemError(
+                503, "not-available", "RVMaster is being restarted", headers={"Retry-After": "1"}
+            )
+        return Health(status="ready")
+
+    unready: dict[int | str, dict[str, Any]] = {503: {"description": "Not in service."}}
+    for prefix, name in (("", ""), ("/v1", "_v1")):
+        router.add_api_route(f"{prefix}/healthz", live, operation_id=f"live{name}")
+        router.add_api_route(f"{prefix}/readyz", ready, operation_id=f"ready{name}", responses=unready)
+
+    @router.get("/v1/status", operation_id="status")
+    async def status(bearer: Viewer) -> Status:
+        """The running appliance: processes, isolation, policy, graph, audit log."""
+        return Status.model_validate(await ask(services.control, StatusWanted(), bearer))
+
+    return router

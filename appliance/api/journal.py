@@ -1,0 +1,47 @@
+"""What REST tells control to record: every call, equal reads and refusals folded.
+
+The first of its kind is told at once; repetitions within `FOLD_SECONDS` are counted and told as one. Kinds are
+bounded: past `kinds` the rest of the time is one kind per status. Changes (anything but GET and HEAD by a recognised
+token) are never folded.
+"""
+
+from collections.abc import Callable
+
+from appliance.channel.messages import RestCalled
+
+FOLD_SECONDS = 10.0
+_READS = frozenset({"GET", "HEAD"})
+_Kind = tuple[str, str, str, str, int, str]
+
+
+class Journal:
+    """Tells what was answered; `flush` is to be called every `FOLD_SECONDS`."""
+
+    def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
+        self._tell = tell
+        self._kinds = kinds
+        self._repeated: dict[_Kind, int] = {}
+
+    def answered(
+        self, *, host: str, who: str, method: str, path: str, status: int, reason: str, duration_us: int
+    ) -> None:
+        """One answer was given."""
+        if who and method not in _READS:
+            self._tell(RestCalled(host, who, method, path, status, reason, duration_us))
+            return
+        kind = (host, who, method, path, status, reason)
+        if kind in self._repeated:
+            self._repeated[kind] += 1
+        elif len(self._repeated) < self._kinds:
+            self._repeated[kind] = 0
+            self._tell(RestCalled(*kind, duration_us))
+        else:
+            rest = ("", "", "", "", status, "further calls, not told one by one")
+            self._repeated[rest] = self._repeated.get(rest, 0) + 1
+
+    def flush(self) -> None:
+        """Tell what was repeated."""
+        repeated, self._repeated = self._repeated, {}
+        for kind, count in repeated.items():
+            if count:
+                self._tell(RestCalled(*kind, 0, count))

@@ -1,0 +1,138 @@
+"""The api as a process of the appliance: lifeline, link to control, certificate, and the listener.
+
+It ends when the supervisor says `Stop` or is gone. It outlives control: while there is none, calls that need it are
+answered 503. A control that does not come back, or that closed the link because of what it was sent, is answered by
+ending: the supervisor starts a fresh api with a fresh link.
+"""
+
+import asyncio
+import datetime
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import structlog
+import uvloop
+
+from appliance.api.access import Doorkeeper
+from appliance.api.app import build_app
+from appliance.api.certificate import tls_context
+from appliance.api.control import ControlLink
+from appliance.api.gate import Gate
+from appliance.api.journal import FOLD_SECONDS, Journal
+from appliance.api.listener import Listener
+from appliance.api.services import Services
+from appliance.channel import messages
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.config import Settings, load_resolved
+
+_log = structlog.get_logger()
+_WITHOUT_CONTROL_SECONDS = 30.0
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    """Serve REST until the supervisor ends it."""
+    uvloop.run(_Api(load_resolved(config), lifeline_fd).run())
+
+
+class _Api:
+    """The parts of the api and the wires between them."""
+
+    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+        self._settings = settings
+        self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self._doorkeeper = Doorkeeper(settings.api_limits.failures_per_minute)
+        self._control = ControlLink(self._doorkeeper.state)
+        self._control.lost = self._await_control
+        self._journal = Journal(self._control.tell)
+        self._stopping = asyncio.Event()
+        self._given = asyncio.Event()
+        self._socket: socket.socket | None = None
+        self._without_control: asyncio.TimerHandle | None = None
+
+    async def run(self) -> None:
+        """Serve from start to end."""
+        self._lifeline.attach(asyncio.get_running_loop(), self._received, self._end)
+        services = Services(self._settings, self._control, self._doorkeeper, self._stopping)
+        app = build_app(services)
+        gate = Gate(
+            app,
+            limits=self._settings.api_limits,
+            doorkeeper=self._doorkeeper,
+            journal=self._journal,
+            names=[*self._settings.api_names, socket.gethostname()],
+        )
+        listener = Listener(gate, self._settings.api_limits)
+        await self._given.wait()
+        if self._socket is None:
+            return
+        try:
+            context = await asyncio.to_thread(self._context) if self._settings.api_tls else None
+            await listener.start(self._socket, context)
+        except (OSError, ValueError) as error:
+            self._say(messages.Failed(f"REST cannot be served: {error}"))
+            await self._stopping.wait()
+            return
+        self._await_control()
+        self._say(messages.Ready({"tls": self._settings.api_tls}))
+        flushing = asyncio.get_running_loop().create_task(self._flush())
+        await self._stopping.wait()
+        flushing.cancel()
+        await listener.stop()
+        self._journal.flush()
+        self._control.close()
+
+    def _end(self) -> None:
+        self._stopping.set()
+        self._given.set()
+
+    def _context(self) -> Any:
+        address = self._settings.api_address
+        names = [*self._settings.api_names]
+        if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
+            names.append(address[0])
+        now = datetime.datetime.now(datetime.UTC)
+        return tls_context(self._settings.state / "api", names, now)
+
+    async def _flush(self) -> None:
+        while True:
+            await asyncio.sleep(FOLD_SECONDS)
+            self._journal.flush()
+
+    def _await_control(self) -> None:
+        if self._control.connected or self._without_control is not None:
+            return
+        loop = asyncio.get_running_loop()
+        self._without_control = loop.call_later(_WITHOUT_CONTROL_SECONDS, self._give_up)
+
+    def _give_up(self) -> None:
+        self._without_control = None
+        if not self._control.connected:
+            _log.error("no control for a long time: the api is started afresh")
+            self._stopping.set()
+
+    def _say(self, message: messages.Message) -> None:
+        try:
+            self._lifeline.send(message)
+        except ChannelClosedError:
+            self._stopping.set()
+
+    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case messages.Ping(number):
+                self._say(messages.Pong(number))
+            case messages.Stop():
+                self._end()
+            case messages.SocketRestored(name) if name == "api":
+                self._socket = socket.socket(fileno=descriptors[0])
+                self._given.set()
+            case messages.LinkOpened(role) if role == "control":
+                sock = socket.socket(fileno=descriptors[0])
+                self._control.attach(Channel(sock, messages.ApiLink, limit=8 << 20, longest=64 << 20))
+            case _:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+                _log.error(
+                    "the supervisor said something that is not for the api", message=type(message).__name__
+                )

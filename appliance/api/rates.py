@@ -1,0 +1,61 @@
+"""How much one peer may do: token buckets, bounded in number. No I/O; time is given.
+
+Invariants:
+
+1. Memory is bounded: at most `peers` buckets. One more pushes out the one that was used longest ago, which by then
+   is full or belongs to a peer that is still waiting its turn: a flood from many addresses gains one burst each.
+2. An IPv6 peer is its /64: whoever has one address there has all of them.
+"""
+
+import ipaddress
+from collections import OrderedDict
+
+_V6_PREFIX = 64
+
+
+def peer_key(host: str) -> str:
+    """What counts as one peer."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if address.version == 4:
+        return host
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.ip_network((address, _V6_PREFIX), strict=False))
+
+
+class Buckets:
+    """One bucket for each peer: `burst` at once, `per_second` on average."""
+
+    def __init__(self, per_second: float, burst: float, *, peers: int = 4096) -> None:
+        self._per_second = per_second
+        self._burst = burst
+        self._peers = peers
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def take(self, host: str, now: float) -> float:
+        """Take one: 0 when there was one, else the seconds until there will be."""
+        left = self._left(host, now)
+        if left < 1:
+            self._keep(host, left, now)
+            return (1 - left) / self._per_second
+        self._keep(host, left - 1, now)
+        return 0.0
+
+    def wait(self, host: str, now: float) -> float:
+        """What `take` would say, without taking."""
+        left = self._left(host, now)
+        return 0.0 if left >= 1 else (1 - left) / self._per_second
+
+    def _left(self, host: str, now: float) -> float:
+        left, then = self._buckets.get(peer_key(host), (self._burst, now))
+        return min(self._burst, left + max(0.0, now - then) * self._per_second)
+
+    def _keep(self, host: str, left: float, now: float) -> None:
+        key = peer_key(host)
+        self._buckets[key] = (left, now)
+        self._buckets.move_to_end(key)
+        if len(self._buckets) > self._peers:
+            self._buckets.popitem(last=False)

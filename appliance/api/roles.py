@@ -1,0 +1,55 @@
+"""What a route asks of who calls it: a role, and what every other route asks the same way."""
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Request, Security
+from fastapi.security import HTTPBearer
+
+from appliance.api.access import Bearer, Role
+from appliance.api.control import ControlLink
+from appliance.api.gate import BEARER
+from appliance.api.problems import ProblemError
+from appliance.channel.admin import AdminRequest
+
+_SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
+
+
+class _Requires:
+    """A dependency: the bearer, whose role must be at least this one."""
+
+    def __init__(self, role: Role) -> None:
+        self._role = role
+
+    def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
+        bearer: Bearer = request.scope[BEARER]
+        if bearer.role < self._role:
+            raise ProblemError(
+                403,
+                "not-for-this-role",
+                f"this is for {self._role.name.lower()}s; the token {bearer.name} is a {bearer.role.name.lower()}'s",
+            )
+        return bearer
+
+
+Viewer = Annotated[Bearer, Depends(_Requires(Role.VIEWER))]
+Operator = Annotated[Bearer, Depends(_Requires(Role.OPERATOR))]
+Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
+
+_PROBLEMS = {
+    "request": (422, "bad-input"),
+    "refused": (422, "refused"),
+    "conflict": (412, "changed-meanwhile"),
+    "unknown": (404, "unknown"),
+    "busy": (503, "busy"),
+    "failed": (503, "not-available"),
+}
+
+
+async def ask(control: ControlLink, request: AdminRequest, bearer: Bearer) -> dict[str, Any]:
+    """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
+    answer = await control.ask(request, bearer.name)
+    if answer.ok:
+        return answer.body
+    status, kind = _PROBLEMS.get(answer.trouble, (503, "not-available"))
+    detail = "\n".join([answer.error, *answer.findings])
+    raise ProblemError(status, kind, detail)

@@ -1,0 +1,107 @@
+"""`rosrv token add|list|revoke`: who may use REST, and as what."""
+
+import datetime
+import json
+import re
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from appliance.channel.admin import AdminRequest, TokenAdd, TokenList, TokenRevoke, TokenRole
+from appliance.cli.policy_input import usage_error
+from appliance.cli.policy_output import say
+from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+
+app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
+
+_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
+_DAY = 86_400.0
+_UNITS = {"m": 60.0, "h": 3600.0, "d": _DAY, "w": 7 * _DAY}
+
+
+@app.command()
+def add(
+    name: Annotated[
+        str, typer.Argument(help="Who will hold it: it stands in the audit log", show_default=False)
+    ],
+    role: Annotated[
+        TokenRole,
+        typer.Option(help="viewer: look; operator: also reload and roll back; admin: also load new policies"),
+    ] = "viewer",
+    expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
+    state: State = DEFAULT_STATE,
+    as_json: _Json = False,
+) -> None:
+    """Make a token. Its text is printed once, here, and kept nowhere.
+
+    Example: rosrv token add alice --role operator --expires 30d
+    """
+    body = _ask(state, TokenAdd(name, role, _seconds(expires)), as_json=as_json)
+    if as_json:
+        _print(json.dumps(body))
+        return
+    _print(body["token"])
+    typer.echo(
+        f"rosrv: {body['role']} {body['name']}, until {_moment(body['expires'])}. "
+        "This is the only time it is shown.",
+        err=True,
+    )
+
+
+@app.command("list")
+def list_tokens(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """List all tokens that were made, without their secrets.
+
+    Example: rosrv token list
+    """
+    now = datetime.datetime.now(datetime.UTC).timestamp()
+    for row in _ask(state, TokenList(), as_json=as_json)["tokens"]:
+        if as_json:
+            _print(json.dumps(row))
+            continue
+        if row["revoked"] is not None:
+            end = f"revoked {_moment(row['revoked'])}"
+        else:
+            end = f"{'expired' if row['expires'] <= now else 'until'} {_moment(row['expires'])}"
+        say(f"{row['name']:<24} {row['role']:<9} {row['id']}  made {_moment(row['created'])}  {end}")
+
+
+@app.command()
+def revoke(
+    name: Annotated[str, typer.Argument(help="The name it was made with", show_default=False)],
+    state: State = DEFAULT_STATE,
+    as_json: _Json = False,
+) -> None:
+    """End a token now; exit status 1 when there is none of this name.
+
+    Example: rosrv token revoke alice
+    """
+    body = _ask(state, TokenRevoke(name), as_json=as_json)
+    if as_json:
+        _print(json.dumps(body))
+    else:
+        say(f"token {body['name']} ({body['role']}) is revoked")
+
+
+def _ask(state: Any, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+    try:
+        return body_or_exit(ask(state, request), as_json=as_json)
+    except NotRunningError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(2) from None
+
+
+def _seconds(text: str) -> float:
+    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([mhdw])", text)
+    if found is None or float(found[1]) <= 0:
+        raise usage_error(f"--expires {text!r} is not a time: write 30m, 12h, 90d or 52w")
+    return float(found[1]) * _UNITS[found[2]]
+
+
+def _moment(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
+
+
+def _print(line: str) -> None:
+    sys.stdout.write(line + "\n")

@@ -1,0 +1,133 @@
+"""Control's end of the link to the api: takes what REST asks, one request after the other, and what it did.
+
+Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
+
+1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
+   nodes.
+2. What is not of the link ends it; an api that does not read its answers loses the link.
+3. Nothing that can be asked here makes a token, and no decision of RVMaster depends on the api.
+"""
+
+import asyncio
+from collections import deque
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.channel.admin import (
+    AdminAnswer,
+    PolicyConfirm,
+    PolicyLoad,
+    PolicyReload,
+    PolicyRollback,
+)
+from appliance.channel.channel import Channel, ChannelFullError
+from appliance.master.administration import Administration
+from appliance.master.recorder import Recorder
+from appliance.master.tokens import Tokens
+
+_log = structlog.get_logger()
+_MOST_WAITING = 64
+_TEXT = 300
+_CHANGES = (PolicyReload, PolicyRollback, PolicyConfirm, PolicyLoad)
+
+
+class RestLink:
+    """Serves whichever api is there."""
+
+    def __init__(self, administration: Administration, tokens: Tokens, recorder: Recorder) -> None:
+        self._administration = administration
+        self._tokens = tokens
+        self._recorder = recorder
+        self._channel: Channel | None = None
+        self._waiting: deque[messages.RequestMade] = deque()
+        self._worker: asyncio.Task[None] | None = None
+        tokens.changed = self._state_tokens
+
+    def attach(self, channel: Channel) -> None:
+        """An api is there: serve it, and tell it the tokens."""
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = channel
+        self._waiting.clear()
+        channel.attach(
+            asyncio.get_running_loop(),
+            lambda message, _descriptors: self._received(channel, message),
+            lambda: self._lost(channel, "it ended"),
+            lambda reason: self._lost(channel, reason),
+        )
+        self._state_tokens()
+
+    def _received(self, channel: Channel, message: object) -> None:
+        if channel is not self._channel:
+            return
+        match message:
+            case messages.RequestMade(number):
+                if len(self._waiting) >= _MOST_WAITING:
+                    text = "too many requests wait for the appliance: try again"
+                    self._send(
+                        messages.RequestAnswered(number, AdminAnswer(False, error=text, trouble="busy"))
+                    )
+                    return
+                self._waiting.append(message)
+                if self._worker is None or self._worker.done():
+                    self._worker = asyncio.get_running_loop().create_task(self._work(channel))
+            case messages.RestCalled():
+                self._record(message)
+            case _:
+                channel.close()
+                self._lost(channel, f"it sent {type(message).__name__}")
+
+    async def _work(self, channel: Channel) -> None:
+        while self._waiting and channel is self._channel:
+            made = self._waiting.popleft()
+            answer = await self._answer(made)
+            if channel is self._channel:
+                self._send(messages.RequestAnswered(made.number, answer))
+            await asyncio.sleep(0)
+
+    async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
+        if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
+            return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
+        try:
+            return await self._administration.carry_out(made.request, who=made.who)
+        except Exception as error:  # noqa: BLE001  a defect of one request is that request's failure
+            _log.exception("a request of the api failed", request=type(made.request).__name__)
+            return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
+
+    def _record(self, call: messages.RestCalled) -> None:
+        denied = call.status in (401, 403, 421, 429)
+        self._recorder.happened(
+            "rest call",
+            call.reason[:_TEXT],
+            severity=Severity.WARNING if denied else Severity.INFO,
+            decision="deny" if denied else "allow",
+            host=call.host,
+            category="rest",
+            resource=call.path[:_TEXT],
+            who=call.who or None,
+            method=call.method[:_TEXT],
+            status=call.status,
+            took_us=call.duration_us,
+            count=call.count,
+        )
+
+    def _state_tokens(self) -> None:
+        self._send(messages.TokensStated(self._tokens.usable()))
+
+    def _send(self, message: messages.Message) -> None:
+        if self._channel is None:
+            return
+        try:
+            self._channel.send(message)
+        except ChannelFullError:
+            channel, self._channel = self._channel, None
+            channel.close()
+            _log.error("the api does not read its answers: its link is closed")
+
+    def _lost(self, channel: Channel, reason: str) -> None:
+        if self._channel is channel:
+            self._channel = None
+            self._waiting.clear()
+            _log.warning("no api", reason=reason)
