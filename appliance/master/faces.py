@@ -98,6 +98,10 @@ class Faces:
             coming.add_done_callback(lambda _done: self._coming.pop(identity, None))
         return await asyncio.shield(coming)
 
+    async def settled(self) -> None:
+        """Wait until all that was registered so far would survive a crash."""
+        await self._store.settled()
+
     async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         outer_port, relay_port = self._places.open()
         incarnation = Incarnation(
@@ -115,7 +119,7 @@ class Faces:
         )
         self._registry.add(incarnation)
         await self.open(incarnation)
-        await self._store.settled()  # a node never registers twice: it must be known after a crash, too
+        await self.settled()  # a node never registers twice: it must be known after a crash, too
         return incarnation
 
     async def open(self, incarnation: Incarnation) -> None:

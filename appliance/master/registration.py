@@ -46,6 +46,8 @@ async def register_service(master: "Master", caller: Caller, arguments: tuple[ob
     )
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
+        # ROSMaster does not know the service's real port: after a crash it could not be found out again.
+        await master.faces.settled()
     return answer
 
 

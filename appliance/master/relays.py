@@ -86,6 +86,7 @@ class RelayControl:
         self._channel: Channel | None = None
         self._epoch = 0
         self._permissions: dict[str, set[PermissionRow]] = {}
+        self._placed: set[str] = set()  # incarnations whose port this relay has
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
         self._asking: set[asyncio.Task[None]] = set()
         self.connections: dict[int, Connection] = {}
@@ -121,6 +122,7 @@ class RelayControl:
         if self._channel is not None:
             self._channel.close()
         self._channel = channel
+        self._placed.clear()
         self.connections.clear()
         channel.attach(asyncio.get_running_loop(), self._received, lambda: self._lost(channel))
         self._epoch += 1
@@ -159,6 +161,9 @@ class RelayControl:
             self._state(row)
 
     def _place_node(self, incarnation: Incarnation) -> None:
+        if incarnation.key in self._placed:
+            return
+        self._placed.add(incarnation.key)
         listening = self._places.socket(incarnation.relay_port)
         message = messages.NodePlaced(incarnation.key, incarnation.name, str(incarnation.host))
         self._send(message, (listening.fileno(),))
@@ -190,7 +195,9 @@ class RelayControl:
 
     def node_withdrawn(self, incarnation: Incarnation) -> None:
         """The incarnation is gone (for now): nothing of it is carried."""
-        self._send(messages.NodeWithdrawn(incarnation.key))
+        if incarnation.key in self._placed:
+            self._placed.discard(incarnation.key)
+            self._send(messages.NodeWithdrawn(incarnation.key))
 
     def node_returned(self, incarnation: Incarnation) -> None:
         """The incarnation is back with all it had."""

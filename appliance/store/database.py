@@ -15,6 +15,7 @@ from typing import Any
 
 Parameters = Sequence[str | int | float | bytes | None]
 _GROUP = 2_000
+_GATHER_SECONDS = 0.002  # a statement that nobody awaits waits this long for company
 
 
 class StoreError(Exception):
@@ -42,6 +43,7 @@ class Database:
             queue.SimpleQueue()
         )
         self._closing = threading.Event()
+        self._hurry = threading.Event()
         self._thread = threading.Thread(target=self._write, name="store", daemon=True)
         self._thread.start()
 
@@ -67,11 +69,13 @@ class Database:
                 done.set_result(None)
 
         self._queue.put(lambda: _call_back(loop, tell))
+        self._hurry.set()
         await done
 
     def close(self) -> None:
         """Write what is queued and close the file."""
         self._closing.set()
+        self._hurry.set()
         self._queue.put(None)
         self._thread.join()
         self._connection.close()
@@ -79,6 +83,9 @@ class Database:
     def _write(self) -> None:
         while True:
             group = [self._queue.get()]
+            if isinstance(group[0], tuple) and self._queue.empty():
+                self._hurry.wait(_GATHER_SECONDS)
+            self._hurry.clear()
             while len(group) < _GROUP and not self._queue.empty():
                 group.append(self._queue.get())
             self._commit([one for one in group if isinstance(one, tuple)])
