@@ -8,9 +8,9 @@ knocks at a dead node's port finds nobody, not somebody else.
 """
 
 import errno
+import socket as sockets
 from collections import deque
 from collections.abc import Callable
-from socket import socket as TcpSocket
 
 from appliance.master.http import listen
 from appliance.master.registry import Incarnation
@@ -31,7 +31,7 @@ class Places:
         host: str,
         ports: range,
         *,
-        keep: Callable[[str, TcpSocket], None],
+        keep: Callable[[str, sockets.socket], None],
         drop: Callable[[str], None],
     ) -> None:
         self._host = host
@@ -39,7 +39,7 @@ class Places:
         self._drop = drop
         self._range = ports
         self._unused = deque(ports)
-        self._sockets: dict[str, TcpSocket] = {}
+        self._sockets: dict[str, sockets.socket] = {}
 
     def set_range(self, ports: range) -> None:
         """Take new ports from this range from now on; those in use stay."""
@@ -64,11 +64,11 @@ class Places:
         self._keep(f"port:{ports[1]}", relay)
         return ports
 
-    def socket(self, port: int) -> TcpSocket:
+    def socket(self, port: int) -> sockets.socket:
         """The listening socket of a port that was opened or adopted."""
         return self._sockets[f"port:{port}"]
 
-    def adopt(self, name: str, sock: TcpSocket) -> None:
+    def adopt(self, name: str, sock: sockets.socket) -> None:
         """Take a kept socket back after a restart of control."""
         self._sockets[name] = sock
         port = sock.getsockname()[1]
@@ -77,7 +77,7 @@ class Places:
 
     def reopen(self, incarnation: Incarnation) -> bool:
         """Open the same ports again (after a restart of the appliance); False when another process has one."""
-        opened: list[TcpSocket] = []
+        opened: list[sockets.socket] = []
         for port in (incarnation.outer_port, incarnation.relay_port):
             if f"port:{port}" in self._sockets:
                 continue
@@ -114,7 +114,7 @@ class Places:
                 self._drop(name)
                 self._unused.append(port)
 
-    def _listen(self) -> TcpSocket:
+    def _listen(self) -> sockets.socket:
         for _ in range(len(self._unused)):
             port = self._unused.popleft()
             try:

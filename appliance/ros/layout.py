@@ -113,10 +113,9 @@ class LayoutBuilder:
 
     def add_array(self, path: str, type_name: str, count: int | None, layout: Layout | None) -> None:
         """Add an array; `layout` is that of its elements if they are messages."""
+        size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if layout is not None:
             size = layout.size
-        else:
-            size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if count is not None and size is not None:
             self._add_leaf(Leaf(path, type_name, self._offset, size * count, count, layout))
         else:
