@@ -6,7 +6,7 @@ an answer of the right shape for the caller, and a record; never an exception fo
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 _log = structlog.get_logger()
 _MULTICALL = "system.multicall"
+_TOGETHER = frozenset({"getParam", "setParam", "hasParam", "deleteParam"})
+_LONGEST_RUN = 64
 _LONGEST_STRETCH = 0.005  # seconds of a multicall without a look at anybody else
 _RECORDED = (KEY, SEARCH_KEY, NODE, SUBGRAPH)  # resolved names: short, and what a reviewer asks for
 _CLAIM_SHOWN = 1024  # characters of a caller_id that is no name
@@ -101,8 +103,10 @@ class Pipeline:
             return [-1, why, 0]
         results: list[Value] = []
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
-        for part in call.params[0]:
-            results.append(await self._answer_part(calls, caller, part))
+        for run in _runs(call.params[0]):
+            # A run of parameter calls goes to ROSMaster together: each is decided and sent, in order, before the
+            # first is answered. Everything else waits for the part before it.
+            results += await asyncio.gather(*(self._answer_part(calls, caller, part) for part in run))
             if time.monotonic() - since > _LONGEST_STRETCH:
                 await asyncio.sleep(0)
                 since = time.monotonic()
@@ -215,6 +219,22 @@ class Pipeline:
             call=call.name,
         )
         return [-1, str(error), call.denial]
+
+
+def _runs(parts: list[Value]) -> Iterator[list[Value]]:
+    """The parts of a multicall in their order: runs of parameter calls, and each other part by itself."""
+    run: list[Value] = []
+    for part in parts:
+        together = isinstance(part, dict) and part.get("methodName") in _TOGETHER
+        if run and (not together or len(run) >= _LONGEST_RUN):
+            yield run
+            run = []
+        if together:
+            run.append(part)
+        else:
+            yield [part]
+    if run:
+        yield run
 
 
 def denial_text(decision: Decision, record: str) -> str:
