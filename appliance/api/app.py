@@ -8,7 +8,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 import appliance
-from appliance.api import health
+from appliance.api import audit, explaining, graph, health, metrics, policy
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
 from appliance.api.problems import REASON, BadInput, ProblemError, defect
@@ -38,8 +38,8 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    for router in (health.routes(services),):
-        app.include_router(router)
+    for part in (health, policy, explaining, audit, graph, metrics):
+        app.include_router(part.routes(services))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:

@@ -5,6 +5,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from appliance.api.audit import RECORD
 from appliance.api.problems import MEDIA_TYPE, Problem
 
 # What the gate may answer to any call.
@@ -43,6 +44,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
     schema = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
     components.update(schema.pop("$defs", {}))
     components["Problem"] = schema
+    components["AuditRecord"] = RECORD
     for path in document["paths"].values():
         for operation in path.values():
             _complete(operation)

@@ -5,12 +5,14 @@ bounded: past `kinds` the rest of the time is one kind per status. Changes (anyt
 token) are never folded.
 """
 
+from collections import Counter
 from collections.abc import Callable
 
 from appliance.channel.messages import RestCalled
 
 FOLD_SECONDS = 10.0
 _READS = frozenset({"GET", "HEAD"})
+_METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _Kind = tuple[str, str, str, str, int, str]
 
 
@@ -21,11 +23,13 @@ class Journal:
         self._tell = tell
         self._kinds = kinds
         self._repeated: dict[_Kind, int] = {}
+        self.calls: Counter[tuple[str, str]] = Counter()  # by method and status, for the metrics
 
     def answered(
         self, *, host: str, who: str, method: str, path: str, status: int, reason: str, duration_us: int
     ) -> None:
         """One answer was given."""
+        self.calls[method if method in _METHODS else "other", str(status)] += 1
         if who and method not in _READS:
             self._tell(RestCalled(host, who, method, path, status, reason, duration_us))
             return

@@ -54,7 +54,7 @@ class _Api:
     async def run(self) -> None:
         """Serve from start to end."""
         self._lifeline.attach(asyncio.get_running_loop(), self._received, self._end)
-        services = Services(self._settings, self._control, self._doorkeeper, self._stopping)
+        services = Services(self._settings, self._control, self._doorkeeper, self._journal, self._stopping)
         app = build_app(services)
         gate = Gate(
             app,

@@ -33,7 +33,6 @@ class _Requires:
 
 Viewer = Annotated[Bearer, Depends(_Requires(Role.VIEWER))]
 Operator = Annotated[Bearer, Depends(_Requires(Role.OPERATOR))]
-Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
 
 _PROBLEMS = {
     "request": (422, "bad-input"),

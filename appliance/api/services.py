@@ -1,22 +1,27 @@
 """What the routes work with, named once."""
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.api.access import Doorkeeper
 from appliance.api.control import ControlLink
+from appliance.api.journal import Journal
 from appliance.config import Settings
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts that the routes share; `stopping` is set when the process is to end."""
+    """The parts that the routes share; `stopping` is set when the process is to end.
+
+    `judging` bounds the policy texts that are compiled at once."""
 
     settings: Settings
     control: ControlLink
     doorkeeper: Doorkeeper
+    journal: Journal
     stopping: asyncio.Event
+    judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
     @property
     def audit_log(self) -> Path:

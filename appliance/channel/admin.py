@@ -68,6 +68,10 @@ class GraphWanted(AdminRequest, frozen=True, tag="graph"):
     """Nodes, topics and services with who is connected to whom and how much flows."""
 
 
+class MetricsWanted(AdminRequest, frozen=True, tag="metrics"):
+    """The status, and everything that control counts."""
+
+
 TokenRole = Literal["viewer", "operator", "admin"]
 
 
@@ -91,7 +95,7 @@ class TokenRevoke(AdminRequest, frozen=True, tag="token revoke"):
 
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
-    | RegistrationsWanted | GraphWanted
+    | RegistrationsWanted | GraphWanted | MetricsWanted
 )  # fmt: skip
 AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke
 

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from appliance.audit.database import LogUnreadableError
+from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import Entry, as_json, as_object, printable
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
@@ -29,7 +30,6 @@ from appliance.audit.search import show as show_one
 from appliance.audit.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.verify import verify as verify_log
 from appliance.cli.audit_output import line, print_entries, print_shown, print_verification, write
-from appliance.cli.moment import MomentError, parse_moment
 from appliance.config import Settings
 
 app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)

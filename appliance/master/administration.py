@@ -14,6 +14,7 @@ import msgspec
 import appliance
 from appliance.channel import admin
 from appliance.master.core import Master
+from appliance.master.measures import measures_of
 from appliance.master.overview import graph_of
 from appliance.master.policies import Loaded, Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.registry import Kind, Life
@@ -23,7 +24,13 @@ from appliance.store.state import RevisionRow, StateStore
 from appliance.store.tokens import TokenRow
 
 _CATEGORIES = {Kind.PUBLICATION: "publish", Kind.SUBSCRIPTION: "subscribe", Kind.SERVICE: "offer"}
-_View = admin.StatusWanted | admin.PolicyRevisions | admin.RegistrationsWanted | admin.GraphWanted
+_View = (
+    admin.StatusWanted
+    | admin.PolicyRevisions
+    | admin.RegistrationsWanted
+    | admin.GraphWanted
+    | admin.MetricsWanted
+)
 _TokenRequest = admin.TokenAdd | admin.TokenList | admin.TokenRevoke
 _PolicyChange = admin.PolicyReload | admin.PolicyRollback | admin.PolicyConfirm | admin.PolicyLoad
 
@@ -46,6 +53,7 @@ class Administration:
         lag: Callable[[], tuple[int, float]],
         audit_failed: Callable[[], str | None],
         audit_degraded: Callable[[], str | None],
+        queued_deliveries: Callable[[], int],
     ) -> None:
         self._master = master
         self._policies = policies
@@ -55,6 +63,7 @@ class Administration:
         self._lag = lag
         self._audit_failed = audit_failed
         self._audit_degraded = audit_degraded
+        self._queued_deliveries = queued_deliveries
         self._started = time.time()
         self._changing = asyncio.Lock()
 
@@ -96,6 +105,12 @@ class Administration:
                 return {"registrations": self._registrations()}
             case admin.GraphWanted():
                 return graph_of(self._master)
+            case admin.MetricsWanted():
+                return {
+                    "status": self._status(),
+                    "queued_deliveries": self._queued_deliveries(),
+                    **measures_of(self._master),
+                }
 
     async def _manage_tokens(self, request: _TokenRequest) -> dict[str, Any]:
         match request:

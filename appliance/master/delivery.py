@@ -56,6 +56,11 @@ class Delivery:
         self._queues: dict[str, deque[NodeCall]] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
 
+    @property
+    def waiting(self) -> int:
+        """How many calls wait, for all nodes together."""
+        return sum(map(len, self._queues.values()))
+
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         """Queue a call for a node."""
         queue = self._queues.setdefault(incarnation.key, deque())

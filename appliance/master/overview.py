@@ -20,8 +20,8 @@ def graph_of(master: Master) -> dict[str, Any]:
     names = {one.key: one.name for one in shown}
     return {
         "nodes": [_node(one) for one in sorted(shown, key=lambda one: one.name)],
-        "topics": _topics(live, master.relay, names),
-        "services": _services(live, master.relay, names),
+        "topics": _topics(master, live, names),
+        "services": _services(master, live, names),
     }
 
 
@@ -36,7 +36,8 @@ def _node(incarnation: Incarnation) -> dict[str, Any]:
     }
 
 
-def _topics(live: list[Incarnation], relay: RelayControl, names: dict[str, str]) -> list[dict[str, Any]]:
+def _topics(master: Master, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
+    relay = master.relay
     topics: dict[str, dict[str, Any]] = {}
     for one in live:
         for registration in one.registrations.values():
@@ -53,15 +54,18 @@ def _topics(live: list[Incarnation], relay: RelayControl, names: dict[str, str])
             else:
                 topic["subscribers"].append(one.name)
     for name, topic in topics.items():
+        topic["mediated"] = master.mediation.carries_topic(name)
         topic["connections"] = _connections(relay, TOPIC, name, names)
     return [topics[name] for name in sorted(topics)]
 
 
-def _services(live: list[Incarnation], relay: RelayControl, names: dict[str, str]) -> list[dict[str, Any]]:
+def _services(master: Master, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
+    relay = master.relay
     return [
         {
             "name": registration.resource,
             "node": one.name,
+            "mediated": master.mediation.carries_service(registration.resource),
             **relay.flow(one.key, registration.resource),
             "connections": _connections(relay, SERVICE, registration.resource, names),
         }

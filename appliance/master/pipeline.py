@@ -72,6 +72,9 @@ class Pipeline:
             return self._not_understood(caller, error)
         try:
             answer = await self._answer_all(calls, caller, method_call)
+            known = method_call.method in calls or method_call.method == _MULTICALL
+            seconds = (time.monotonic_ns() - caller.arrived) / 1e9
+            self._master.recorder.meter.called(method_call.method if known else "unknown", seconds)
             if len(body) > self._offload:
                 return await asyncio.to_thread(build_response, answer)
             return build_response(answer)

@@ -326,6 +326,7 @@ class _Control:
             lag=lambda: self._audit.lag,
             audit_failed=lambda: self._audit.failed,
             audit_degraded=lambda: self._audit.degraded,
+            queued_deliveries=lambda: self._delivery.waiting,
         )
         self._rest = RestLink(administration, self._tokens, self._recorder)
         if _ADMIN in sockets:

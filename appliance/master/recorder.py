@@ -6,6 +6,7 @@ from typing import Any
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record, RuleReference, Severity
 from appliance.master.call import Caller
+from appliance.metrics import Meter
 from appliance.policy.model import Decision, Rule
 
 
@@ -22,6 +23,7 @@ class Recorder:
         self.strict = strict
         self._deny_when_failed = deny_when_failed
         self.revision = 0
+        self.meter = Meter()
 
     @property
     def obstacle(self) -> str | None:
@@ -47,6 +49,8 @@ class Recorder:
         """Record a decision; its id. `asked_of` is what a command is about: a parameter, a node."""
         record_id = self._ids.next()
         word = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
+        duration = time.monotonic_ns() - caller.arrived
+        self.meter.decided(category, word, duration / 1e9)
         detail: dict[str, Any] = {"call": method, **asked_of}
         if caller.target is not None:
             detail["node"] = caller.target.name
@@ -64,7 +68,7 @@ class Recorder:
                 rule=rule_reference(decision.rule),
                 revision=self.revision,
                 reason=decision.reason,
-                duration_us=(time.monotonic_ns() - caller.arrived) // 1000,
+                duration_us=duration // 1000,
                 detail=detail,
             )
         )

@@ -8,6 +8,7 @@ with Appliance(host, state, policy=OPEN_POLICY) as appliance:
 import json
 import os
 import signal
+import ssl
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
+from tests.support.rest import Rest
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 OPEN_POLICY = """\
@@ -105,6 +107,17 @@ class Appliance:
         """Write the policy file and have it read again."""
         self.policy_file.write_text(policy)
         self.rosrv("policy", "reload")
+
+    def rest(self, token: str | None = None) -> Rest:
+        """REST, by the token given or the first one; trusts the certificate the appliance made."""
+        url = str(self.ready["api"])
+        certificate = None
+        if url.startswith("https:"):
+            # The kernel takes connections before the process is there: one answer says that it is.
+            served = ssl.get_server_certificate((Rest(url).url.hostname, Rest(url).url.port), timeout=LIMIT)
+            certificate = self.state / "api" / "certificate.pem"
+            assert certificate.read_text() == served
+        return Rest(url, token or self.ready["token"], certificate)
 
     def pids(self, role: str) -> list[int]:
         """The process ids of a role, by `rosrv status`."""

@@ -1,4 +1,4 @@
-"""Moments as people give them on the command line: `1h` ago, a date, or RFC 3339."""
+"""Moments as people give them, on the command line and over REST: `1h` ago, a date, or RFC 3339."""
 
 import re
 from datetime import UTC, datetime

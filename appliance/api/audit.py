@@ -1,0 +1,297 @@
+"""`/v1/audit`: search, one record, follow live, verify, export. Reads the log's file, which it cannot write.
+
+What is costly is bounded: so many searches, exports and followers at once, one verification. Whoever comes on top
+waits a moment and is then told to come back.
+"""
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from fastapi import APIRouter, Depends, Header, Path, Query
+from pydantic import BaseModel, ConfigDict
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.responses import JSONResponse, StreamingResponse
+
+from appliance.api.access import Bearer
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Operator, Viewer
+from appliance.api.services import Services
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.moment import MomentError, parse_moment
+from appliance.audit.output import Entry, as_json, as_object
+from appliance.audit.query import Filter, FilterError
+from appliance.audit.record import Severity
+from appliance.audit.schema import json_schema
+from appliance.audit.search import Follower, export, search, show
+from appliance.audit.signatures import KeyUnreadableError
+from appliance.audit.verify import verify
+
+_T = TypeVar("_T")
+_SEARCHES, _EXPORTS = 4, 2
+_PATIENCE_SECONDS = 5.0
+_POLL_SECONDS = 0.2
+_PING_SECONDS = 15
+_STREAM_PAGE = 500
+_LARGEST_PAGE = 1000
+
+RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
+_RECORD_REF = {"$ref": "#/components/schemas/AuditRecord"}
+_PAGE = {
+    "type": "object",
+    "properties": {
+        "records": {"type": "array", "items": _RECORD_REF},
+        "cursor": {"type": ["string", "null"], "description": "of the next page; null: there is none"},
+    },
+    "required": ["records", "cursor"],
+    "additionalProperties": False,
+}
+_SHOWN = {
+    "type": "object",
+    "properties": {
+        "record": _RECORD_REF,
+        "before": {"type": "array", "items": _RECORD_REF},
+        "after": {"type": "array", "items": _RECORD_REF},
+    },
+    "required": ["record", "before", "after"],
+    "additionalProperties": False,
+}
+
+
+class LogFinding(BaseModel):
+    """One thing that is wrong; `first` and `last` are sequences of records, or numbers of checkpoints."""
+
+    model_config = ConfigDict(extra="forbid")
+    kind: str
+    first: int
+    last: int
+    message: str
+
+
+class Verified(BaseModel):
+    """Whether the log is complete and unchanged; the fields are those of `rosrv audit verify --json`."""
+
+    model_config = ConfigDict(extra="forbid")
+    ok: bool
+    log: str
+    records: int
+    first: int
+    last: int
+    removed: int
+    checkpoints: int
+    signed_checkpoints: int
+    signed_through: int
+    unsealed: int
+    key: str | None
+    findings: list[LogFinding]
+
+
+def _wanted(
+    *,
+    decision: Annotated[list[Literal["allow", "deny", "would deny"]] | None, Query()] = None,
+    since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
+    until: Annotated[str | None, Query(max_length=64, description="before this moment")] = None,
+    host: Annotated[str | None, Query(max_length=256, description="of the peer; a glob")] = None,
+    caller_id: Annotated[str | None, Query(max_length=256, description="the name it gave; a glob")] = None,
+    resource: Annotated[
+        str | None, Query(max_length=256, description="topic, service, call…; a glob")
+    ] = None,
+    category: Annotated[str | None, Query(max_length=256)] = None,
+    event: Annotated[str | None, Query(max_length=256)] = None,
+    severity: Annotated[Severity | None, Query(description="this one or a graver one")] = None,
+    rule: Annotated[str | None, Query(max_length=256, description="section or key; a glob")] = None,
+    text: Annotated[
+        str | None, Query(max_length=256, description="anywhere in names, reason, details")
+    ] = None,
+) -> Filter:
+    now = time.time_ns()
+    try:
+        return Filter(
+            decision=tuple(decision or ()),
+            since=None if since is None else parse_moment(since, now),
+            until=None if until is None else parse_moment(until, now),
+            host=host,
+            caller_id=caller_id,
+            resource=resource,
+            category=category,
+            event=event,
+            severity=severity,
+            rule=rule,
+            text=text,
+        )
+    except (MomentError, OverflowError, ValueError) as error:
+        raise ProblemError(422, "bad-input", str(error)) from error
+
+
+Wanted = Annotated[Filter, Depends(_wanted)]
+Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
+
+
+class Desk:
+    """Reads the log in threads, so many at once."""
+
+    def __init__(self, services: Services) -> None:
+        self.path = services.audit_log
+        self.searches = asyncio.Semaphore(_SEARCHES)
+        self.exports = asyncio.Semaphore(_EXPORTS)
+        self.streams = asyncio.Semaphore(services.settings.api_limits.streams)
+        self.verification = asyncio.Semaphore(1)
+
+    async def read(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        """What a function of `appliance.audit` says. Raises `ProblemError`."""
+        async with self.turn(self.searches, "searches of the audit log"):
+            return await self.in_thread(function, *arguments, **named)
+
+    async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        """The same without waiting for a turn."""
+        try:
+            return await asyncio.to_thread(function, *arguments, **named)
+        except FilterError as error:
+            raise ProblemError(422, "bad-input", str(error)) from error
+        except (LogUnreadableError, KeyUnreadableError) as error:
+            raise ProblemError(503, "log-unreadable", str(error)) from error
+
+    @contextlib.asynccontextmanager
+    async def turn(self, turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
+        """Wait a moment for one of so many at once."""
+        try:
+            async with asyncio.timeout(_PATIENCE_SECONDS):
+                await turns.acquire()
+        except TimeoutError:
+            raise ProblemError(
+                503, "busy", f"too many {what} at once: try again", headers={"Retry-After": "5"}
+            ) from None
+        try:
+            yield
+        finally:
+            turns.release()
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix="/v1/audit", tags=["audit"])
+    desk = Desk(services)
+
+    @router.get("", operation_id="search_audit", responses=_json(_PAGE))
+    async def search_audit(
+        bearer: Viewer,  # noqa: ARG001  asked for its role
+        wanted: Wanted,
+        cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
+        limit: Limit = 100,
+        order: Annotated[Literal["newest", "oldest"], Query(description="which comes first")] = "newest",
+    ) -> JSONResponse:
+        """Records that match, a page at a time."""
+        page = await desk.read(search, desk.path, wanted, cursor, limit, newest_first=order == "newest")
+        return JSONResponse({"records": list(map(as_object, page.entries)), "cursor": page.cursor})
+
+    @router.get(
+        "/stream", operation_id="follow_audit", responses=_text("text/event-stream", "Events `record`.")
+    )
+    async def follow_audit(
+        bearer: Viewer,
+        wanted: Wanted,
+        after: Annotated[int | None, Query(ge=0, le=10**18, description="begin after this sequence")] = None,
+        last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", pattern="^[0-9]{1,18}$")] = None,
+    ) -> EventSourceResponse:
+        """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
+
+        Ends when the token does. A browser that reconnects goes on where it was.
+        """
+        start = int(last_event_id) if last_event_id is not None else after
+        follower = await desk.read(Follower, desk.path, wanted, start)
+        if desk.streams.locked():
+            raise ProblemError(
+                503, "busy", "too many clients follow the audit log", headers={"Retry-After": "10"}
+            )
+        return EventSourceResponse(_follow(services, desk, follower, bearer), ping=_PING_SECONDS)
+
+    @router.get("/verify", operation_id="verify_audit", response_model=Verified)
+    async def verify_audit(bearer: Operator) -> JSONResponse:  # noqa: ARG001  asked for its role
+        """Prove that the log is complete and unchanged; for operators, one at a time.
+
+        What the signer remembers is not looked at: `rosrv audit verify` on the machine does that too.
+        """
+        async with desk.turn(desk.verification, "verifications"):
+            return JSONResponse(msgspec.to_builtins(await desk.in_thread(verify, desk.path)))
+
+    @router.get(
+        "/export", operation_id="export_audit", responses=_text("application/x-ndjson", "A record a line.")
+    )
+    async def export_audit(bearer: Viewer, wanted: Wanted) -> StreamingResponse:  # noqa: ARG001  its role
+        """All records that match, oldest first, one JSON object a line."""
+        entries = await desk.read(lambda: _begun(export(desk.path, wanted)))
+        if desk.exports.locked():
+            raise ProblemError(503, "busy", "too many exports at once", headers={"Retry-After": "10"})
+        return StreamingResponse(_lines(entries, desk.exports), media_type="application/x-ndjson")
+
+    @router.get("/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN)
+    async def audit_record(
+        bearer: Viewer,  # noqa: ARG001  asked for its role
+        record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")],
+        neighbours: Annotated[int, Query(ge=0, le=100)] = 5,
+    ) -> JSONResponse:
+        """One record (by id, or by sequence), and what the same host or caller did around it."""
+        shown = await desk.read(show, desk.path, record_id, neighbours)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        around = {"before": list(map(as_object, shown.before)), "after": list(map(as_object, shown.after))}
+        return JSONResponse({"record": as_object(shown.entry), **around})
+
+    return router
+
+
+_UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"description": "There is no such record."}}
+
+
+def _json(schema: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
+
+
+def _text(media_type: str, description: str) -> dict[int | str, dict[str, Any]]:
+    return {200: {"description": description, "content": {media_type: {"schema": {"type": "string"}}}}}
+
+
+async def _follow(
+    services: Services, desk: Desk, follower: Follower, bearer: Bearer
+) -> AsyncIterator[ServerSentEvent]:
+    async with desk.streams:
+        while not services.stopping.is_set():
+            if not services.doorkeeper.still_good(bearer):
+                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+                return
+            entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
+            for entry in entries:
+                yield ServerSentEvent(event="record", id=str(entry.sequence), data=as_json(entry))
+            if not entries:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+
+
+def _begun(entries: Iterator[Entry]) -> Iterator[Entry]:
+    """The same entries, the first of them read: what is wrong with a search is known before the answer begins."""
+    first = next(entries, None)
+    return iter(()) if first is None else _chain(first, entries)
+
+
+def _chain(first: Entry, rest: Iterator[Entry]) -> Iterator[Entry]:
+    yield first
+    yield from rest
+
+
+async def _lines(entries: Iterator[Entry], turns: asyncio.Semaphore) -> AsyncIterator[str]:
+    async with turns:
+        while piece := await asyncio.to_thread(_piece, entries):
+            yield piece
+
+
+def _piece(entries: Iterator[Entry]) -> str:
+    lines = []
+    for entry in entries:
+        lines.append(as_json(entry) + "\n")
+        if len(lines) == _STREAM_PAGE:
+            break
+    return "".join(lines)

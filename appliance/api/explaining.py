@@ -1,0 +1,82 @@
+"""`/v1/policy/explain`: why a request is decided as it is, under the policy in force or another text."""
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+
+from appliance.api.access import Bearer
+from appliance.api.judgement import explanation, word_of
+from appliance.api.policy_models import Explained, LostRule, Question, RuleText
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.channel.admin import PolicyWanted
+from appliance.policy.explain import Explanation
+from appliance.policy.model import Category, Rule
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix="/v1/policy", tags=["policy"])
+
+    async def explained(question: Question, bearer: Bearer) -> Explained:
+        current = await ask(services.control, PolicyWanted(), bearer)
+        text, file = (
+            (question.text, "policy") if question.text is not None else (current["text"], current["file"])
+        )
+        async with services.judging:
+            found = await asyncio.to_thread(
+                explanation,
+                text,
+                file,
+                current,
+                host=question.host,
+                node=question.node,
+                category=question.category,
+                resource=question.resource,
+            )
+        return _explained(found)
+
+    @router.get("/explain", operation_id="explain")
+    async def explain_request(
+        bearer: Viewer,
+        host: Annotated[str, Query(min_length=1, max_length=100, description="an address, or `robot`")],
+        category: Category,
+        resource: Annotated[str, Query(min_length=1, max_length=256)],
+        node: Annotated[
+            str, Query(max_length=256, description="the name it gives, where a node is needed")
+        ] = "",
+    ) -> Explained:
+        """Why the policy in force decides a request as it does."""
+        return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
+
+    @router.post("/explain", operation_id="explain_under")
+    async def explain_under(question: Question, bearer: Viewer) -> Explained:
+        """The same under another text, which is not loaded."""
+        return await explained(question, bearer)
+
+    return router
+
+
+def _rule(rule: Rule) -> RuleText:
+    return RuleText(section=rule.section, key=rule.key, file=rule.file, line=rule.line)
+
+
+def _explained(found: Explanation) -> Explained:
+    request, decision = found.request, found.decision
+    return Explained(
+        host=str(request.host),
+        caller_id=request.caller_id,
+        category=request.category.value,
+        resource=request.resource,
+        decision=word_of(decision),
+        rule=_rule(decision.rule) if decision.rule else None,
+        reason=decision.reason,
+        through=list(found.through),
+        lost=[
+            LostRule(rule=_rule(one.rule), would="allow" if one.grants else "deny", why=one.why)
+            for one in found.lost
+        ],
+        node=_explained(found.node) if found.node is not None else None,
+        allowed=found.allowed,
+    )

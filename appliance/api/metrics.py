@@ -1,0 +1,126 @@
+"""`/metrics`: what is measured, in Prometheus's format."""
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.core import Metric as Family
+from prometheus_client.registry import Collector
+from starlette.responses import Response
+
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.channel.admin import MetricsWanted
+from appliance.metrics import BOUNDS, METRICS, Metric
+
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+_Samples = Iterable[tuple[tuple[str, ...], Any]]
+_TEXT: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Prometheus's text format",
+        "content": {"text/plain": {"schema": {"type": "string"}}},
+    }
+}
+
+
+def routes(services: Services) -> APIRouter:
+    """The route, at the two places where it is looked for."""
+    router = APIRouter(tags=["metrics"])
+
+    async def metrics(bearer: Viewer) -> Response:
+        """What is measured, in Prometheus's text format; docs/metrics.md lists it."""
+        body = await ask(services.control, MetricsWanted(), bearer)
+        body["rest"] = [(labels, count) for labels, count in services.journal.calls.items()]
+        return Response(rendered(body), media_type=CONTENT_TYPE_LATEST)
+
+    for prefix, name in (("", ""), ("/v1", "_v1")):
+        router.add_api_route(
+            f"{prefix}/metrics",
+            metrics,
+            operation_id=f"metrics{name}",
+            responses=_TEXT,
+            response_class=Response,
+        )
+    return router
+
+
+def rendered(body: dict[str, Any]) -> bytes:
+    """Control's answer to `MetricsWanted` as Prometheus reads it."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Once(body))
+    return generate_latest(registry)
+
+
+class _Once(Collector):
+    """Gives the families of one answer."""
+
+    def __init__(self, body: dict[str, Any]) -> None:
+        self._samples = _samples(body)
+
+    def collect(self) -> Iterator[Family]:
+        for metric in METRICS:
+            yield _family(metric, self._samples[metric.name])
+
+
+def _family(metric: Metric, samples: _Samples) -> Family:
+    if metric.kind == "histogram":
+        histogram = HistogramMetricFamily(metric.name, metric.help, labels=metric.labels)
+        for labels, (counts, total) in samples:
+            histogram.add_metric(labels, _buckets(counts), total)
+        return histogram
+    kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
+    family = kind(metric.name, metric.help, labels=metric.labels)
+    for labels, value in samples:
+        family.add_metric(labels, float(value))
+    return family
+
+
+def _buckets(counts: list[int]) -> list[tuple[str, float]]:
+    total, buckets = 0, []
+    for bound, count in zip([*map(str, BOUNDS), "+Inf"], counts, strict=True):
+        total += count
+        buckets.append((bound, float(total)))
+    return buckets
+
+
+def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
+    status = body["status"]
+    policy, audit = status["policy"], status["audit"]
+    relayed = body["relayed"]
+    return {
+        "rosrv_info": [((status["version"],), 1)],
+        "rosrv_start_time_seconds": [((), status["since"])],
+        "rosrv_decisions_total": [((one[0], one[1]), one[2]) for one in body["decisions"]],
+        "rosrv_decision_seconds": [((), body["decision_seconds"])],
+        "rosrv_master_call_seconds": [((one[0],), (one[1], one[2])) for one in body["calls"]],
+        "rosrv_relay_connected": [((), status["relay"] == "connected")],
+        "rosrv_relay_connections": [((kind,), count) for kind, count in body["connections"].items()],
+        "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
+        "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
+        "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_nodes": [((state,), count) for state, count in body["nodes"].items()],
+        "rosrv_registrations": [((kind,), count) for kind, count in body["registrations"].items()],
+        "rosrv_rosmaster_reachable": [((), status["rosmaster"] == "reachable")],
+        "rosrv_delivery_queue": [((), body["queued_deliveries"])],
+        "rosrv_audit_queue": [((), audit["lag_records"])],
+        "rosrv_audit_lag_seconds": [((), audit["lag_seconds"])],
+        "rosrv_audit_failed": [((), audit["failed"] is not None)],
+        "rosrv_policy_revision": [((), policy["revision"])],
+        "rosrv_policy_differs_from_file": [((), policy["differs_from_file"])],
+        "rosrv_process_restarts_total": [((one["role"],), one["restarts"]) for one in status["processes"]],
+        "rosrv_process_resident_bytes": list(_memory(status["processes"])),
+        "rosrv_rest_calls_total": body["rest"],
+    }
+
+
+def _memory(processes: Iterable[dict[str, Any]]) -> Iterator[tuple[tuple[str, ...], float]]:
+    for one in processes:
+        try:
+            pages = Path(f"/proc/{one['pid']}/statm").read_text().split()[1]
+        except OSError:
+            continue  # it ended just now
+        yield (one["role"],), float(int(pages) * _PAGE_BYTES)

@@ -1,0 +1,108 @@
+"""What is measured: every metric by name, and the counters that RVMaster keeps.
+
+`METRICS` is the one list that `/metrics` is made from and docs/metrics.md is generated from
+(`python -m appliance.metrics`). Counting is a few additions on the way of a request; nothing is formatted there.
+Labels have few values: names of calls, categories and roles are ours; topics are those that are registered.
+"""
+
+import bisect
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)  # seconds
+
+
+class Metric(NamedTuple):
+    """One metric; `name` as Prometheus shows it."""
+
+    name: str
+    kind: Literal["counter", "gauge", "histogram"]
+    labels: tuple[str, ...]
+    help: str
+
+
+METRICS = (
+    Metric("rosrv_info", "gauge", ("version",), "1, with the version that runs"),
+    Metric("rosrv_start_time_seconds", "gauge", (), "when RVMaster started, seconds since the epoch"),
+    Metric(
+        "rosrv_decisions_total", "counter", ("category", "outcome"), "decisions: allow, deny or would deny"
+    ),
+    Metric("rosrv_decision_seconds", "histogram", (), "from a request's arrival to its decision"),
+    Metric("rosrv_master_call_seconds", "histogram", ("call",), "from a request's arrival to its answer"),
+    Metric("rosrv_relay_connected", "gauge", (), "1 while there is a relay"),
+    Metric(
+        "rosrv_relay_connections", "gauge", ("kind",), "subscribers (topic) and clients (service) connected"
+    ),
+    Metric("rosrv_relay_messages_total", "counter", ("resource",), "messages relayed, by topic or service"),
+    Metric("rosrv_relay_bytes_total", "counter", ("resource",), "bytes relayed, by topic or service"),
+    Metric(
+        "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
+    ),
+    Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
+    Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),
+    Metric("rosrv_rosmaster_reachable", "gauge", (), "1 while the real ROS Master answers"),
+    Metric("rosrv_delivery_queue", "gauge", (), "calls that wait to be made to nodes"),
+    Metric("rosrv_audit_queue", "gauge", (), "audit records that wait to be on disk"),
+    Metric("rosrv_audit_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
+    Metric("rosrv_audit_failed", "gauge", (), "1 while the audit log cannot be written"),
+    Metric("rosrv_policy_revision", "gauge", (), "revision of the policy in force"),
+    Metric("rosrv_policy_differs_from_file", "gauge", (), "1 while the policy in force is not the file's"),
+    Metric("rosrv_process_restarts_total", "counter", ("role",), "times a process was started again"),
+    Metric("rosrv_process_resident_bytes", "gauge", ("role",), "memory of a process"),
+    Metric("rosrv_rest_calls_total", "counter", ("method", "status"), "REST calls since the api started"),
+)
+
+
+@dataclass(slots=True)
+class Histogram:
+    """How many were at most so long; `counts` has one more place than `BOUNDS`, for those beyond."""
+
+    counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
+    sum: float = 0.0
+
+    def observe(self, seconds: float) -> None:
+        """Count one."""
+        self.counts[bisect.bisect_left(BOUNDS, seconds)] += 1
+        self.sum += seconds
+
+
+class Meter:
+    """The counters of RVMaster, since it started."""
+
+    def __init__(self) -> None:
+        self.decisions: Counter[tuple[str, str]] = Counter()
+        self.decision_seconds = Histogram()
+        self.calls: dict[str, Histogram] = {}
+
+    def decided(self, category: str, outcome: str, seconds: float) -> None:
+        """A decision was made."""
+        self.decisions[category, outcome] += 1
+        self.decision_seconds.observe(seconds)
+
+    def called(self, call: str, seconds: float) -> None:
+        """A call of the table was answered (`call` must not be a stranger's text)."""
+        self.calls.setdefault(call, Histogram()).observe(seconds)
+
+    def values(self) -> dict[str, Any]:
+        """Everything, in plain values."""
+        return {
+            "decisions": [[*labels, count] for labels, count in self.decisions.items()],
+            "decision_seconds": [self.decision_seconds.counts, self.decision_seconds.sum],
+            "calls": [[call, one.counts, one.sum] for call, one in self.calls.items()],
+        }
+
+
+def markdown() -> str:
+    """The generated part of the page on metrics."""
+    lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
+    lines += [
+        f"| `{one.name}` | {one.kind} | {', '.join(f'`{label}`' for label in one.labels) or '-'} | {one.help} |"
+        for one in METRICS
+    ]
+    return "\n".join([*lines, ""])
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())

@@ -1,0 +1,108 @@
+"""A client of the appliance's REST interface, as a script would write it with the standard library.
+
+rest = Rest(appliance.ready["api"], appliance.ready["token"], certificate)
+assert rest.get("/v1/policy").status == 200
+"""
+
+import http.client
+import json
+import ssl
+import urllib.parse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer; header names in lower case."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        """The body as JSON."""
+        return json.loads(self.body)
+
+    @property
+    def etag(self) -> str:
+        """Its ETag."""
+        return self.headers["etag"]
+
+
+class Rest:
+    """Makes requests, each on a connection of its own."""
+
+    def __init__(self, url: str, token: str | None = None, certificate: Path | None = None) -> None:
+        """`certificate` is what an https server is trusted by."""
+        self.url = urllib.parse.urlsplit(url)
+        self.token = token
+        self.certificate = certificate
+
+    def with_token(self, token: str | None) -> "Rest":
+        """The same place, asked by somebody else."""
+        return Rest(self.url.geturl(), token, self.certificate)
+
+    def connect(self, timeout: float = 30) -> http.client.HTTPConnection:
+        """A connection."""
+        assert self.url.hostname is not None
+        if self.url.scheme == "http":
+            return http.client.HTTPConnection(self.url.hostname, self.url.port, timeout=timeout)
+        context = ssl.create_default_context(cafile=self.certificate)
+        return http.client.HTTPSConnection(self.url.hostname, self.url.port, timeout=timeout, context=context)
+
+    def headers(self, given: dict[str, str] | None = None) -> dict[str, str]:
+        """What is sent with every request."""
+        known = {"Authorization": f"Bearer {self.token}"} if self.token is not None else {}
+        return known | (given or {})
+
+    def request(
+        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> Answer:
+        """One request."""
+        connection = self.connect()
+        try:
+            connection.request(method, path, body, self.headers(headers))
+            response = connection.getresponse()
+            names = {name.lower(): value for name, value in response.getheaders()}
+            return Answer(response.status, names, response.read())
+        finally:
+            connection.close()
+
+    def get(self, path: str, **headers: str) -> Answer:
+        """GET; header names with _ for -."""
+        return self.request(
+            "GET", path, None, {name.replace("_", "-"): text for name, text in headers.items()}
+        )
+
+    def post(self, path: str, body: Any = None, *, match: str | None = None) -> Answer:
+        """POST: a text as text/plain, anything else as JSON; `match` is If-Match."""
+        headers = {} if match is None else {"If-Match": match}
+        if isinstance(body, str):
+            return self.request("POST", path, body.encode(), headers | {"Content-Type": "text/plain"})
+        headers["Content-Type"] = "application/json"
+        return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
+
+    def events(self, path: str, timeout: float = 30, **headers: str) -> Iterator[dict[str, str]]:
+        """Server-sent events, one dict of its fields each; the first, `{}`, says that the stream is open."""
+        connection = self.connect(timeout)
+        try:
+            given = {name.replace("_", "-"): text for name, text in headers.items()}
+            connection.request("GET", path, None, self.headers(given))
+            response = connection.getresponse()
+            assert response.status == 200, response.read()
+            yield {}
+            event: dict[str, str] = {}
+            while line := response.readline():
+                text = line.decode().rstrip("\r\n")
+                if not text and event:
+                    yield event
+                    event = {}
+                elif text and not text.startswith(":"):
+                    name, _colon, value = text.partition(": ")
+                    event[name] = value
+        finally:
+            connection.close()
