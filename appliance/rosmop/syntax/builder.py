@@ -206,8 +206,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def type(self, meta: Meta, children: list[Any]) -> tree.TypeName:
         core = next(child for child in children if isinstance(child, tree.TypeName))
-        constant = core.constant or "const" in children
-        return tree.TypeName(self.at(meta), core.name, core.element, constant, core.pointer, core.reference)
+        constant, static = core.constant or "const" in children, "static" in children
+        return replace(core, position=self.at(meta), constant=constant, static=static)
 
     def qualifier(self, meta: Meta, children: list[Any]) -> str:
         del meta
@@ -463,7 +463,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
 
 def _referenced(kind: tree.TypeName) -> tree.TypeName:
-    return tree.TypeName(kind.position, kind.name, kind.element, kind.constant, kind.pointer, reference=True)
+    return replace(kind, reference=True)
 
 
 def _is_word(child: Any, kind: str) -> bool:

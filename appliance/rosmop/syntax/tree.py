@@ -31,6 +31,7 @@ class TypeName(Node):
     constant: bool = False
     pointer: bool = False
     reference: bool = False
+    static: bool = False
 
 
 @dataclass(frozen=True)

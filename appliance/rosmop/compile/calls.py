@@ -1,0 +1,289 @@
+"""Calls as code: macros of rosconsole, the library, helper functions, member functions, constructors."""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+from appliance.rosmop.compile import members
+from appliance.rosmop.compile.conversion import condition, convert, number
+from appliance.rosmop.compile.library import LIBRARY, Arguments, find_function
+from appliance.rosmop.compile.output import Stream, formatted
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.scope import HelperFunction, Scope
+from appliance.rosmop.compile.storing import require_place, store
+from appliance.rosmop.positions import Position
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.messages import nearest, shown
+from appliance.rosmop.types.resolve import named_type, record
+
+ValueOf = Callable[[Scope, tree.Expression], Value]
+
+_MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
+_REFUSED = {
+    "system": "there are no programs to start",
+    "fopen": "there are no files",
+    "malloc": "there are no pointers; use a `std::vector`",
+    "free": "there are no pointers",
+    "exit": "an action cannot end the program; write `return;`",
+    "sleep": "an action must not wait; use an event `every …`",
+    "usleep": "an action must not wait; use an event `every …`",
+    "rand": "verdicts are functions of what was received; there is no chance in them",
+    "time": "write `ros::Time::now()`",
+}
+
+
+def call(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
+    """A call of anything."""
+    callee = node.callee
+    if isinstance(callee, tree.Member):
+        base = value_of(scope, callee.base)
+        arguments = [value_of(scope, argument) for argument in node.arguments]
+        at = (node.position, scope.site(node))
+        return members.call(members.Invocation(scope, base, callee.name, arguments, at))
+    if not isinstance(callee, tree.Name):
+        raise SpecificationError.at(node.position, "only functions can be called")
+    return _named(scope, node, callee.parts, value_of)
+
+
+def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: ValueOf) -> Value:
+    function = scope.names.functions.get(parts[0]) if len(parts) == 1 else None
+    if function is not None:
+        return _helper(scope, node, function, value_of)
+    macro = _MACRO.match(parts[0]) if len(parts) == 1 else None
+    if macro is not None:
+        return _macro(scope, node, macro, value_of)
+    if parts in (("printf",), ("std", "printf"), ("puts",)):
+        return _log(scope, node, "INFO", node.arguments, value_of)
+    if parts[-2:] == ("Time", "now"):
+        if node.arguments:
+            raise SpecificationError.at(node.position, "`now` takes no argument")
+        return Value(kinds.TIME, f"{scope.context}.turn.now", node.position)
+    library = find_function(parts)
+    if library is not None:
+        values = [value_of(scope, argument) for argument in node.arguments]
+        return library(Arguments(scope, parts, values, node.position, scope.site(node)))
+    kind = named_type(parts)
+    if kind is None and len(parts) == 2 and parts[0] not in ("std", "ros"):
+        kind = record(node.position, "/".join(parts), scope.messages)
+    if kind is None:
+        raise _unknown(scope, node, parts)
+    return construct(scope, node.position, kind, node.arguments, value_of)
+
+
+def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> SpecificationError:
+    name = "::".join(parts)
+    if parts[-1] in _REFUSED:
+        return SpecificationError.at(
+            node.position, f"there is no function {shown(name)}: {_REFUSED[parts[-1]]}"
+        )
+    owners = [other.name for other in scope.shared.specifications if parts[0] in other.functions]
+    if owners and len(parts) == 1:
+        return SpecificationError.at(
+            node.position,
+            f"{shown(name)} is a function of {owners[0]}; functions belong to their specification",
+        )
+    known = [*scope.names.functions, *LIBRARY, "printf", "ROS_INFO", "ROS_WARN", "ROS_ERROR"]
+    hint = nearest(parts[-1], known)
+    return SpecificationError.at(
+        node.position, f"there is no function {shown(name)}{hint if 'mean' in hint else ''}"
+    )
+
+
+# Helper functions
+
+
+def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: ValueOf) -> Value:
+    if len(node.arguments) != len(function.parameters):
+        raise SpecificationError.at(
+            node.position,
+            f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
+        )
+    codes, targets = [], []
+    for argument, parameter in zip(node.arguments, function.parameters, strict=True):
+        value = value_of(scope, argument)
+        if parameter in function.references:
+            targets.append(_referenced(value, parameter.type, function.name))
+            codes.append(value.code)
+        elif parameter.constant and value.type == parameter.type:
+            codes.append(value.code)
+        else:
+            codes.append(convert(scope, value, parameter.type, scope.site(argument)))
+    if function.recursive:
+        codes.append("n + 1" if scope.recursive else "0")
+    code = f"{function.code}({', '.join(codes)})"
+    if targets:
+        result = scope.temporary()
+        stores = [store(scope, target, f"{result}[{i}]") for i, target in enumerate(targets, 1)]
+        code = f"(({result} := {code}), {', '.join(stores)}, {result}[0])[-1]"
+    return Value(function.result, code, node.position, pure=False)
+
+
+def _referenced(value: Value, kind: kinds.Type, name: str) -> Value:
+    require_place(value, f"a reference parameter of `{name}`")
+    if value.type != kind:
+        raise SpecificationError.at(
+            value.position, f"`{name}` takes a reference to {kind}; this is {value.type}"
+        )
+    return value
+
+
+# Output
+
+
+def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueOf) -> Value:
+    level, stream, variant = macro.groups()
+    arguments = list(node.arguments)
+    guard = ""
+    if variant is not None and variant != "_ONCE":
+        if not arguments:
+            raise SpecificationError.at(node.position, f"`{macro[0]}` needs a first argument")
+        first = value_of(scope, arguments.pop(0))
+        if variant == "_COND":
+            guard = condition(first)
+        elif variant == "_THROTTLE":
+            seconds = number(convert(scope, first, kinds.DOUBLE), kinds.DOUBLE, kinds.DOUBLE)
+            guard = f"{scope.context}.throttle({seconds}, {scope.site(node)})"
+    elif variant == "_ONCE":
+        guard = f"{scope.context}.throttle(c_inf, {scope.site(node)})"
+    if stream:
+        if len(arguments) != 1:
+            raise SpecificationError.at(node.position, f"`{macro[0]}` takes what is printed: `a << b`")
+        value = streamed(scope, node, level, arguments[0], value_of)
+    else:
+        value = _log(scope, node, level, tuple(arguments), value_of)
+    code = f"({value.code} if {guard} else None)" if guard else value.code
+    return Value(kinds.VOID, code, node.position, pure=False)
+
+
+def _log(
+    scope: Scope, node: tree.Call, level: str, arguments: Sequence[tree.Expression], value_of: ValueOf
+) -> Value:
+    if not arguments:
+        raise SpecificationError.at(node.position, "there is nothing to print; write a text")
+    template, *rest = (value_of(scope, argument) for argument in arguments)
+    text = formatted(scope, template, rest)
+    code = f"{scope.context}.log({level!r}, {text}, {scope.site(node)})"
+    return Value(kinds.VOID, code, node.position, pure=False)
+
+
+def stream_of(node: tree.Expression) -> str | None:
+    """The level of a statement `std::cout << …` or `std::cerr << …`, None for another."""
+    if not isinstance(node, tree.Binary):
+        return None
+    while isinstance(node, tree.Binary) and node.operator == "<<":
+        node = node.left
+    if not isinstance(node, tree.Name) or node.parts[:-1] not in ((), ("std",)):
+        return None
+    return {"cout": "INFO", "cerr": "ERROR", "clog": "INFO"}.get(node.parts[-1])
+
+
+def streamed(
+    scope: Scope,
+    node: tree.Node,
+    level: str,
+    chain: tree.Expression,
+    value_of: ValueOf,
+    *,
+    headed: bool = False,
+) -> Value:
+    """Code that prints `a << b << c`; `headed` if the first is the stream itself."""
+    parts: list[tree.Expression] = []
+    while isinstance(chain, tree.Binary) and chain.operator == "<<":
+        parts.append(chain.right)
+        chain = chain.left
+    parts += [] if headed else [chain]
+    stream = Stream(scope, scope.site(node))
+    pieces = [_piece(scope, stream, part, value_of) for part in reversed(parts)]
+    code = f"{scope.context}.log({level!r}, p_join(({''.join(f'{piece}, ' for piece in pieces if piece)})), "
+    return Value(kinds.VOID, f"{code}{scope.site(node)})", node.position, pure=False)
+
+
+def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> str | None:
+    if isinstance(part, tree.Name) and part.parts[-1] == "endl":
+        return "b'\\n'"
+    if isinstance(part, tree.Call) and isinstance(part.callee, tree.Name):
+        name, arguments = part.callee.parts[-1], part.arguments
+        if name == "setprecision" and len(arguments) == 1:
+            stream.manipulated(part.callee, value_of(scope, arguments[0]))
+            return None
+    return None if stream.manipulated(part, None) else stream.piece(value_of(scope, part))
+
+
+# Constructors
+
+
+def construct(
+    scope: Scope,
+    position: Position,
+    kind: kinds.Type,
+    arguments: Sequence[tree.Expression],
+    value_of: ValueOf,
+) -> Value:
+    """`type(arguments)`."""
+    if not arguments:
+        return Value(kind, scope.codecs.zero(kind), position)
+    values = [value_of(scope, argument) for argument in arguments if not isinstance(argument, tree.Elements)]
+    site = scope.lines.site
+    if isinstance(kind, kinds.Vector):
+        return Value(kind, _vector(scope, kind, arguments, values, site), position)
+    if isinstance(kind, kinds.Time | kinds.Duration) and values and kinds.is_number(values[0].type):
+        return Value(kind, _moment(kind, values, site), position)
+    if isinstance(kind, kinds.String) and len(values) == 2:
+        count = convert(scope, values[0], kinds.ULONG)
+        character = convert(scope, values[1], kinds.CHAR)
+        return Value(kind, f"e_repeat({scope.context}, {count}, {character}, {site})", position)
+    if len(arguments) != 1 or len(values) != 1 or isinstance(kind, kinds.Void):
+        raise SpecificationError.at(position, f"{kind} cannot be made from this")
+    return Value(kind, convert(scope, values[0], kind), position, pure=values[0].pure)
+
+
+def _vector(
+    scope: Scope, kind: kinds.Vector, arguments: Sequence[tree.Expression], values: Sequence[Value], site: int
+) -> str:
+    from appliance.rosmop.compile.expressions import elements  # noqa: PLC0415  vectors of vectors are expressions
+
+    if len(arguments) == 1 and isinstance(arguments[0], tree.Elements):
+        return elements(scope, arguments[0], kind)
+    if len(values) == 1 and isinstance(values[0].type, kinds.Vector):
+        return convert(scope, values[0], kind, site)
+    codecs = scope.codecs
+    if not values or len(values) > 2 or not kinds.is_number(values[0].type):
+        raise SpecificationError.at(
+            arguments[0].position, f"a {kind} is made from a size, and a value for all"
+        )
+    count = number(values[0].code, values[0].type, kinds.ULONG)
+    width = codecs.width(kind.element)
+    if len(values) == 1:
+        return f"l_filled({scope.context}, {count}, {codecs.maker(kind.element)}, {width}, {site})"
+    value = convert(scope, values[1], kind.element, site)
+    copied = codecs.copy(kind.element, scope.context, "e", site)
+    return f"e_fill({scope.context}, {count}, {value}, lambda e: {copied}, {width}, {site})"
+
+
+def _moment(kind: kinds.Type, values: Sequence[Value], site: int) -> str:
+    limit = "m_time" if isinstance(kind, kinds.Time) else "m_duration"
+    if len(values) == 1:
+        return f"{limit}(m_nanoseconds({values[0].code}, {site}), {site})"
+    if len(values) != 2:
+        raise SpecificationError.at(values[2].position, f"{kind} takes seconds, or seconds and nanoseconds")
+    second, nano = (number(value.code, value.type, kinds.LONG) for value in values)
+    return f"{limit}({second} * 1000000000 + {nano}, {site})"
+
+
+def limits_of(kind: kinds.Type) -> Mapping[str, int | float]:
+    """What `std::numeric_limits` says of a type."""
+    if isinstance(kind, kinds.Integer):
+        return {"min": kind.least, "max": kind.most, "lowest": kind.least}
+    if isinstance(kind, kinds.Floating):
+        large = 1.7976931348623157e308 if kind.bits == 64 else 3.4028234663852886e38
+        return {
+            "max": large,
+            "lowest": -large,
+            "min": 2.2250738585072014e-308 if kind.bits == 64 else 1.1754943508222875e-38,
+            "epsilon": 2.220446049250313e-16 if kind.bits == 64 else 1.1920928955078125e-07,
+            "infinity": math.inf,
+            "quiet_NaN": math.nan,
+        }
+    return {}

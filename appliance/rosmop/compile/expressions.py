@@ -1,0 +1,335 @@
+"""Expressions as code. One function for each kind of expression of `syntax/tree.py`; types are checked here."""
+
+import re
+from collections.abc import Callable, Mapping
+
+from appliance.rosmop.compile import calls, members, operators, storing
+from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
+from appliance.rosmop.compile.library import CONSTANTS
+from appliance.rosmop.compile.places import CharacterPlace, Value, VariablePlace
+from appliance.rosmop.compile.scope import Scope, Variable
+from appliance.rosmop.runtime.numbers import f32
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+from appliance.rosmop.types.messages import PRIMITIVES, UnknownNameError, shown
+from appliance.rosmop.types.resolve import resolve
+
+_NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]+|[0-9.]+(?:[eE][+-]?[0-9]+)?)([uUlLfF]*)\Z")
+_MAX_DIGITS = 400
+
+
+def value_of(scope: Scope, node: tree.Expression) -> Value:
+    """The value of an expression; refuses what has no meaning."""
+    return _KINDS[type(node)](scope, node)
+
+
+def converted(scope: Scope, node: tree.Expression, target: Type) -> str:
+    """Code for an expression as a value of the target type; `{…}` makes a vector."""
+    if isinstance(node, tree.Elements):
+        return elements(scope, node, target)
+    return convert(scope, value_of(scope, node), target, scope.site(node))
+
+
+def elements(scope: Scope, node: tree.Elements, target: Type) -> str:
+    """Code for `{a, b, c}` as a vector."""
+    if not isinstance(target, kinds.Vector):
+        if len(node.items) == 1:
+            return converted(scope, node.items[0], target)
+        if not node.items:
+            return scope.codecs.zero(target)
+        raise SpecificationError.at(
+            node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
+        )
+    if target.length is not None and len(node.items) > target.length:
+        raise SpecificationError.at(
+            node.items[target.length].position, f"more than the {target.length} elements of the array"
+        )
+    items = [converted(scope, item, target.element) for item in node.items]
+    missing = 0 if target.length is None else target.length - len(items)
+    code = f"[{', '.join(items)}]"
+    if missing:
+        rest = scope.codecs.maker(kinds.Vector(target.element, missing))
+        code = f"({code} + {rest}())"
+    return code
+
+
+def literal_number(node: tree.Number) -> Value:
+    """A number literal, with the type C++ gives it."""
+    found = _NUMBER.match(node.text)
+    if found is None or len(node.text) > _MAX_DIGITS or found[1].count(".") > 1:
+        raise SpecificationError.at(node.position, f"{shown(node.text)} is no number")
+    text, suffix = found[1], found[2].lower()
+    if not text.lower().startswith("0x") and re.search(r"[.eE]", text):
+        return _floating(node, float(text), suffix)
+    if "f" in suffix:
+        raise SpecificationError.at(node.position, f"{shown(node.text)} is no number; write `{text}.0f`")
+    return _integer(node, text, suffix)
+
+
+def _floating(node: tree.Number, value: float, suffix: str) -> Value:
+    if suffix not in ("", "f", "l"):
+        raise SpecificationError.at(node.position, f"{shown(node.text)} is no number")
+    if suffix == "f":
+        return constant_value(node.position, kinds.FLOAT, f32(value))
+    return constant_value(node.position, kinds.DOUBLE, value)
+
+
+def _integer(node: tree.Number, text: str, suffix: str) -> Value:
+    decimal = text == "0" or text[0] != "0"
+    try:
+        value = int(text, 10 if decimal else 16 if text[1:2] in ("x", "X") else 8)
+    except ValueError:
+        raise SpecificationError.at(
+            node.position, f"{shown(node.text)} is no number; one that begins with 0 is octal"
+        ) from None
+    candidates: list[kinds.Integer] = [kinds.INT, kinds.UINT, kinds.LONG, kinds.ULONG]
+    if "l" in suffix:
+        candidates = candidates[2:]
+    candidates = [
+        kind for kind in candidates if not (kind.signed if "u" in suffix else decimal and not kind.signed)
+    ]
+    for kind in candidates:
+        if value <= kind.most:
+            return constant_value(node.position, kind, value)
+    raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
+
+
+# Each kind of expression
+
+
+def _number(scope: Scope, node: tree.Expression) -> Value:
+    del scope
+    assert isinstance(node, tree.Number)  # noqa: S101  so says the table at the end
+    return literal_number(node)
+
+
+def _text(scope: Scope, node: tree.Expression) -> Value:
+    del scope
+    assert isinstance(node, tree.Text)  # noqa: S101
+    return constant_value(node.position, kinds.STRING, node.value)
+
+
+def _character(scope: Scope, node: tree.Expression) -> Value:
+    del scope
+    assert isinstance(node, tree.Character)  # noqa: S101
+    return constant_value(node.position, kinds.CHAR, node.value)
+
+
+def _name(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Name)  # noqa: S101
+    parts = node.parts
+    if parts == ("MESSAGE",):
+        return _message(scope, node)
+    if len(parts) == 1:
+        variable = scope.find(parts[0], node.position)
+        if variable is not None:
+            return read(variable, node)
+    if parts in CONSTANTS:
+        kind, constant = CONSTANTS[parts]
+        return constant_value(node.position, kind, constant)
+    if len(parts) == 3:
+        return _message_constant(scope, node)
+    if len(parts) == 1 and parts[0] in scope.names.functions:
+        raise SpecificationError.at(node.position, f"{shown(parts[0])} is a function; write `{parts[0]}(…)`")
+    name = "::".join(parts)
+    if parts[-1] in ("cout", "cerr", "endl"):
+        raise SpecificationError.at(
+            node.position, f"{shown(name)} stands at the start of a statement, or after `<<`"
+        )
+    raise scope.unknown(name, node.position)
+
+
+def read(variable: Variable, node: tree.Node) -> Value:
+    """The value of a variable."""
+    variable.used = True
+    if variable.alias is not None:
+        alias = variable.alias
+        return Value(
+            alias.type, alias.code, node.position, VariablePlace(variable), owned=False, pure=alias.pure
+        )
+    return Value(variable.type, variable.code, node.position, VariablePlace(variable), owned=False)
+
+
+def _message(scope: Scope, node: tree.Expression) -> Value:
+    if scope.read_message is None or scope.message_type is None:
+        hint = {
+            "handler": "a handler has no message; copy it in the action: `v = MESSAGE;`",
+            "timer": "a timer has no message",
+            "init": "there is no message yet",
+            "function": "a function has no message; pass it what it needs",
+        }.get(scope.role, "there is no message here")
+        raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
+    return Value(kinds.Record(scope.message_type), scope.read_message(), node.position)
+
+
+def _message_constant(scope: Scope, node: tree.Name) -> Value:
+    """`package::Type::NAME`."""
+    package, name, constant = node.parts
+    try:
+        found = scope.messages.constant(f"{package}/{name}", constant)
+    except UnknownNameError as error:
+        raise SpecificationError.at(node.position, str(error)) from None
+    value = found.value.encode("utf-8", "surrogateescape") if isinstance(found.value, str) else found.value
+    return constant_value(node.position, PRIMITIVES[found.type], value)
+
+
+def _unary(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Unary)  # noqa: S101
+    return operators.unary(node.operator, value_of(scope, node.operand), node.position, scope.site(node))
+
+
+def _step(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Step)  # noqa: S101
+    target = value_of(scope, node.target)
+    storing.require_place(target, f"`{node.operator}`")
+    if not target.pure:
+        raise SpecificationError.at(
+            node.target.position, "too much in one step; put the index into a variable first"
+        )
+    one = constant_value(node.position, kinds.INT, 1)
+    operands = operators.Operands(scope, node.position, target, one, scope.site(node))
+    changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
+    stored = storing.store(scope, target, changed)
+    code = stored if node.prefix else f"({target.code}, {stored})[0]"
+    return Value(target.type, code, node.position, pure=False)
+
+
+def _binary(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Binary)  # noqa: S101
+    left, right = value_of(scope, node.left), value_of(scope, node.right)
+    return operators.binary(
+        node.operator, operators.Operands(scope, node.position, left, right, scope.site(node))
+    )
+
+
+def _assign(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Assign)  # noqa: S101
+    target, code = assignment(scope, node)
+    return Value(target.type, storing.store(scope, target, code), node.position, owned=False, pure=False)
+
+
+def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
+    """The target of an assignment, and code for the value it gets."""
+    if node.target == tree.Name(node.position, ("MESSAGE",)):
+        raise SpecificationError.at(
+            node.position, "`MESSAGE` cannot be assigned; bind the fields you want to change"
+        )
+    target = value_of(scope, node.target)
+    storing.require_place(target, f"`{node.operator}`")
+    if node.operator == "=":
+        return target, converted(scope, node.value, target.type)
+    if not target.pure:
+        raise SpecificationError.at(
+            node.target.position, "too much in one step; put the index into a variable first"
+        )
+    value = value_of(scope, node.value)
+    operands = operators.Operands(scope, node.position, target, value, scope.site(node))
+    return target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
+
+
+def _conditional(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Conditional)  # noqa: S101
+    test = condition(value_of(scope, node.condition))
+    yes, no = value_of(scope, node.yes), value_of(scope, node.no)
+    if kinds.is_number(yes.type) and kinds.is_number(no.type):
+        kind = yes.type if yes.type == no.type else kinds.common(yes.type, no.type)
+        codes = [number(each.code, each.type, kind) for each in (yes, no)]
+    elif kinds.convertible(no.type, yes.type):
+        kind = kinds.STRING if isinstance(yes.type, kinds.Characters) else yes.type
+        codes = [convert(scope, each, kind) if kinds.is_scalar(kind) else each.code for each in (yes, no)]
+    else:
+        raise SpecificationError.at(
+            no.position, f"`?:` between {yes.type} and {no.type}; make them the same type"
+        )
+    code = f"({codes[0]} if {test} else {codes[1]})"
+    return Value(kind, code, node.position, owned=yes.owned and no.owned, pure=yes.pure and no.pure)
+
+
+def _sequence(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Sequence)  # noqa: S101
+    values = [value_of(scope, item) for item in node.items]
+    code = f"({', '.join(value.code for value in values)})[-1]"
+    return Value(values[-1].type, code, node.position, owned=values[-1].owned, pure=False)
+
+
+def _index(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Index)  # noqa: S101
+    base, index = value_of(scope, node.base), value_of(scope, node.index)
+    site = scope.site(node)
+    if isinstance(base.type, kinds.Vector):
+        return members.element_value(scope, base, index, node.position, site)
+    if isinstance(base.type, kinds.String | kinds.Characters):
+        code = convert(scope, index, kinds.LONG)
+        place = CharacterPlace(base, code, site) if base.place is not None else None
+        read_code = f"e_character({base.code}, {code}, {site})"
+        return Value(kinds.CHAR, read_code, node.position, place, pure=base.pure and index.pure)
+    raise SpecificationError.at(node.position, f"{base.type} has no elements")
+
+
+def _member(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Member)  # noqa: S101
+    return members.field(scope, value_of(scope, node.base), node.name, node.position, scope.site(node))
+
+
+def _cast(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Cast)  # noqa: S101
+    target = resolve(node.type, scope.messages)
+    value = value_of(scope, node.operand)
+    return Value(target, convert(scope, value, target), node.position, pure=value.pure)
+
+
+def _call(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Call)  # noqa: S101
+    return calls.call(scope, node, value_of)
+
+
+def _construct(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Construct)  # noqa: S101
+    return calls.construct(scope, node.position, resolve(node.type, scope.messages), node.arguments, value_of)
+
+
+def _new(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.NewCharacters)  # noqa: S101
+    size = convert(scope, value_of(scope, node.size), kinds.ULONG)
+    code = f"e_repeat({scope.context}, {size}, 0, {scope.site(node)})"
+    return Value(kinds.CHARACTERS, code, node.position, pure=False)
+
+
+def _limit(scope: Scope, node: tree.Expression) -> Value:
+    assert isinstance(node, tree.Limit)  # noqa: S101
+    kind = resolve(node.type, scope.messages)
+    found = calls.limits_of(kind).get(node.name)
+    if found is None:
+        raise SpecificationError.at(node.position, f"`numeric_limits<{kind}>::{node.name}()` is not known")
+    return constant_value(node.position, kind, found)
+
+
+def _elements(scope: Scope, node: tree.Expression) -> Value:
+    del scope
+    raise SpecificationError.at(
+        node.position, "`{…}` has no type here; write `std::vector<type>{…}` or assign it to a variable"
+    )
+
+
+_KINDS: Mapping[type[tree.Expression], Callable[[Scope, tree.Expression], Value]] = {
+    tree.Number: _number,
+    tree.Text: _text,
+    tree.Character: _character,
+    tree.Name: _name,
+    tree.Unary: _unary,
+    tree.Step: _step,
+    tree.Binary: _binary,
+    tree.Assign: _assign,
+    tree.Conditional: _conditional,
+    tree.Sequence: _sequence,
+    tree.Index: _index,
+    tree.Member: _member,
+    tree.Cast: _cast,
+    tree.Call: _call,
+    tree.Construct: _construct,
+    tree.NewCharacters: _new,
+    tree.Limit: _limit,
+    tree.Elements: _elements,
+}

@@ -1,0 +1,181 @@
+"""Helper functions, `init`, first values and handlers as Python functions."""
+
+from collections.abc import Iterable, Mapping
+
+from appliance.rosmop.compile.loops import charge
+from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames, Variable
+from appliance.rosmop.compile.statements import initial, write
+from appliance.rosmop.runtime.context import MAX_CALLS
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.messages import shown
+from appliance.rosmop.types.resolve import resolve
+
+_TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
+
+
+def declare_variables(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Give the shared variables of a specification their names and types."""
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            try:
+                variable = _shared_variable(shared, names, declaration, declarator)
+            except SpecificationError as error:
+                shared.findings += error.findings
+                continue
+            names.variables[declarator.name] = variable
+            shared.measures[variable.code] = shared.codecs.measure(variable.type)
+
+
+def _shared_variable(
+    shared: Shared, names: SpecificationNames, declaration: tree.Declaration, declarator: tree.Declarator
+) -> Variable:
+    if declarator.name in names.variables or declarator.name in _TAKEN:
+        raise SpecificationError.at(declarator.position, f"{shown(declarator.name)} is declared twice")
+    scope = Scope(shared, names, "init")
+    scope.lines.site = scope.site(declaration)
+    if declaration.type.name == ("auto",):
+        raise SpecificationError.at(
+            declaration.position, "a shared variable needs a type; `auto` is for local ones"
+        )
+    kind, _ = initial(scope, declaration.type, tree.Declarator(
+        declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array,
+        value=declarator.value if declarator.is_array and declarator.size is None else None,
+    ))  # fmt: skip
+    return Variable(
+        declarator.name,
+        kind,
+        shared.module.fresh("g"),
+        declarator.position,
+        shared=True,
+        constant=declaration.type.constant,
+    )
+
+
+def compile_start(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> str:
+    """Write the function that gives the shared variables their first values and runs `init`."""
+    scope = Scope(shared, names, "init")
+    scope.drop_refused = "there is no message yet"
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            variable = names.variables.get(declarator.name)
+            if variable is None:
+                continue
+            try:
+                _first_value(scope, declaration, declarator, variable)
+            except SpecificationError as error:
+                shared.findings += error.findings
+    for init in specification.inits:
+        write(scope, init.body)
+    if len(specification.inits) > 1:
+        raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
+    function = shared.module.fresh("i")
+    _add(scope, f"def {function}():")
+    return function
+
+
+def _first_value(
+    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, variable: Variable
+) -> None:
+    with scope.at(declarator):
+        _, code = initial(scope, declaration.type, declarator)
+        scope.written.add(variable.code)
+        scope.lines.add(f"{variable.code} = {code}")
+
+
+def declare_functions(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Give the helper functions of a specification their names and types."""
+    for node in specification.functions:
+        try:
+            names.functions[node.name] = _signature(shared, names, node)
+        except SpecificationError as error:
+            shared.findings += error.findings
+    for function in names.functions.values():
+        function.recursive = _calls_itself(function, names.functions)
+
+
+def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -> HelperFunction:
+    if node.name in names.functions or node.name in _TAKEN:
+        raise SpecificationError.at(node.position, f"the function {shown(node.name)} is declared twice")
+    result = kinds.VOID if node.type is None else resolve(node.type, shared.messages)
+    parameters = []
+    references = []
+    for parameter in node.parameters:
+        kind = resolve(parameter.type, shared.messages)
+        variable = Variable(
+            parameter.name,
+            kind,
+            shared.module.fresh("v"),
+            parameter.position,
+            constant=parameter.type.constant and parameter.type.reference,
+        )
+        parameters.append(variable)
+        if parameter.type.reference and not parameter.type.constant:
+            references.append(variable)
+    return HelperFunction(
+        node.name, shared.module.fresh("h"), result, tuple(parameters), tuple(references), node
+    )
+
+
+def _calls_itself(function: HelperFunction, functions: Mapping[str, HelperFunction]) -> bool:
+    seen: set[str] = set()
+    waiting = [function]
+    while waiting:
+        for name in _called(waiting.pop().node.body):
+            if name == function.name:
+                return True
+            if name in functions and name not in seen:
+                seen.add(name)
+                waiting.append(functions[name])
+    return False
+
+
+def _called(node: tree.Node) -> Iterable[str]:
+    waiting: list[object] = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Node):
+            if isinstance(current, tree.Call) and isinstance(current.callee, tree.Name):
+                yield current.callee.parts[-1]
+            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+
+
+def compile_function(shared: Shared, names: SpecificationNames, function: HelperFunction) -> None:
+    """Write a helper function."""
+    scope = Scope(shared, names, "function")
+    scope.drop_refused = "a function has no message; return a `bool` and drop in the action"
+    scope.result, scope.references, scope.recursive = function.result, function.references, function.recursive
+    for variable in function.parameters:
+        scope.declare(variable)
+    with scope.at(function.node):
+        charge(scope, function.node.body)
+        if function.recursive:
+            site = scope.lines.site
+            scope.lines.add(f"if n > {MAX_CALLS}: e_too_deep({site}, {function.name!r})")
+        write(scope, function.node.body)
+        zero = "None" if isinstance(function.result, kinds.Void) else scope.codecs.zero(function.result)
+        handed = "".join(f", {variable.code}" for variable in function.references)
+        scope.lines.add(f"return ({zero}{handed})" if handed else f"return {zero}")
+    parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
+    _add(scope, f"def {function.code}({', '.join(parameters)}):")
+
+
+def compile_handler(
+    shared: Shared, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
+) -> str:
+    """Write the function of a handler; returns its name."""
+    scope = Scope(shared, names, "handler")
+    scope.drop_refused = drop_refused
+    write(scope, handler.body)
+    function = shared.module.fresh("j")
+    _add(scope, f"def {function}(m):")
+    return function
+
+
+def _add(scope: Scope, header: str) -> None:
+    lines = scope.lines.lines or [("    pass", -1)]
+    written = [(f"    global {', '.join(sorted(scope.written))}", -1)] if scope.written else []
+    scope.module.add([(header, -1), *written, *lines])

@@ -1,0 +1,281 @@
+"""Functions that every specification can call: `<math.h>`, `std::min`, `std::to_string`, `strcpy`, …"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+
+from appliance.rosmop.compile.conversion import convert, number, require_number, wrapped
+from appliance.rosmop.compile.output import formatted
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.compile.storing import store
+from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime import numbers, texts
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+
+FUNCTIONS: dict[str, Callable[..., object]] = {
+    **{f"h_{name}": function for name, (_, function) in numbers.MATH.items()},
+    "h_abs": abs,
+    "h_min": min,
+    "h_max": max,
+    "h_isnan": math.isnan,
+    "h_isinf": math.isinf,
+    "h_isfinite": math.isfinite,
+    "h_to_integer": lambda value: b"%d" % value,
+    "h_to_floating": lambda value: b"%f" % value,
+    "h_parse": texts.parse_integer,
+    "h_parse_floating": texts.parse_floating,
+    "h_atoi": texts.lenient_integer,
+    "h_atof": texts.lenient_floating,
+    "h_filled": texts.filled,
+    "h_filled_at_most": texts.filled_at_most,
+    "h_extended": texts.extended,
+    "h_compare": texts.compare,
+    "h_len": len,
+}
+
+
+class Arguments:
+    """The arguments of a call, where it stands, and what it is called."""
+
+    def __init__(
+        self, scope: Scope, parts: tuple[str, ...], values: Sequence[Value], position: Position, site: int
+    ) -> None:
+        self.scope = scope
+        self.name = "::".join(parts)
+        self.standard = parts[0] == "std"
+        self.values = values
+        self.position = position
+        self.site = site
+
+    def count(self, least: int, most: int | None = None) -> None:
+        """Refuse another number of arguments."""
+        most = least if most is None else most
+        if not least <= len(self.values) <= most:
+            wanted = str(least) if most == least else f"{least} to {most}"
+            raise SpecificationError.at(
+                self.position, f"`{self.name}` takes {wanted} argument(s), not {len(self.values)}"
+            )
+
+    def text(self, index: int) -> str:
+        """An argument as a string."""
+        return convert(self.scope, self.values[index], kinds.STRING)
+
+    def value(self, kind: kinds.Type, code: str) -> Value:
+        """The result of a function without effects."""
+        return Value(kind, code, self.position, pure=all(value.pure for value in self.values))
+
+
+Function = Callable[[Arguments], Value]
+
+
+def find_function(parts: tuple[str, ...]) -> Function | None:
+    """The library function of this name, with or without `std::`."""
+    if parts[0] == "std" and len(parts) == 2:
+        parts = parts[1:]
+    return LIBRARY.get(parts[0]) if len(parts) == 1 else None
+
+
+def _math(name: str, count: int) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(count)
+        for value in call.values:
+            require_number(value, f"`{call.name}`")
+        codes = [number(value.code, value.type, kinds.DOUBLE) for value in call.values]
+        code = f"h_{name}({', '.join(codes)})"
+        if call.standard and all(value.type == kinds.FLOAT for value in call.values):
+            return call.value(kinds.FLOAT, f"c_f32({code})")
+        return call.value(kinds.DOUBLE, code)
+
+    return function
+
+
+def _absolute(call: Arguments) -> Value:
+    call.count(1)
+    require_number(call.values[0], "`abs`")
+    value = call.values[0]
+    kind = kinds.promoted(value.type)
+    code = f"h_abs({number(value.code, value.type, kind)})"
+    return call.value(kind, wrapped(code, kind) if isinstance(kind, kinds.Integer) else code)
+
+
+def _extreme(name: str) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(2)
+        left, right = call.values
+        if kinds.is_number(left.type) and kinds.is_number(right.type):
+            kind = left.type if left.type == right.type else kinds.common(left.type, right.type)
+            codes = [number(value.code, value.type, kind) for value in call.values]
+            return call.value(kind, f"h_{name}({codes[0]}, {codes[1]})")
+        if left.type != right.type or not isinstance(left.type, kinds.String | kinds.Time | kinds.Duration):
+            raise SpecificationError.at(
+                call.position, f"`{call.name}` has no meaning for {left.type} and {right.type}"
+            )
+        return call.value(left.type, f"h_{name}({left.code}, {right.code})")
+
+    return function
+
+
+def _question(name: str) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(1)
+        require_number(call.values[0], f"`{name}`")
+        return call.value(kinds.BOOL, f"h_{name}({call.values[0].code})")
+
+    return function
+
+
+def _to_string(call: Arguments) -> Value:
+    call.count(1)
+    value = call.values[0]
+    require_number(value, "`std::to_string`")
+    floating = isinstance(value.type, kinds.Floating)
+    return call.value(kinds.STRING, f"h_to_{'floating' if floating else 'integer'}({value.code})")
+
+
+def _parser(kind: kinds.Integer) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(1, 3)
+        if len(call.values) > 1 and call.values[1].constant != 0:
+            raise SpecificationError.at(call.values[1].position, "the second argument must be 0")
+        base = call.values[2].constant if len(call.values) > 2 else 10
+        if base not in (2, 8, 10, 16):
+            raise SpecificationError.at(call.values[2].position, "the base must be 2, 8, 10 or 16")
+        return call.value(kind, f"h_parse({call.text(0)}, {base}, {kind.least}, {kind.most}, {call.site})")
+
+    return function
+
+
+def _parse_floating(kind: kinds.Floating) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(1)
+        code = f"h_parse_floating({call.text(0)}, {call.site})"
+        return call.value(kind, code if kind.bits == 64 else f"c_f32({code})")
+
+    return function
+
+
+def _lenient(kind: kinds.Type, name: str) -> Function:
+    def function(call: Arguments) -> Value:
+        call.count(1)
+        code = f"h_{name}({call.text(0)})"
+        return call.value(kind, wrapped(code, kind) if isinstance(kind, kinds.Integer) else code)
+
+    return function
+
+
+def _compare(call: Arguments) -> Value:
+    call.count(2)
+    return call.value(kinds.INT, f"h_compare({call.text(0)}, {call.text(1)})")
+
+
+def _length(call: Arguments) -> Value:
+    call.count(1)
+    return call.value(kinds.ULONG, f"h_len({call.text(0)})")
+
+
+def _buffer(call: Arguments) -> Value:
+    target = call.values[0]
+    if not isinstance(target.type, kinds.Characters):
+        raise SpecificationError.at(
+            target.position, f"`{call.name}` needs a `char` buffer; for a {target.type} write `=` or `+=`"
+        )
+    return target
+
+
+def _fills(function: str) -> Function:
+    def fill(call: Arguments) -> Value:
+        call.count(2)
+        target = _buffer(call)
+        code = store(call.scope, target, f"{function}({target.code}, {call.text(1)}, {call.site})")
+        return Value(kinds.CHARACTERS, code, call.position, pure=False)
+
+    return fill
+
+
+def _fills_at_most(call: Arguments) -> Value:
+    call.count(3)
+    target = _buffer(call)
+    limit = number(call.values[2].code, call.values[2].type, kinds.ULONG)
+    code = f"h_filled_at_most({target.code}, {call.text(1)}, {limit}, {call.site})"
+    return Value(kinds.CHARACTERS, store(call.scope, target, code), call.position, pure=False)
+
+
+def _prints(call: Arguments) -> Value:
+    call.count(2, 100)
+    target = _buffer(call)
+    text = formatted(call.scope, call.values[1], call.values[2:])
+    code = store(call.scope, target, f"h_filled({target.code}, {text}, {call.site})")
+    return Value(kinds.INT, f"(h_len({code}) * 0)", call.position, pure=False)
+
+
+def _prints_at_most(call: Arguments) -> Value:
+    call.count(3, 100)
+    target = _buffer(call)
+    limit = number(call.values[1].code, call.values[1].type, kinds.LONG)
+    text = formatted(call.scope, call.values[2], call.values[3:])
+    cut = f"{text}[:h_max({limit} - 1, 0)]"
+    code = store(call.scope, target, f"h_filled({target.code}, {cut}, {call.site})")
+    return Value(kinds.INT, f"(h_len({code}) * 0)", call.position, pure=False)
+
+
+LIBRARY: Mapping[str, Function] = MappingProxyType(
+    {
+        **{name: _math(name, count) for name, (count, _) in numbers.MATH.items()},
+        "abs": _absolute,
+        "labs": _absolute,
+        "llabs": _absolute,
+        "min": _extreme("min"),
+        "max": _extreme("max"),
+        "isnan": _question("isnan"),
+        "isinf": _question("isinf"),
+        "isfinite": _question("isfinite"),
+        "to_string": _to_string,
+        "stoi": _parser(kinds.INT),
+        "stol": _parser(kinds.LONG),
+        "stoll": _parser(kinds.LONG),
+        "stoul": _parser(kinds.ULONG),
+        "stoull": _parser(kinds.ULONG),
+        "stof": _parse_floating(kinds.FLOAT),
+        "stod": _parse_floating(kinds.DOUBLE),
+        "atoi": _lenient(kinds.INT, "atoi"),
+        "atol": _lenient(kinds.LONG, "atoi"),
+        "atof": _lenient(kinds.DOUBLE, "atof"),
+        "strcmp": _compare,
+        "strlen": _length,
+        "strcpy": _fills("h_filled"),
+        "strcat": _fills("h_extended"),
+        "strncpy": _fills_at_most,
+        "sprintf": _prints,
+        "snprintf": _prints_at_most,
+    }
+)
+
+CONSTANTS: Mapping[tuple[str, ...], tuple[kinds.Type, bool | int | float]] = MappingProxyType(
+    {
+        ("true",): (kinds.BOOL, True),
+        ("false",): (kinds.BOOL, False),
+        ("M_PI",): (kinds.DOUBLE, math.pi),
+        ("M_PI_2",): (kinds.DOUBLE, math.pi / 2),
+        ("M_PI_4",): (kinds.DOUBLE, math.pi / 4),
+        ("M_1_PI",): (kinds.DOUBLE, 1 / math.pi),
+        ("M_E",): (kinds.DOUBLE, math.e),
+        ("M_SQRT2",): (kinds.DOUBLE, math.sqrt(2)),
+        ("INFINITY",): (kinds.FLOAT, math.inf),
+        ("HUGE_VAL",): (kinds.DOUBLE, math.inf),
+        ("NAN",): (kinds.FLOAT, math.nan),
+        ("INT_MAX",): (kinds.INT, kinds.INT.most),
+        ("INT_MIN",): (kinds.INT, kinds.INT.least),
+        ("UINT_MAX",): (kinds.UINT, kinds.UINT.most),
+        ("LONG_MAX",): (kinds.LONG, kinds.LONG.most),
+        ("LONG_MIN",): (kinds.LONG, kinds.LONG.least),
+        ("DBL_MAX",): (kinds.DOUBLE, 1.7976931348623157e308),
+        ("DBL_MIN",): (kinds.DOUBLE, 2.2250738585072014e-308),
+        ("DBL_EPSILON",): (kinds.DOUBLE, 2.220446049250313e-16),
+        ("FLT_MAX",): (kinds.FLOAT, 3.4028234663852886e38),
+        ("FLT_EPSILON",): (kinds.FLOAT, 1.1920928955078125e-07),
+        ("std", "string", "npos"): (kinds.ULONG, texts.NOT_FOUND),
+        ("string", "npos"): (kinds.ULONG, texts.NOT_FOUND),
+    }
+)

@@ -1,0 +1,218 @@
+"""Loops and `switch` as code. Every iteration is charged, so that no loop outlives its budget."""
+
+from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
+from appliance.rosmop.compile.expressions import value_of
+from appliance.rosmop.compile.members import element_value
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.scope import Loop, Scope, Variable
+from appliance.rosmop.positions import Position
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+from appliance.rosmop.types.resolve import resolve
+
+MAX_NESTED = 15
+"""Loops inside each other; Python takes no more than 20."""
+
+
+def charge(scope: Scope, node: tree.Node) -> None:
+    """Write the lines that charge for one iteration (or one call)."""
+    context = scope.context
+    scope.lines.add(f"{context}.budget -= {weight(node)}")
+    scope.lines.add(f"if {context}.budget < 0: {context}.spend(0, {scope.lines.site})")
+
+
+def weight(node: tree.Node) -> int:
+    """How many instructions a body is charged: its expressions and statements, however they are nested."""
+    total = 0
+    waiting: list[object] = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Node):
+            total += 1
+            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+    return total
+
+
+def write_while(scope: Scope, node: tree.Statement) -> None:
+    """`while` and `do … while`."""
+    assert isinstance(node, tree.While)  # noqa: S101  so says the table in statements.py
+    _enter(scope, node, Loop(False))
+    scope.lines.add("while True:")
+    with scope.indented():
+        charge(scope, node)
+        if node.at_end:
+            scope.loops[-1].step = lambda: _leave_unless(scope, node.condition)
+        else:
+            _leave_unless(scope, node.condition)
+    _body(scope, node.body)
+    if node.at_end:
+        with scope.indented():
+            _leave_unless(scope, node.condition)
+    scope.loops.pop()
+
+
+def write_for(scope: Scope, node: tree.Statement) -> None:
+    """`for (start; condition; step)`."""
+    from appliance.rosmop.compile.statements import write  # noqa: PLC0415  a loop is made of statements
+
+    assert isinstance(node, tree.For)  # noqa: S101
+    with scope.block():
+        if node.start is not None:
+            write(scope, node.start)
+        step = tree.Evaluate(node.step.position, node.step) if node.step is not None else None
+        _enter(scope, node, Loop(False, (lambda: write(scope, step)) if step is not None else None))
+        scope.lines.add("while True:")
+        with scope.indented():
+            charge(scope, node)
+            if node.condition is not None:
+                _leave_unless(scope, node.condition)
+        _body(scope, node.body)
+        if step is not None:
+            with scope.indented():
+                write(scope, step)
+        scope.loops.pop()
+
+
+def write_range_for(scope: Scope, node: tree.Statement) -> None:
+    """`for (type name : values)`."""
+    assert isinstance(node, tree.RangeFor)  # noqa: S101
+    values = value_of(scope, node.values)
+    if not isinstance(values.type, kinds.Vector | kinds.String):
+        raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
+    element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
+    kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
+    _enter(scope, node, Loop(False))
+    with scope.block():
+        if node.type.reference and not node.type.constant:
+            _by_reference(scope, node, values, kind)
+        else:
+            _by_value(scope, node, values, element, kind)
+        _body(scope, node.body)
+    scope.loops.pop()
+
+
+def _by_value(scope: Scope, node: tree.RangeFor, values: Value, element: Type, kind: Type) -> None:
+    each = scope.temporary()
+    scope.lines.add(f"for {each} in {values.code}:")
+    with scope.indented():
+        charge(scope, node)
+        code = f"(({each} + 128 & 255) - 128)" if isinstance(values.type, kinds.String) else each
+        value = Value(element, code, node.position, owned=node.type.reference)
+        variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
+        scope.lines.add(f"{variable.code} = {convert(scope, value, kind)}")
+
+
+def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> None:
+    if not isinstance(values.type, kinds.Vector) or values.place is None or not values.pure:
+        raise SpecificationError.at(
+            node.values.position, "a reference goes through a vector variable; leave out the `&`"
+        )
+    if values.type.element != kind:
+        raise SpecificationError.at(node.type.position, f"the elements are {values.type.element}, not {kind}")
+    index = scope.temporary("i")
+    scope.lines.add(f"{index} = -1")
+    scope.lines.add("while True:")
+    with scope.indented():
+        charge(scope, node)
+        scope.lines.add(f"{index} += 1")
+        scope.lines.add(f"if {index} >= l_len({values.code}): break")
+    at = Value(kinds.LONG, index, node.position)
+    alias = element_value(scope, values, at, node.position, scope.lines.site)
+    scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
+
+
+def write_switch(scope: Scope, node: tree.Statement) -> None:
+    """`switch`: the index of the first case, then every block from there on until a `break`."""
+    assert isinstance(node, tree.Switch)  # noqa: S101
+    value = value_of(scope, node.value)
+    kind = kinds.promoted(value.type)
+    if not isinstance(kind, kinds.Integer):
+        raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
+    start, flag = scope.temporary(), scope.temporary("k")
+    table, default = _cases(scope, node, kind)
+    selected = number(value.code, value.type, kind)
+    scope.lines.add(f"{flag} = False")
+    scope.lines.add(f"{start} = {{{table}}}.get({selected}, {default})")
+    _enter(scope, node, Loop(True, continued=flag))
+    scope.lines.add("while True:")
+    with scope.block(), scope.indented():
+        for index, case in enumerate(node.cases):
+            if case.statements:
+                scope.lines.add(f"if {start} <= {index}:")
+                _statements(scope, case)
+        scope.lines.add("break")
+    loop = scope.loops.pop()
+    if loop.step is not None:
+        scope.lines.add(f"if {flag}:")
+        with scope.indented():
+            write_continue(scope, node.position)
+
+
+def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[str, int]:
+    table: dict[int, int] = {}
+    default = len(node.cases)
+    for index, case in enumerate(node.cases):
+        if case.value is None:
+            default = index
+            continue
+        value = value_of(scope, case.value)
+        constant = value.constant
+        if not isinstance(constant, int):
+            raise SpecificationError.at(
+                case.value.position, "a case needs a constant: a number or a character"
+            )
+        wanted = constant_value(value.position, kind, int(constant))
+        if int(constant) in table:
+            raise SpecificationError.at(case.value.position, f"case {int(constant)} occurs twice")
+        table[int(constant)] = index
+        convert(scope, wanted, kind)
+    return ", ".join(f"{constant}: {index}" for constant, index in table.items()), default
+
+
+def write_continue(scope: Scope, position: Position) -> None:
+    """`continue`: the step of the innermost loop, then its next iteration."""
+    if not any(not loop.is_switch for loop in scope.loops):
+        raise SpecificationError.at(position, "`continue` stands in a loop")
+    loop = scope.loops[-1]
+    if loop.is_switch:
+        loop.step = lambda: None
+        scope.lines.add(f"{loop.continued} = True")
+        scope.lines.add("break")
+        return
+    if loop.step is not None:
+        loop.step()
+    scope.lines.add("continue")
+
+
+def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
+    if len(scope.loops) >= MAX_NESTED:
+        raise SpecificationError.at(
+            node.position, f"more than {MAX_NESTED} loops inside each other; use helper functions"
+        )
+    scope.loops.append(loop)
+
+
+def _leave_unless(scope: Scope, node: tree.Expression) -> None:
+    with scope.at(node):
+        scope.lines.add(f"if not {condition(value_of(scope, node))}: break")
+
+
+def _body(scope: Scope, body: tree.Statement) -> None:
+    from appliance.rosmop.compile.statements import write_body  # noqa: PLC0415  a loop is made of statements
+
+    write_body(scope, [body])
+
+
+def _statements(scope: Scope, case: tree.Case) -> None:
+    from appliance.rosmop.compile.statements import write  # noqa: PLC0415  a case is made of statements
+
+    with scope.indented():
+        before = len(scope.lines.lines)
+        for statement in case.statements:
+            write(scope, statement)
+        if len(scope.lines.lines) == before:
+            scope.lines.add("pass")

@@ -1,0 +1,105 @@
+"""The Python module that is being generated: its lines, the names it may use, and the sites faults are told by."""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from appliance.rosmop.positions import Position
+
+FILENAME = "<compiled specification>"
+MAX_LINES = 200_000
+
+
+@dataclass(frozen=True)
+class Site:
+    """A place in the text that generated code belongs to, and the variables whose values explain a fault there.
+
+    `variables` are (name in the text, name in the code, how to show a value).
+    """
+
+    position: Position
+    variables: tuple[tuple[str, str, Callable[[Any], object]], ...] = ()
+
+
+class TooComplexError(Exception):
+    """The generated code is more than the Python compiler takes."""
+
+
+class Module:
+    """Lines of source, each with its site; and the namespace the code will run in."""
+
+    def __init__(self) -> None:
+        self.sites: list[Site] = []
+        self.namespace: dict[str, Any] = {"__builtins__": {}}
+        self._lines: list[str] = []
+        self._line_sites: list[int] = []
+        self._names = 0
+        self._structs: dict[str, str] = {}
+
+    def fresh(self, prefix: str) -> str:
+        """A name that nothing else has."""
+        self._names += 1
+        return f"{prefix}{self._names}"
+
+    def site(self, site: Site) -> int:
+        """The number of a site."""
+        self.sites.append(site)
+        return len(self.sites) - 1
+
+    def use(self, value: Any, prefix: str = "x") -> str:
+        """A name for a value from outside."""
+        name = self.fresh(prefix)
+        self.namespace[name] = value
+        return name
+
+    def struct(self, code: str, method: str) -> str:
+        """A name for `Struct(code).method`."""
+        key = f"{method} {code}"
+        if key not in self._structs:
+            self._structs[key] = self.use(getattr(struct.Struct(code), method), "s")
+        return self._structs[key]
+
+    def add(self, lines: list[tuple[str, int]]) -> None:
+        """Append lines with their sites (-1: none)."""
+        for line, site in lines:
+            self._lines.append(line)
+            self._line_sites.append(site)
+
+    def site_of_line(self, number: int) -> int:
+        """The site of a line of the source, counted from 1."""
+        return self._line_sites[number - 1] if 0 < number <= len(self._line_sites) else -1
+
+    @property
+    def source(self) -> str:
+        """The source, for tests and for the curious."""
+        return "\n".join(self._lines) + "\n"
+
+    def run(self) -> dict[str, Any]:
+        """Compile and execute the module; returns its namespace. Raises `TooComplexError`."""
+        if len(self._lines) > MAX_LINES:
+            raise TooComplexError(f"{len(self._lines)} lines of code")
+        try:
+            code = compile(self.source, FILENAME, "exec", dont_inherit=True, optimize=0)
+        except (SyntaxError, RecursionError, MemoryError, OverflowError) as error:
+            raise TooComplexError(str(error)) from None
+        exec(code, self.namespace)  # noqa: S102  our own code: see the head of this package
+        return self.namespace
+
+
+class Lines:
+    """The body of a function while it is written: indentation, and the site of the current statement."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int]] = []
+        self.depth = 1
+        self.site = -1
+
+    def add(self, line: str) -> None:
+        """Append a line at the current depth."""
+        self.lines.append(("    " * self.depth + line, self.site))
+
+    def extend(self, lines: list[str]) -> None:
+        """Append lines at the current depth."""
+        for line in lines:
+            self.add(line)

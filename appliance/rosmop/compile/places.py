@@ -1,0 +1,85 @@
+"""Values of expressions as code, and the places that can be assigned."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from appliance.rosmop.positions import Position
+from appliance.rosmop.types.kinds import Type
+
+if TYPE_CHECKING:
+    from appliance.rosmop.compile.scope import Variable
+
+
+@dataclass(frozen=True)
+class Value:
+    """An expression: its type and the code that computes it.
+
+    `place` is where the value lives if it can be assigned. `owned` means that nothing else refers to it, so it
+    needs no copy. `constant` is known without running. `pure` means that computing it twice changes nothing.
+    """
+
+    type: Type
+    code: str
+    position: Position
+    place: "Place | None" = None
+    owned: bool = True
+    constant: bool | int | float | bytes | None = None
+    pure: bool = True
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a value lives."""
+
+
+@dataclass(frozen=True)
+class VariablePlace(Place):
+    """A variable."""
+
+    variable: "Variable"
+
+
+@dataclass(frozen=True)
+class ElementPlace(Place):
+    """An element of a vector."""
+
+    base: Value
+    index: str
+    site: int
+
+
+@dataclass(frozen=True)
+class CharacterPlace(Place):
+    """A character of a string."""
+
+    base: Value
+    index: str
+    site: int
+
+
+@dataclass(frozen=True)
+class SlotPlace(Place):
+    """A field of a message."""
+
+    base: Value
+    slot: int
+
+
+@dataclass(frozen=True)
+class PartPlace(Place):
+    """`sec` or `nsec` of a time or duration."""
+
+    base: Value
+    part: str
+    site: int
+
+
+def root(value: Value) -> "Variable | None":
+    """The variable that a place is part of."""
+    place = value.place
+    while place is not None:
+        if isinstance(place, VariablePlace):
+            variable = place.variable
+            return root(variable.alias) if variable.alias is not None else variable
+        place = place.base.place  # type: ignore[attr-defined]  # every other place has a base
+    return None

@@ -1,0 +1,248 @@
+"""What a function under compilation knows: variables by name, the lines written so far, where it stands."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from appliance.rosmop.compile.codecs import Codecs
+from appliance.rosmop.compile.module import Lines, Module, Site
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+from appliance.rosmop.types.messages import Messages, nearest, shown
+
+Role = Literal["action", "timer", "handler", "init", "function"]
+
+
+@dataclass(eq=False)
+class Variable:
+    """A variable: its name in the text and in the code.
+
+    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is what a
+    reference stands for. `shared` variables live in the namespace of the module.
+    """
+
+    name: str
+    type: Type
+    code: str
+    position: Position
+    shared: bool = False
+    constant: bool = False
+    flag: str | None = None
+    alias: Value | None = None
+    used: bool = False
+    assigned: bool = False
+
+
+@dataclass(eq=False)
+class HelperFunction:
+    """A helper function; `references` are the parameters that are handed back."""
+
+    name: str
+    code: str
+    result: Type
+    parameters: tuple[Variable, ...]
+    references: tuple[Variable, ...]
+    node: tree.Function
+    recursive: bool = False
+
+
+@dataclass(eq=False)
+class SpecificationNames:
+    """What one specification declares, and the code's name for its context."""
+
+    name: str
+    context: str
+    variables: dict[str, Variable] = field(default_factory=dict)
+    functions: dict[str, HelperFunction] = field(default_factory=dict)
+    uses: set[str] = field(default_factory=set)
+    """The other specifications whose variables are used."""
+
+
+@dataclass(eq=False)
+class Loop:
+    """A loop or switch around the current statement: the lines a `continue` needs before it."""
+
+    is_switch: bool
+    step: Callable[[], None] | None = None
+    continued: str | None = None  # of a switch: the flag that tells the loop around it to continue
+
+
+@dataclass(frozen=True)
+class Publication:
+    """A topic that a specification publishes, and where it says so."""
+
+    topic: str
+    type: str
+    position: Position
+
+
+class Shared:
+    """What all functions of all specifications share while they are compiled."""
+
+    def __init__(self, module: Module, messages: Messages) -> None:
+        self.module = module
+        self.messages = messages
+        self.codecs = Codecs(module, messages)
+        self.specifications: list[SpecificationNames] = []
+        self.measures: dict[str, Callable[[Any], int]] = {}
+        self.findings: list[Finding] = []
+        self.publications: list[Publication] = []
+
+    def foreign(self, own: SpecificationNames, name: str, position: Position) -> Variable | None:
+        """A variable of another specification."""
+        owners = [other for other in self.specifications if other is not own and name in other.variables]
+        if len(owners) > 1:
+            both = " and ".join(other.name for other in owners[:2])
+            raise SpecificationError.at(
+                position, f"{shown(name)} is a variable of {both}; give one of them another name"
+            )
+        if not owners:
+            return None
+        own.uses.add(owners[0].name)
+        return owners[0].variables[name]
+
+
+class Scope:
+    """A function under compilation."""
+
+    def __init__(self, shared: Shared, names: SpecificationNames, role: Role) -> None:
+        self.shared = shared
+        self.names = names
+        self.role: Role = role
+        self.module = shared.module
+        self.codecs = shared.codecs
+        self.messages = shared.messages
+        self.context = names.context
+        self.lines = Lines()
+        self.result: Type = kinds.VOID
+        self.references: tuple[Variable, ...] = ()
+        self.message_type: str | None = None  # of the message that `MESSAGE` is
+        self.read_message: Callable[[], str] | None = None
+        self.whole_asked: str | None = None  # `MESSAGE` was read: the code's name for what is pending
+        self.drop_refused: str | None = None  # why `DROP;` may not stand here
+        self.loops: list[Loop] = []
+        self.written: set[str] = set()
+        self.calls: set[str] = set()
+        self.recursive = False
+        self._blocks: list[dict[str, Variable]] = [{}]
+
+    # Names
+
+    @contextmanager
+    def block(self) -> Iterator[None]:
+        """A block with names of its own."""
+        self._blocks.append({})
+        yield
+        self._blocks.pop()
+
+    def declare(self, variable: Variable) -> None:
+        """A name of the innermost block."""
+        block = self._blocks[-1]
+        if variable.name in block:
+            raise SpecificationError.at(
+                variable.position, f"{shown(variable.name)} is declared twice in this block"
+            )
+        block[variable.name] = variable
+        if variable.alias is None:
+            self.shared.measures[variable.code] = self.codecs.measure(variable.type)
+
+    def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
+        """A new local variable."""
+        variable = Variable(name, kind, self.module.fresh("v"), position, constant=constant)
+        self.declare(variable)
+        return variable
+
+    def find(self, name: str, position: Position) -> Variable | None:
+        """The variable of this name: local, of this specification, of another one."""
+        for block in reversed(self._blocks):
+            if name in block:
+                return block[name]
+        own = self.names.variables.get(name)
+        return own or self.shared.foreign(self.names, name, position)
+
+    def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
+        """The refusal of a name that nothing has."""
+        known = [name for block in self._blocks for name in block]
+        known += [*self.names.variables, *self.names.functions]
+        return SpecificationError.at(position, f"there is no {what} {shown(name)}{nearest(name, known)}")
+
+    def published(self, topic: str, kind: str, position: Position) -> None:
+        """Note that the topic is published."""
+        self.shared.publications.append(Publication(topic, kind, position))
+
+    # Lines
+
+    def temporary(self, prefix: str = "t") -> str:
+        """A name for an intermediate value."""
+        return self.module.fresh(prefix)
+
+    def site(self, node: tree.Node) -> int:
+        """The site of a node: where it stands, and the variables in it."""
+        return self.module.site(Site(node.position, tuple(self._variables(node))))
+
+    @contextmanager
+    def at(self, node: tree.Node) -> Iterator[None]:
+        """Lines written inside belong to this node."""
+        before = self.lines.site
+        self.lines.site = self.site(node)
+        yield
+        self.lines.site = before
+
+    @contextmanager
+    def indented(self) -> Iterator[None]:
+        """Lines written inside are one step deeper."""
+        self.lines.depth += 1
+        yield
+        self.lines.depth -= 1
+
+    def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object]]]:
+        seen: set[str] = set()
+        for name in names_in(node):
+            if name in seen or len(seen) >= 16:
+                continue
+            seen.add(name)
+            try:
+                variable = self.find(name, node.position)
+            except SpecificationError:
+                continue
+            if variable is not None and variable.alias is None:
+                yield name, variable.code, showing(variable.type)
+
+
+def names_in(node: object) -> Iterator[str]:
+    """The simple names in an expression, or in the expressions of a statement that holds no other statement."""
+    waiting = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tree.Name):
+            if len(current.parts) == 1:
+                yield current.parts[0]
+        elif isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Node) and (current is node or not isinstance(current, tree.Statement)):
+            waiting += [getattr(current, name) for name in reversed(current.__dataclass_fields__)]
+
+
+def showing(kind: Type) -> Callable[[Any], object]:
+    """How a value of a type is shown where a fault is told: something JSON has."""
+    if isinstance(kind, kinds.String | kinds.Characters):
+        return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
+    if isinstance(kind, kinds.Time | kinds.Duration):
+        return lambda value: value / 1e9
+    if isinstance(kind, kinds.Vector):
+        inner = showing(kind.element)
+        return lambda values: [inner(value) for value in values[:8]] + ["…"] * (len(values) > 8)
+    if isinstance(kind, kinds.Floating):
+        return lambda value: value if value - value == 0 else str(value)
+    if isinstance(kind, kinds.Record):
+        return lambda value: _short(str(value)[:200])
+    return lambda value: value
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 80 else text[:79] + "…"

@@ -1,0 +1,309 @@
+"""Specifications as code: a set of files becomes one module, and a description of what is in it.
+
+Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, TypeVar
+
+from appliance.ros.definitions import Definitions
+from appliance.rosmop.compile import conversion, library, members, operators, output, storing
+from appliance.rosmop.compile.events import EventCode, compile_event
+from appliance.rosmop.compile.functions import (
+    compile_function,
+    compile_handler,
+    compile_start,
+    declare_functions,
+    declare_variables,
+)
+from appliance.rosmop.compile.lint import lint_property, unused_events
+from appliance.rosmop.compile.module import Module, TooComplexError
+from appliance.rosmop.compile.scope import Publication, Shared, SpecificationNames
+from appliance.rosmop.logics.catalogue import compile_property
+from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
+from appliance.rosmop.positions import Finding
+from appliance.rosmop.runtime import texts, vectors, wire
+from appliance.rosmop.runtime.context import MAX_BYTES, Context, FaultError, Turn
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types.messages import Messages, nearest, shown
+
+_T = TypeVar("_T")
+
+MODIFIERS = frozenset({"hold"})
+IGNORED_MODIFIERS = frozenset(
+    {"unsynchronized", "decentralized", "perthread", "suffix", "full-binding", "creation"}
+)
+"""Modifiers of MOP that say how a monitor is generated, and mean nothing here."""
+
+
+@dataclass(frozen=True)
+class PropertyCode:
+    """A compiled property: its monitor, and for each category that is handled the name of the function."""
+
+    property: CompiledProperty
+    handlers: Mapping[str, str]
+    order: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SpecificationCode:
+    """A compiled specification. `variables` are its shared variables: name in the text to name in the code."""
+
+    name: str
+    file: str
+    hold: bool
+    start: str
+    context: str
+    events: tuple[EventCode, ...]
+    properties: tuple[PropertyCode, ...]
+    variables: Mapping[str, str]
+    uses: frozenset[str]
+    """The other specifications whose variables it uses."""
+
+
+@dataclass(eq=False)
+class Compiled:
+    """A set of specifications, ready to run: the namespace of the code, and what is in it."""
+
+    module: Module
+    namespace: dict[str, Any]
+    specifications: tuple[SpecificationCode, ...]
+    turn: Turn
+    warnings: tuple[Finding, ...]
+    publications: tuple[Publication, ...] = ()
+    messages: Messages = field(default_factory=lambda: Messages(Definitions({})))
+
+
+def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compiled:
+    """Compile a set of files; raises `SpecificationError` with everything that is wrong."""
+    module, messages = Module(), Messages(definitions)
+    shared = Shared(module, messages)
+    turn = Turn()
+    _offer(module, shared.measures)
+    pairs = [(file, specification) for file in files for specification in file.specifications]
+    names = [_declare(shared, module, turn, specification) for _, specification in pairs]
+    _check_names(shared, [specification for _, specification in pairs])
+    compiled = []
+    for (file, specification), own in zip(pairs, names, strict=True):
+        code = _compile(shared, own, file, specification)
+        if code is not None:
+            compiled.append(code)
+    _check_types(shared, compiled)
+    findings = list(dict.fromkeys(shared.findings))
+    if any(finding.severity == "error" for finding in findings):
+        raise SpecificationError(findings)
+    try:
+        namespace = module.run()
+    except TooComplexError as error:
+        position = pairs[0][1].position
+        raise SpecificationError.at(
+            position, f"too complex to compile ({error}); split expressions and functions"
+        ) from None
+    warnings = tuple(sorted(findings, key=lambda finding: finding.position))
+    return Compiled(module, namespace, tuple(compiled), turn, warnings, tuple(shared.publications), messages)
+
+
+def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None:
+    """Put into the namespace what generated code may use, and nothing else."""
+    for functions in (
+        conversion.FUNCTIONS,
+        storing.FUNCTIONS,
+        operators.FUNCTIONS,
+        members.FUNCTIONS,
+        library.FUNCTIONS,
+        output.FUNCTIONS,
+    ):
+        module.namespace |= functions
+    module.namespace |= {
+        "__rv__": measures,
+        "c_nan": float("nan"),
+        "c_inf": float("inf"),
+        "e_character": texts.character,
+        "e_repeat": texts.repeat,
+        "e_filled": texts.filled,
+        "e_fill": vectors.filled_with,
+        "e_bytearray": bytearray,
+        "e_bytes": bytes,
+        "e_too_deep": _too_deep,
+        "x_whole": wire.whole,
+    }
+
+
+def _too_deep(site: int, name: str) -> None:
+    raise FaultError(site, f"`{name}` calls itself without end")
+
+
+def _declare(
+    shared: Shared, module: Module, turn: Turn, specification: tree.Specification
+) -> SpecificationNames:
+    context = module.fresh("c")
+    module.namespace[context] = Context(specification.name, turn, shared.measures)
+    names = SpecificationNames(specification.name, context)
+    shared.specifications.append(names)
+    declare_variables(shared, names, specification)
+    declare_functions(shared, names, specification)
+    size = sum(shared.codecs.width(variable.type) for variable in names.variables.values())
+    if size > MAX_BYTES:
+        shared.findings.append(
+            Finding(
+                specification.position,
+                "error",
+                f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB",
+            )
+        )
+    return names
+
+
+def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -> None:
+    seen: dict[str, tree.Specification] = {}
+    owners: dict[str, str] = {}
+    for specification, names in zip(specifications, shared.specifications, strict=True):
+        if specification.name in seen:
+            first = seen[specification.name].position
+            text = (
+                f"there is another specification {shown(specification.name)} at {first}; give it another name"
+            )
+            shared.findings.append(Finding(specification.position, "error", text))
+        seen[specification.name] = specification
+        for variable in names.variables.values():
+            other = owners.setdefault(variable.name, names.name)
+            if other != names.name:
+                text = f"{shown(variable.name)} is also a variable of {other}; each has its own"
+                shared.findings.append(Finding(variable.position, "warning", text))
+
+
+def _compile(
+    shared: Shared, names: SpecificationNames, file: tree.File, specification: tree.Specification
+) -> SpecificationCode | None:
+    _check_head(shared, specification)
+    start = _noted(shared, partial(compile_start, shared, names, specification))
+    for function in names.functions.values():
+        _noted(shared, partial(compile_function, shared, names, function))
+    events = [_noted(shared, partial(compile_event, shared, names, event)) for event in specification.events]
+    good = tuple(event for event in events if event is not None)
+    properties = [_property(shared, names, specification, node) for node in specification.properties]
+    if start is None or len(good) < len(events) or None in properties:
+        return None
+    known = tuple(code for code in properties if code is not None)
+    shared.findings += unused_events(specification, known)
+    variables = {variable.name: variable.code for variable in names.variables.values()}
+    uses = frozenset(names.uses)
+    return SpecificationCode(
+        specification.name,
+        file.name,
+        any(modifier.parts == ("hold",) for modifier in specification.modifiers),
+        start,
+        names.context,
+        good,
+        known,
+        variables,
+        uses,
+    )
+
+
+def _noted(shared: Shared, action: Callable[[], _T]) -> _T | None:
+    """What the action returns; None if it refused, which is noted."""
+    try:
+        return action()
+    except SpecificationError as error:
+        shared.findings += error.findings
+        return None
+
+
+def _check_head(shared: Shared, specification: tree.Specification) -> None:
+    for modifier in specification.modifiers:
+        word = modifier.parts[0]
+        if word in IGNORED_MODIFIERS:
+            shared.findings.append(Finding(modifier.position, "warning", f"{shown(word)} means nothing here"))
+        elif word not in MODIFIERS:
+            text = f"{shown(word)} is no modifier of a specification{nearest(word, MODIFIERS)}"
+            shared.findings.append(Finding(modifier.position, "error", text))
+    if specification.parameters:
+        text = "specifications take no parameters; write them as variables"
+        shared.findings.append(Finding(specification.parameters[0].position, "error", text))
+    if not specification.events:
+        text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
+        shared.findings.append(Finding(specification.position, "error", text))
+    seen = set()
+    for event in specification.events:
+        if event.name in seen:
+            shared.findings.append(
+                Finding(event.position, "error", f"the event {shown(event.name)} occurs twice")
+            )
+        seen.add(event.name)
+        for modifier in event.modifiers:
+            text = f"the modifier {shown(modifier.parts[0])} of an event means nothing here"
+            shared.findings.append(Finding(modifier.position, "warning", text))
+
+
+# Properties
+
+
+def _property(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification, node: tree.Property
+) -> PropertyCode | None:
+    events = tuple(dict.fromkeys(event.name for event in specification.events))
+    try:
+        compiled = compile_property(node.logic, node.formula, events, node.formula_position, node.position)
+    except FormulaError as error:
+        shared.findings += error.findings
+        return None
+    handlers: dict[str, str] = {}
+    for handler in node.handlers:
+        text = _handler_refused(compiled, handlers, handler)
+        if text is not None:
+            shared.findings.append(Finding(handler.position, "error", text))
+            continue
+        refused = _blocking_refused(compiled, specification, handler.category)
+        function = _noted(shared, partial(compile_handler, shared, names, handler, refused))
+        if function is not None:
+            handlers[handler.category] = function
+    shared.findings += lint_property(compiled, node)
+    return PropertyCode(compiled, handlers, tuple(handlers))
+
+
+def _handler_refused(
+    compiled: CompiledProperty, handlers: Mapping[str, str], handler: tree.Handler
+) -> str | None:
+    if handler.category in handlers:
+        return f"@{handler.category} is handled twice; put both into one handler"
+    if handler.category not in compiled.categories:
+        known = nearest(handler.category, compiled.categories)
+        return f"{compiled.logic} has no category {shown(handler.category)} here{known}"
+    return None
+
+
+def _blocking_refused(
+    compiled: CompiledProperty, specification: tree.Specification, category: str
+) -> str | None:
+    """Why a handler cannot drop the message that brought it about."""
+    refused = compiled.blocking_refused(category)
+    if refused is not None:
+        return refused
+    for index, event in enumerate(specification.events):
+        if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
+            return f"the timer {shown(event.name)} can bring @{category} about, and it has no message to drop"
+    return None
+
+
+def _check_types(shared: Shared, compiled: Sequence[SpecificationCode]) -> None:
+    """A topic has one type: in all events, and in all that is published."""
+    types: dict[tuple[str, str | None], tuple[str, object]] = {}
+    for specification in compiled:
+        for event in specification.events:
+            if event.topic is None or event.type is None:
+                continue
+            kind = event.service_type or event.type
+            key = (event.topic, "service" if event.part else None)
+            known, where = types.setdefault(key, (kind, event.position))
+            if known != kind:
+                text = f"{event.topic} has the type {known} at {where}, and {kind} here; a topic has one type"
+                shared.findings.append(Finding(event.position, "error", text))
+    for published in shared.publications:
+        known, where = types.setdefault((published.topic, None), (published.type, published.position))
+        if known != published.type:
+            text = f"{published.topic} has the type {known} at {where}, and {published.type} here"
+            shared.findings.append(Finding(published.position, "error", text))

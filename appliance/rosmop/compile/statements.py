@@ -1,0 +1,260 @@
+"""Statements as code. One function for each kind of statement of `syntax/tree.py`.
+
+A statement that is refused is noted and the next one is looked at, so that one check finds as much as it can.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from appliance.ros import names
+from appliance.rosmop.compile import calls, loops
+from appliance.rosmop.compile.conversion import condition, convert
+from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
+from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.compile.storing import store_lines
+from appliance.rosmop.positions import Position
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.messages import shown
+from appliance.rosmop.types.resolve import record, resolve
+
+LARGE = 4096
+"""A local variable of so many bytes is charged when it is declared."""
+
+
+def write(scope: Scope, node: tree.Statement) -> None:
+    """Write the lines of a statement."""
+    try:
+        with scope.at(node):
+            _KINDS[type(node)](scope, node)
+    except SpecificationError as error:
+        scope.shared.findings += error.findings
+
+
+def write_body(scope: Scope, statements: Sequence[tree.Statement]) -> None:
+    """Write statements one step deeper, in a block of names of their own; `pass` if nothing comes of them."""
+    with scope.block(), scope.indented():
+        before = len(scope.lines.lines)
+        for statement in statements:
+            write(scope, statement)
+        if len(scope.lines.lines) == before:
+            scope.lines.add("pass")
+
+
+# Declarations
+
+
+def _declaration(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Declaration)  # noqa: S101  so says the table at the end
+    if node.type.static:
+        raise SpecificationError.at(
+            node.position, "there are no static variables in functions; declare it before the events"
+        )
+    if node.type.reference:
+        raise SpecificationError.at(
+            node.position, "references are for parameters and range-for; use a variable"
+        )
+    for declarator in node.declarators:
+        kind, code = initial(scope, node.type, declarator)
+        if scope.codecs.width(kind) > LARGE:
+            size = scope.codecs.width(kind)
+            scope.lines.add(f"{scope.context}.allocate({size}, {scope.lines.site})")
+        variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
+        scope.lines.add(f"{variable.code} = {code}")
+
+
+def initial(scope: Scope, name: tree.TypeName, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
+    """The type of a declared variable, and code for its first value."""
+    if name.name == ("auto",):
+        return _deduced(scope, declarator)
+    kind = resolve(name, scope.messages)
+    if kind == kinds.VOID:
+        raise SpecificationError.at(name.position, "a variable cannot be void")
+    if declarator.is_array:
+        return _array(scope, kind, declarator)
+    if declarator.arguments is not None:
+        value = calls.construct(scope, declarator.position, kind, declarator.arguments, value_of)
+        return kind, convert(scope, value, kind)
+    if declarator.value is None:
+        return kind, scope.codecs.zero(kind)
+    return kind, converted(scope, declarator.value, kind)
+
+
+def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
+    if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
+        raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
+    value = value_of(scope, declarator.value)
+    if isinstance(value.type, kinds.Void | kinds.Stream):
+        raise SpecificationError.at(declarator.position, f"`auto` of {value.type}; this has no value")
+    kind = kinds.STRING if isinstance(value.type, kinds.Characters) else value.type
+    return kind, convert(scope, value, kind)
+
+
+def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
+    size = _array_size(scope, declarator)
+    if kind == kinds.CHAR and not isinstance(declarator.value, tree.Elements):
+        zeros = f"e_repeat({scope.context}, {size}, 0, {scope.lines.site})"
+        if declarator.value is None:
+            return kinds.CHARACTERS, zeros
+        text = converted(scope, declarator.value, kinds.STRING)
+        if size is None:
+            return kinds.CHARACTERS, f"({text} + b'\\0')"
+        return kinds.CHARACTERS, f"e_filled({zeros}, {text}, {scope.lines.site})"
+    if size is None:
+        assert isinstance(declarator.value, tree.Elements)  # noqa: S101  _array_size has looked
+        size = len(declarator.value.items)
+    array = kinds.Vector(kind, size)
+    if declarator.value is None:
+        return array, scope.codecs.zero(array)
+    if not isinstance(declarator.value, tree.Elements):
+        raise SpecificationError.at(declarator.value.position, "an array is initialised by `{…}`")
+    return array, elements(scope, declarator.value, array)
+
+
+def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
+    if declarator.size is None:
+        if declarator.value is None:
+            raise SpecificationError.at(declarator.position, "an array needs a size: `name[3]`")
+        return None
+    value = value_of(scope, declarator.size)
+    size = value.constant
+    if not isinstance(size, int) or isinstance(size, bool) or not 0 < size <= 1 << 24:
+        raise SpecificationError.at(
+            declarator.size.position,
+            "the size of an array is a number; write a `std::vector` for another size",
+        )
+    return size
+
+
+# Expressions and control
+
+
+def _evaluate(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Evaluate)  # noqa: S101
+    expression = node.expression
+    level = calls.stream_of(expression)
+    if level is not None:
+        scope.lines.add(calls.streamed(scope, node, level, expression, value_of, headed=True).code)
+    elif isinstance(expression, tree.Assign):
+        target, code = assignment(scope, expression)
+        scope.lines.extend(store_lines(scope, target, code))
+    elif isinstance(expression, tree.Step):
+        prefix = tree.Step(expression.position, expression.operator, expression.target, prefix=True)
+        scope.lines.add(value_of(scope, prefix).code)
+    else:
+        scope.lines.add(value_of(scope, expression).code)
+
+
+def _block(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Block)  # noqa: S101
+    with scope.block():
+        for statement in node.statements:
+            write(scope, statement)
+
+
+def _if(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.If)  # noqa: S101
+    with scope.at(node.condition):
+        scope.lines.add(f"if {condition(value_of(scope, node.condition))}:")
+    write_body(scope, [node.yes])
+    if node.no is not None:
+        scope.lines.add("else:")
+        write_body(scope, [node.no])
+
+
+def _break(scope: Scope, node: tree.Statement) -> None:
+    if not scope.loops:
+        raise SpecificationError.at(node.position, "`break` stands in a loop or a `switch`")
+    scope.lines.add("break")
+
+
+def _continue(scope: Scope, node: tree.Statement) -> None:
+    loops.write_continue(scope, node.position)
+
+
+def _return(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Return)  # noqa: S101
+    if scope.role == "function":
+        _return_value(scope, node)
+        return
+    if node.value is not None:
+        hint = "write `return;` to drop the message" if scope.role == "action" else "write `return;`"
+        raise SpecificationError.at(node.value.position, f"there is nobody to return a value to; {hint}")
+    if scope.role == "action":
+        scope.lines.add("m.dropped = True")
+    scope.lines.add("return True" if scope.role in ("action", "timer") else "return")
+
+
+def _return_value(scope: Scope, node: tree.Return) -> None:
+    void = isinstance(scope.result, kinds.Void)
+    if void != (node.value is None):
+        hint = (
+            "this function has no value; write `return;`" if void else f"this function returns {scope.result}"
+        )
+        raise SpecificationError.at(node.position, hint)
+    code = "None" if node.value is None else converted(scope, node.value, scope.result)
+    handed = "".join(f", {variable.code}" for variable in scope.references)
+    scope.lines.add(f"return ({code}{handed})" if handed else f"return {code}")
+
+
+# What only specifications have
+
+
+def _drop(scope: Scope, node: tree.Statement) -> None:
+    if scope.drop_refused is not None:
+        raise SpecificationError.at(node.position, f"`DROP;` cannot stand here: {scope.drop_refused}")
+    scope.lines.add("m.dropped = True")
+
+
+def _reset(scope: Scope, node: tree.Statement) -> None:
+    if scope.role != "handler":
+        raise SpecificationError.at(node.position, "`__RESET;` stands in the handlers of a property")
+    scope.lines.add(f"{scope.context}.turn.reset = True")
+
+
+def _delete(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Delete)  # noqa: S101
+    value = value_of(scope, node.target)
+    if not isinstance(value.type, kinds.Characters):
+        raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
+
+
+def _publish(scope: Scope, node: tree.Statement) -> None:
+    assert isinstance(node, tree.Publish)  # noqa: S101
+    check_topic(node.topic, node.position)
+    kind = record(node.type_position, node.type, scope.messages)
+    value = value_of(scope, node.value)
+    if value.type != kind:
+        raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is to be published")
+    out = scope.temporary()
+    scope.lines.add(f"{out} = e_bytearray()")
+    scope.lines.add(f"{scope.codecs.encoder(kind)}({value.code}, {out})")
+    arguments = f"{node.topic!r}, {node.type!r}, e_bytes({out}), {scope.lines.site}"
+    scope.lines.add(f"{scope.context}.publish({arguments})")
+    scope.published(node.topic, node.type, node.position)
+
+
+def check_topic(topic: str, position: Position) -> None:
+    """Refuse the name of a topic or service that is not global and canonical."""
+    if not names.is_global_name(topic):
+        hint = f"; write `/{topic}`" if names.is_global_name("/" + topic) else "; write for example `/a/b`"
+        raise SpecificationError.at(position, f"{shown(topic)} is no global name{hint}")
+
+
+_KINDS: Mapping[type[tree.Statement], Callable[[Scope, tree.Statement], None]] = {
+    tree.Declaration: _declaration,
+    tree.Evaluate: _evaluate,
+    tree.Block: _block,
+    tree.If: _if,
+    tree.While: loops.write_while,
+    tree.For: loops.write_for,
+    tree.RangeFor: loops.write_range_for,
+    tree.Switch: loops.write_switch,
+    tree.Break: _break,
+    tree.Continue: _continue,
+    tree.Return: _return,
+    tree.Drop: _drop,
+    tree.Reset: _reset,
+    tree.Delete: _delete,
+    tree.Publish: _publish,
+}

@@ -1,0 +1,446 @@
+"""The running monitors: a message goes in, what is to be done with it comes out. No I/O, no clock.
+
+Theory of operation:
+
+1. `MonitorSet.load` compiles files; `start` gives the variables their first values. A file that is wrong
+   changes nothing: the set in force stays.
+2. `process` gives a message to the events on its topic, specification by specification in the order they were
+   given, event by event in source order. After the action of an event that did not drop the message, every
+   property of its specification steps, and the handlers of the categories it is in run. What drops the message
+   ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over.
+3. Time is what the caller says: nanoseconds, with every message. Ticks (`every`) up to and including the time of
+   a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
+   the caller calls `advance` when `next_due` has come.
+4. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
+   keep their variables and runs.
+"""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Literal
+
+from appliance.ros.definitions import Definitions
+from appliance.rosmop.compile.specification import Compiled, compile_files
+from appliance.rosmop.faults import explain
+from appliance.rosmop.logics.interface import Categories, RunFaultError
+from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
+from appliance.rosmop.outcomes import Fault, Outcome, Verdict
+from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, LogLine
+from appliance.rosmop.runtime.wire import Buffer, Message
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.parser import parse
+
+OnFault = Literal["drop", "pass"]
+
+MAX_TICKS = 100_000
+"""Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
+
+FAILING_AFTER = 10
+"""Faults after which a monitor is shown as failing."""
+
+
+class MonitorSet:
+    """Specifications in force together."""
+
+    def __init__(self, compiled: Compiled, files: Sequence[tree.File], on_fault: OnFault = "drop") -> None:
+        self.files = tuple(files)
+        self.warnings: tuple[Finding, ...] = compiled.warnings
+        self._compiled = compiled
+        self._turn = compiled.turn
+        self._on_fault = on_fault
+        nodes = [node for file in files for node in file.specifications]
+        self._monitors = monitors_of(compiled, nodes, 0)
+        self._steps: dict[str, tuple[Step, ...]] = {}
+        self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
+        self._due: int | None = None
+        self._timed = False
+        self._index()
+
+    @classmethod
+    def load(
+        cls, sources: Mapping[str, str], definitions: Definitions, on_fault: OnFault = "drop"
+    ) -> "MonitorSet":
+        """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong."""
+        files = [parse(text, name) for name, text in sources.items()]
+        return cls(compile_files(files, definitions), files, on_fault)
+
+    # What there is
+
+    @property
+    def monitors(self) -> tuple[Monitor, ...]:
+        """The running specifications, in order."""
+        return self._monitors
+
+    @property
+    def topics(self) -> Mapping[str, str]:
+        """The topics with events, and their message types."""
+        return MappingProxyType(
+            {
+                step.event.topic: step.event.type
+                for monitor in self._monitors
+                for step in monitor.steps
+                if step.event.part is None and step.event.topic and step.event.type
+            }
+        )
+
+    @property
+    def services(self) -> Mapping[str, str]:
+        """The services with events, and their types."""
+        return MappingProxyType(
+            {
+                step.event.topic: step.event.service_type
+                for monitor in self._monitors
+                for step in monitor.steps
+                if step.event.topic and step.event.service_type
+            }
+        )
+
+    @property
+    def publications(self) -> Mapping[str, str]:
+        """The topics that specifications publish, and their message types."""
+        return MappingProxyType({each.topic: each.type for each in self._compiled.publications})
+
+    def md5sum(self, message_type: str) -> str:
+        """The md5sum of a message type as the specifications understand it."""
+        return self._compiled.messages.definitions.md5sum(message_type)
+
+    @property
+    def definitions(self) -> Definitions:
+        """The definitions that the specifications were compiled against."""
+        return self._compiled.messages.definitions
+
+    def wants(self, topic: str) -> bool:
+        """Whether an enabled monitor has an event on this topic."""
+        return topic in self._steps
+
+    def monitor(self, name: str) -> Monitor:
+        """A running specification by name; raises KeyError."""
+        for monitor in self._monitors:
+            if monitor.name == name:
+                return monitor
+        raise KeyError(name)
+
+    # What is done to them
+
+    def start(
+        self, time_ns: int, expected: frozenset[str] | None = None, *, restarted: bool = False
+    ) -> Outcome:
+        """Begin: first values, `init`, timers. Everything that `init` put out is in the outcome.
+
+        `expected` are the topics that are known to carry messages (of a recording); a specification with events
+        on one of them starts its timers with its first message. With `restarted`, specifications with the
+        modifier `hold` block their topics until `resume`.
+        """
+        outcome = Outcome(time=time_ns)
+        self._turn.now = time_ns
+        for monitor in self._monitors:
+            self._begin(monitor, time_ns, outcome)
+            monitor.held = restarted and monitor.code.hold
+            awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
+            for timer in monitor.timers:
+                timer.due = None if awaited else time_ns + timer.period
+        self._collect(outcome)
+        self._schedule()
+        return outcome
+
+    def replaced(
+        self, sources: Mapping[str, str], definitions: Definitions, time_ns: int
+    ) -> tuple["MonitorSet", Outcome]:
+        """The set that takes this one's place, started; specifications with the same text keep their state."""
+        following = MonitorSet.load(sources, definitions, self._on_fault)
+        outcome = following.start(time_ns)
+        known = {monitor.name: monitor for monitor in self._monitors}
+        for monitor in following.monitors:
+            before = known.get(monitor.name)
+            if before is not None and before.node == monitor.node:
+                following._take_over(monitor, before, self._compiled)
+        following._index()
+        following._schedule()
+        return following, outcome
+
+    def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
+        """Let the events of a monitor happen, or not; raises KeyError."""
+        monitor = self.monitor(name)
+        if enabled and not monitor.enabled:
+            for timer in monitor.timers:
+                timer.due = time_ns + timer.period
+        monitor.enabled = enabled
+        self._index()
+        self._schedule()
+
+    def resume(self, name: str) -> None:
+        """Let a held specification carry its topics again; raises KeyError."""
+        self.monitor(name).held = False
+
+    # What happens
+
+    def process(self, topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+        """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
+        return self._process(self._steps.get(topic, ()), buffer, time_ns)
+
+    def process_service(self, service: str, part: str, buffer: Buffer, time_ns: int) -> Outcome:
+        """The same for the `request` or `response` (the `part`) of a service."""
+        return self._process(self._requests.get((service, part), ()), buffer, time_ns)
+
+    @property
+    def next_due(self) -> int | None:
+        """When the next tick is due or the next deadline has passed; None if nothing is waited for."""
+        return self._due
+
+    def advance(self, time_ns: int) -> list[Outcome]:
+        """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
+        outcomes: list[Outcome] = []
+        ticks: dict[int, int] = {}
+        while self._due is not None and self._due <= time_ns:
+            timer = self._next_timer()
+            deadline = self._next_deadline()
+            if timer is not None and timer.due is not None and (deadline is None or timer.due <= deadline[0]):
+                if timer.due > time_ns:
+                    break
+                outcomes.append(self._tick(timer, time_ns, ticks))
+            elif deadline is not None and deadline[0] < time_ns:
+                outcomes.append(self._expire(deadline[1], deadline[2]))
+            else:
+                break
+            self._schedule()
+        return outcomes
+
+    # One message
+
+    def _process(self, steps: tuple[Step, ...], buffer: Buffer, time_ns: int) -> Outcome:
+        before = self.advance(time_ns) if self._due is not None and self._due <= time_ns else []
+        outcome = Outcome(buffer=buffer, time=time_ns, before=before)
+        if not steps:
+            return outcome
+        turn = self._turn
+        turn.now = time_ns
+        message = Message(buffer, time_ns)
+        monitor: Monitor | None = None
+        for step in steps:
+            if step.monitor is not monitor:
+                monitor = step.monitor
+                monitor.context.budget = BUDGET
+                if not monitor.seen:
+                    self._first_message(monitor, time_ns)
+                if monitor.held:
+                    outcome.reason = f"{monitor.name} holds its topics until it is resumed"
+                    message.dropped = True
+                    break
+            self._happen(step, message, outcome)
+            if message.dropped:
+                break
+        if turn.log or turn.published:
+            self._collect(outcome)
+        if message.dropped:
+            outcome.result = "dropped"
+        elif message.changed:
+            outcome.result = "changed"
+            outcome.buffer = message.buffer
+        if self._timed:
+            self._schedule()
+        return outcome
+
+    def _happen(self, step: Step, message: Message, outcome: Outcome) -> None:
+        try:
+            happened = step.function(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            self._fault(error, step.monitor, step.event.position, outcome)
+            message.dropped = message.dropped or self._on_fault == "drop"
+            return
+        if not happened:
+            if message.past:
+                self._past(step, message)
+            return
+        outcome.events.append(step.name)
+        if not message.dropped:
+            self._step_properties(step, message, message.time, outcome)
+
+    def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
+        for running in step.monitor.properties:
+            try:
+                categories = running.run.step(step.index, time_ns)
+            except RunFaultError as error:
+                self._fault(error, step.monitor, running.code.property.source.origin, outcome)
+                self._block(message)
+                continue
+            if categories:
+                self._tell(step.monitor, running, categories, message, outcome)
+
+    def _tell(
+        self,
+        monitor: Monitor,
+        running: RunningProperty,
+        categories: Categories,
+        message: Message | None,
+        outcome: Outcome,
+        *,
+        in_order_told: bool = False,
+    ) -> None:
+        """Run the handlers of these categories, in source order (after a deadline: in the order they are told)."""
+        handlers = [(category, handler) for category, handler in running.handlers if category in categories]
+        if in_order_told:
+            handlers.sort(key=lambda pair: categories.index(pair[0]))
+        self._turn.reset = False
+        for category, handler in handlers:
+            logic = running.code.property.logic
+            outcome.verdicts.append(Verdict(monitor.name, running.index, logic, category))
+            self._handle(monitor, handler, message, running, outcome)
+        if self._turn.reset:
+            running.run = running.code.property.start(self._turn.now)
+
+    def _handle(
+        self,
+        monitor: Monitor,
+        handler: Handler,
+        message: Message | None,
+        running: RunningProperty,
+        outcome: Outcome,
+    ) -> None:
+        try:
+            handler(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this handler and is recorded
+            self._fault(error, monitor, running.code.property.source.origin, outcome)
+            self._block(message)
+
+    def _block(self, message: Message | None) -> None:
+        """What a fault does to the message."""
+        if message is not None and self._on_fault == "drop":
+            message.dropped = True
+
+    def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
+        fault: Fault = explain(error, self._compiled.module, monitor.name, otherwise)
+        monitor.faults += 1
+        outcome.faults.append(fault)
+
+    def _past(self, step: Step, message: Message) -> None:
+        """Count an event that did not happen, and tell it once in a while."""
+        step.past += 1
+        now = message.time
+        if step.told is None or now - step.told >= FOLDED_NS:
+            _, index, count = message.past or (0, 0, 0)
+            times = "" if step.past == 1 else f" ({step.past} times)"
+            text = f"{step.name} did not happen: index {index} is past the end of {count} elements{times}"
+            self._turn.log.append(LogLine("WARN", text, step.monitor.name))
+            step.told, step.past = now, 0
+        message.past = None
+
+    def _collect(self, outcome: Outcome) -> None:
+        turn = self._turn
+        outcome.log, outcome.published = turn.log, turn.published
+        turn.log, turn.published = [], []
+
+    # Time
+
+    def _tick(self, timer: Timer, time_ns: int, ticks: dict[int, int]) -> Outcome:
+        step = timer.step
+        due = timer.due or 0
+        outcome = Outcome(time=due, timer=step.name)
+        self._turn.now = due
+        step.monitor.context.budget = BUDGET
+        timer.ticked = True
+        timer.due = due + timer.period
+        try:
+            happened = step.function(None)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            self._fault(error, step.monitor, step.event.position, outcome)
+            happened = False
+        if happened:
+            outcome.events.append(step.name)
+            self._step_properties(step, None, due, outcome)
+        ticks[id(timer)] = ticks.get(id(timer), 0) + 1
+        if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
+            left_out = (time_ns - timer.due) // timer.period + 1
+            timer.due += left_out * timer.period
+            text = f"{left_out} ticks of {step.name} are left out: the time has made a leap"
+            self._turn.log.append(LogLine("WARN", text, step.monitor.name))
+        self._collect(outcome)
+        return outcome
+
+    def _expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
+        deadline = running.run.deadline or 0
+        word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
+        outcome = Outcome(time=deadline, timer=f"{monitor.name}.{word}")
+        self._turn.now = deadline
+        monitor.context.budget = BUDGET
+        categories = running.run.expire()
+        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+        self._collect(outcome)
+        return outcome
+
+    def _first_message(self, monitor: Monitor, time_ns: int) -> None:
+        monitor.seen = True
+        for timer in monitor.timers:
+            if not timer.ticked:
+                timer.due = time_ns + timer.period
+
+    def _next_timer(self) -> Timer | None:
+        timers = [
+            timer
+            for monitor in self._monitors
+            if monitor.enabled
+            for timer in monitor.timers
+            if timer.due is not None
+        ]
+        return min(timers, key=lambda timer: timer.due or 0, default=None)
+
+    def _next_deadline(self) -> tuple[int, Monitor, RunningProperty] | None:
+        found: tuple[int, Monitor, RunningProperty] | None = None
+        for monitor in self._monitors:
+            if monitor.enabled:
+                for running in monitor.properties:
+                    deadline = running.run.deadline
+                    if deadline is not None and (found is None or deadline < found[0]):
+                        found = (deadline, monitor, running)
+        return found
+
+    def _schedule(self) -> None:
+        """Work out when something is due next. A deadline has passed only after its last nanosecond."""
+        if not self._timed:
+            return
+        timer, deadline = self._next_timer(), self._next_deadline()
+        times = [timer.due] if timer is not None and timer.due is not None else []
+        if deadline is not None:
+            times.append(deadline[0] + 1)
+        self._due = min(times, default=None)
+
+    # The set
+
+    def _begin(self, monitor: Monitor, time_ns: int, outcome: Outcome) -> None:
+        monitor.context.budget = BUDGET
+        for running in monitor.properties:
+            running.run = running.code.property.start(time_ns)
+        try:
+            self._compiled.namespace[monitor.code.start]()
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of `init` and is recorded
+            self._fault(error, monitor, monitor.node.position, outcome)
+
+    def _take_over(self, monitor: Monitor, before: Monitor, compiled: Compiled) -> None:
+        for name, code in monitor.code.variables.items():
+            self._compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
+        for running, old in zip(monitor.properties, before.properties, strict=True):
+            running.run = old.run
+        for timer, ticking in zip(monitor.timers, before.timers, strict=True):
+            timer.due, timer.ticked = ticking.due, ticking.ticked
+        monitor.enabled, monitor.held, monitor.seen = before.enabled, before.held, before.seen
+        monitor.faults = before.faults
+
+    def _index(self) -> None:
+        """Which steps a message on which topic takes."""
+        steps: dict[str, list[Step]] = {}
+        requests: dict[tuple[str, str], list[Step]] = {}
+        for monitor in self._monitors:
+            if not monitor.enabled:
+                continue
+            for step in monitor.steps:
+                topic, part = step.event.topic or "", step.event.part
+                if part is None:
+                    steps.setdefault(topic, []).append(step)
+                else:
+                    requests.setdefault((topic, part), []).append(step)
+        self._steps = {topic: tuple(found) for topic, found in steps.items()}
+        self._requests = {key: tuple(found) for key, found in requests.items()}
+        self._timed = any(
+            monitor.timers or any(running.code.property.timed for running in monitor.properties)
+            for monitor in self._monitors
+        )

@@ -1,0 +1,48 @@
+"""From an exception in generated code to a place in the text and the values of its variables."""
+
+import struct
+from types import TracebackType
+from typing import Any
+
+from appliance.rosmop.compile.module import FILENAME, Module, Site
+from appliance.rosmop.outcomes import Fault
+from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.context import FaultError, MalformedError
+
+
+def explain(error: Exception, module: Module, monitor: str, otherwise: Position) -> Fault:
+    """The fault that an exception is. `otherwise` is where it stands if the code has no better place."""
+    line, variables = _innermost(error.__traceback__)
+    number = error.site if isinstance(error, FaultError) else -1
+    if number < 0:
+        number = module.site_of_line(line)
+    site = module.sites[number] if number >= 0 else Site(otherwise)
+    values = {}
+    for name, code, show in site.variables:
+        value = variables.get(code, module.namespace.get(code, _MISSING))
+        if value is not _MISSING:
+            values[name] = show(value)
+    return Fault(monitor, site.position, _text(error), values)
+
+
+_MISSING = object()
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, FaultError):
+        return error.text
+    if isinstance(error, MalformedError):
+        return f"the bytes are not a message of this type: {error}"
+    if isinstance(error, struct.error):
+        return "the bytes are not a message of this type: it ends before its last field"
+    return f"{type(error).__name__}: {error}"
+
+
+def _innermost(traceback: TracebackType | None) -> tuple[int, dict[str, Any]]:
+    """The line and the local variables of the innermost function of generated code."""
+    line, variables = 0, {}
+    while traceback is not None:
+        if traceback.tb_frame.f_code.co_filename == FILENAME:
+            line, variables = traceback.tb_lineno, traceback.tb_frame.f_locals
+        traceback = traceback.tb_next
+    return line, variables

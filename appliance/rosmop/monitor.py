@@ -1,0 +1,102 @@
+"""A running specification: its events as functions, the runs of its properties, its timers."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.rosmop.compile.events import EventCode
+from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
+from appliance.rosmop.logics.interface import Run
+from appliance.rosmop.runtime.context import Context
+from appliance.rosmop.runtime.wire import Message
+from appliance.rosmop.syntax import tree
+
+Handler = Callable[[Message | None], None]
+
+
+@dataclass(eq=False, slots=True)
+class RunningProperty:
+    """A property of a running specification: the monitor of its formula, and its handlers in source order."""
+
+    index: int
+    code: PropertyCode
+    handlers: tuple[tuple[str, Handler], ...]
+    run: Run
+
+
+@dataclass(eq=False, slots=True)
+class Step:
+    """What one event does with a message: its function, then its properties.
+
+    `past` counts how often the event did not happen because an index was past the end, since `told`.
+    """
+
+    monitor: "Monitor"
+    event: EventCode
+    index: int
+    name: str
+    function: Callable[[Message | None], bool]
+    past: int = 0
+    told: int | None = None
+
+
+@dataclass(eq=False, slots=True)
+class Timer:
+    """An event that happens every so often; `due` is the time of its next tick, None while it does not run."""
+
+    step: Step
+    period: int
+    due: int | None = None
+    ticked: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class Monitor:
+    """A running specification."""
+
+    code: SpecificationCode
+    node: tree.Specification
+    context: Context
+    properties: tuple[RunningProperty, ...]
+    steps: tuple[Step, ...] = ()
+    timers: tuple[Timer, ...] = ()
+    enabled: bool = True
+    held: bool = False
+    faults: int = 0
+    seen: bool = False
+    """A message of one of its events has come."""
+
+    @property
+    def name(self) -> str:
+        """The name of the specification."""
+        return self.code.name
+
+
+def monitors_of(compiled: Compiled, nodes: list[tree.Specification], time_ns: int) -> tuple[Monitor, ...]:
+    """The running forms of compiled specifications, in their initial state."""
+    return tuple(
+        _monitor(compiled, code, node, time_ns)
+        for code, node in zip(compiled.specifications, nodes, strict=True)
+    )
+
+
+def _monitor(compiled: Compiled, code: SpecificationCode, node: tree.Specification, time_ns: int) -> Monitor:
+    names = compiled.namespace
+    properties = tuple(
+        RunningProperty(
+            index,
+            each,
+            tuple((category, names[each.handlers[category]]) for category in each.order),
+            each.property.start(time_ns),
+        )
+        for index, each in enumerate(code.properties)
+    )
+    monitor = Monitor(code, node, names[code.context], properties)
+    steps = [
+        Step(monitor, event, index, f"{code.name}.{event.name}", names[event.function])
+        for index, event in enumerate(code.events)
+    ]
+    monitor.steps = tuple(step for step in steps if step.event.period_ns is None)
+    monitor.timers = tuple(
+        Timer(step, step.event.period_ns) for step in steps if step.event.period_ns is not None
+    )
+    return monitor

@@ -1,0 +1,153 @@
+"""The bounds of one specification's actions, and what they hand out: log lines, published messages, faults.
+
+Invariants:
+
+1. Between two calls of `begin` a specification spends at most its budget of instructions; loops, calls and
+   copies of anything long are charged before they are done.
+2. The values of a specification never hold more than `MAX_BYTES` plus `UNMEASURED` bytes. Whatever makes
+   something long says so to `allocate`; when enough has been said, the live values are measured.
+"""
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import FrameType
+
+BUDGET = 1_000_000
+"""Instructions that a specification may spend on one message."""
+
+MAX_BYTES = 16 << 20
+"""Bytes that the values of a specification may hold together."""
+
+UNMEASURED = 1 << 20
+"""Bytes that may be made between two measurements."""
+
+MAX_CALLS = 100
+"""Calls of recursive helper functions inside each other."""
+
+BYTES_PER_INSTRUCTION = 16
+OUTPUT_COST = 100  # instructions for a line of output or a published message
+FOLDED_NS = 60 * 10**9  # an event that does not happen for an index past the end is told once in this time
+
+Measure = Callable[[object], int]
+
+
+class FaultError(Exception):
+    """An action cannot go on: at which site, and why."""
+
+    def __init__(self, site: int, text: str) -> None:
+        super().__init__(text)
+        self.site = site
+        self.text = text
+
+
+class MalformedError(Exception):
+    """The bytes of a message are not of its type."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """A line of output: `level` is DEBUG, INFO, WARN, ERROR or FATAL."""
+
+    level: str
+    text: str
+    monitor: str
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A message to be published."""
+
+    topic: str
+    type: str
+    data: bytes
+
+
+@dataclass(slots=True)
+class Turn:
+    """What the actions run for one message (or one tick) share: its time, and what comes out."""
+
+    now: int = 0
+    log: list[LogLine] = field(default_factory=list)
+    published: list[Published] = field(default_factory=list)
+    reset: bool = False  # `__RESET;` was met, for the property whose handlers run
+
+
+class Context:
+    """One specification: its name, what it has left of its budget, and where its output goes."""
+
+    __slots__ = ("_allocated", "_measures", "_pending", "budget", "monitor", "throttled", "turn")
+
+    def __init__(self, monitor: str, turn: Turn, measures: Mapping[str, Measure]) -> None:
+        self.monitor = monitor
+        self.turn = turn
+        self.budget = BUDGET
+        self.throttled: dict[int, int] = {}
+        self._allocated = 0
+        self._measures = measures  # of the variables of the generated code, by name
+        self._pending = 0
+
+    def begin(self) -> None:
+        """A new message: the whole budget."""
+        self.budget = BUDGET
+
+    def spend(self, instructions: int, site: int) -> None:
+        """Take from the budget; a fault if nothing is left."""
+        self.budget -= instructions
+        if self.budget < 0:
+            raise FaultError(
+                site, f"more than {BUDGET} instructions for one message; is there a loop without end?"
+            )
+
+    def allocate(self, size: int, site: int) -> None:
+        """`size` bytes are about to be made, or copied."""
+        if size > MAX_BYTES:
+            raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
+        self.spend(size // BYTES_PER_INSTRUCTION, site)
+        self._allocated += size
+        if self._allocated > UNMEASURED:
+            self._measure(size, site)
+
+    def log(self, level: str, text: bytes, site: int) -> None:
+        """A line of output. Bytes that are not UTF-8 are shown as U+FFFD."""
+        self.spend(OUTPUT_COST + len(text) // BYTES_PER_INSTRUCTION, site)
+        line = text.decode("utf-8", "replace").rstrip("\n")
+        self.turn.log.append(LogLine(level, line, self.monitor))
+
+    def throttle(self, period: float, site: int) -> bool:
+        """Whether output at this site is due: the last was at least `period` seconds ago."""
+        now = self.turn.now
+        last = self.throttled.get(site)
+        if last is not None and last <= now < last + period * 1e9:
+            return False
+        self.throttled[site] = now
+        return True
+
+    def publish(self, topic: str, kind: str, data: bytes, site: int) -> None:
+        """A message to be published."""
+        self.spend(OUTPUT_COST, site)
+        self.allocate(len(data), site)
+        self._pending += len(data)
+        self.turn.published.append(Published(topic, kind, data))
+
+    def _measure(self, size: int, site: int) -> None:
+        held = size + sum(len(message.data) for message in self.turn.published)
+        frame: FrameType | None = sys._getframe(2)  # the locals of the calling actions count, too
+        shared: Mapping[str, object] = {}
+        while frame is not None:
+            if frame.f_globals.get("__rv__") is self._measures:
+                shared = frame.f_globals
+                held += self._held(frame.f_locals)
+            frame = frame.f_back
+        held += self._held(shared)
+        self._allocated = 0
+        self.spend(held // (BYTES_PER_INSTRUCTION * 64), site)
+        if held > MAX_BYTES:
+            raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
+
+    def _held(self, variables: Mapping[str, object]) -> int:
+        measures = self._measures
+        return sum(measures[name](value) for name, value in variables.items() if name in measures)
+
+
+_TOO_LARGE = f"the values of a specification may hold {MAX_BYTES >> 20} MiB together"

@@ -1,0 +1,189 @@
+"""Strings: bytes, as in C++. They never change; a change of one character makes a new string."""
+
+import re
+
+from appliance.rosmop.runtime.context import Context, FaultError
+
+NOT_FOUND = (1 << 64) - 1
+"""`std::string::npos`."""
+
+_LONG = 64  # bytes; shorter strings are not charged
+_INTEGER = re.compile(rb"\s*([+-]?)(0[xX][0-9a-fA-F]+|[0-9]+)")
+_FLOATING = re.compile(
+    rb"\s*([+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf(?:inity)?|nan))", re.IGNORECASE
+)
+
+
+def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
+    """`left + right`."""
+    size = len(left) + len(right)
+    if size > _LONG:
+        context.allocate(size, site)
+    return left + right
+
+
+def repeat(context: Context, count: int, character: int, site: int) -> bytes:
+    """`std::string(count, character)`."""
+    context.allocate(count, site)
+    return bytes((character & 0xFF,)) * count
+
+
+def character(text: bytes, index: int, site: int) -> int:
+    """`text[index]`, a signed char. The one after the last is 0."""
+    if 0 <= index < len(text):
+        value = text[index]
+        return value - 256 if value > 127 else value
+    if index == len(text):
+        return 0
+    raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+
+
+def member(text: bytes, index: int, site: int) -> int:
+    """`text.at(index)`, `front` and `back`: like `character`, but the one after the last is a fault."""
+    if index == len(text):
+        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+    return character(text, index, site)
+
+
+def with_character(context: Context, text: bytes, index: int, value: int, site: int) -> bytes:
+    """`text` after `text[index] = value`."""
+    if not 0 <= index < len(text):
+        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+    if len(text) > _LONG:
+        context.allocate(len(text), site)
+    return text[:index] + bytes((value & 0xFF,)) + text[index + 1 :]
+
+
+def substring(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
+    """`text.substr(start, count)`."""
+    if start > len(text):
+        raise FaultError(site, f"substr from {start}, past the end of a string of {len(text)} characters")
+    result = text[start : start + count]
+    if len(result) > _LONG:
+        context.allocate(len(result), site)
+    return result
+
+
+def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.find(wanted, start)`."""
+    context.spend(len(text) // 16, site)
+    found = text.find(wanted, start) if start <= len(text) else -1
+    return NOT_FOUND if found < 0 else found
+
+
+def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.rfind(wanted, start)`."""
+    context.spend(len(text) // 16, site)
+    found = text.rfind(wanted, 0, min(start, len(text)) + len(wanted))
+    return NOT_FOUND if found < 0 else found
+
+
+def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.find_first_of(wanted, start)`."""
+    context.spend(len(text), site)
+    return next((index for index in range(start, len(text)) if text[index] in wanted), NOT_FOUND)
+
+
+def compare(left: bytes, right: bytes) -> int:
+    """`left.compare(right)`, `strcmp`."""
+    return (left > right) - (left < right)
+
+
+def resize(context: Context, text: bytes, size: int, value: int, site: int) -> bytes:
+    """`text` after `text.resize(size, value)`."""
+    context.allocate(size, site)
+    return text[:size].ljust(size, bytes((value & 0xFF,)))
+
+
+def erase(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
+    """`text` after `text.erase(start, count)`."""
+    if start > len(text):
+        raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text), site)
+    return text[:start] + text[start + count :]
+
+
+def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -> bytes:
+    """`text` after `text.insert(start, added)`."""
+    if start > len(text):
+        raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text) + len(added), site)
+    return text[:start] + added + text[start:]
+
+
+def replace(context: Context, text: bytes, start: int, count: int, added: bytes, site: int) -> bytes:  # noqa: PLR0917  the arguments are C++'s
+    """`text` after `text.replace(start, count, added)`."""
+    if start > len(text):
+        raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text) + len(added), site)
+    return text[:start] + added + text[start + count :]
+
+
+def shorten(text: bytes, site: int) -> bytes:
+    """`text` after `text.pop_back()`."""
+    if not text:
+        raise FaultError(site, "pop_back of an empty string")
+    return text[:-1]
+
+
+def filled(buffer: bytes, text: bytes, site: int) -> bytes:
+    """A `char` buffer after `strcpy(buffer, text)`."""
+    copied = text.split(b"\0", 1)[0] + b"\0"
+    if len(copied) > len(buffer):
+        raise FaultError(site, f"strcpy of {len(copied)} characters into a buffer of {len(buffer)}")
+    return copied + buffer[len(copied) :]
+
+
+def filled_at_most(buffer: bytes, text: bytes, count: int, site: int) -> bytes:
+    """A `char` buffer after `strncpy(buffer, text, count)`."""
+    if count > len(buffer):
+        raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
+    copied = text.split(b"\0", 1)[0][:count]
+    return copied + b"\0" * (count - len(copied)) + buffer[count:]
+
+
+def extended(buffer: bytes, text: bytes, site: int) -> bytes:
+    """A `char` buffer after `strcat(buffer, text)`."""
+    return filled(buffer, terminated(buffer) + terminated(text), site)
+
+
+def terminated(buffer: bytes) -> bytes:
+    """The string in a `char` buffer: up to the first zero."""
+    return buffer.split(b"\0", 1)[0]
+
+
+def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
+    """`std::stoi` and its like; a fault where C++ throws."""
+    found = _INTEGER.match(text[:1000])
+    if found is None:
+        raise FaultError(site, "the string does not begin with a number")
+    digits = found[2].decode()
+    if base == 10 and digits[:2] in ("0x", "0X"):
+        digits = "0"
+    try:
+        value = int(found[1].decode() + digits, 16 if digits[:2] in ("0x", "0X") else base)
+    except ValueError:
+        raise FaultError(site, "the string does not begin with a number of this base") from None
+    if not least <= value <= most:
+        raise FaultError(site, f"the number does not fit; it must be from {least} to {most}")
+    return value
+
+
+def parse_floating(text: bytes, site: int) -> float:
+    """`std::stod`; a fault where C++ throws."""
+    found = _FLOATING.match(text[:1000])
+    if found is None:
+        raise FaultError(site, "the string does not begin with a number")
+    return float(found[1])
+
+
+def lenient_integer(text: bytes) -> int:
+    """`atoi`: 0 for what is no number."""
+    found = re.match(rb"\s*[+-]?[0-9]{1,18}", text[:1000])
+    return int(found[0]) if found else 0
+
+
+def lenient_floating(text: bytes) -> float:
+    """`atof`: 0 for what is no number."""
+    found = _FLOATING.match(text[:1000])
+    return float(found[1]) if found else 0.0

@@ -1,0 +1,97 @@
+"""Vectors: Python lists. Functions that make something long charge for it first.
+
+`width` is the bytes that C++ takes for an element; it is what counts for the limit on memory.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from appliance.rosmop.runtime.context import Context, FaultError
+
+Values = list[Any]
+
+
+def element(values: Values, index: int, site: int) -> Any:
+    """`values[index]`."""
+    if 0 <= index < len(values):
+        return values[index]
+    raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
+
+
+def put(values: Values, index: int, value: Any, site: int) -> Any:
+    """`values[index] = value`; the value."""
+    if 0 <= index < len(values):
+        values[index] = value
+        return value
+    raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
+
+
+def put_slot(record: Values, slot: int, value: Any) -> Any:
+    """Set a field of a message; the value."""
+    record[slot] = value
+    return value
+
+
+def append(context: Context, values: Values, value: Any, width: int, site: int) -> None:
+    """`values.push_back(value)`."""
+    context.allocate(width, site)
+    values.append(value)
+
+
+def pop(values: Values, site: int) -> None:
+    """`values.pop_back()`."""
+    if not values:
+        raise FaultError(site, "pop_back of an empty vector")
+    values.pop()
+
+
+def copied(context: Context, values: Values, width: int, site: int) -> Values:
+    """A copy of a vector of numbers, strings or times."""
+    context.allocate(len(values) * width, site)
+    return values.copy()
+
+
+def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
+    """A copy of a vector of vectors or messages; `copy` copies an element."""
+    context.allocate(len(values) * width, site)
+    return [copy(context, value, site) for value in values]
+
+
+def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
+    """`count` new elements."""
+    context.allocate(count * width, site)
+    context.spend(count // 4, site)
+    return [make() for _ in range(count)]
+
+
+def resized(  # noqa: PLR0917  the arguments are C++'s
+    context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
+) -> None:
+    """`values.resize(count)`."""
+    more = count - len(values)
+    if more <= 0:
+        del values[count:]
+        return
+    values += filled(context, more, make, width, site)
+
+
+def assigned(values: Values, others: Values) -> Values:
+    """Put other elements in the place of all of a vector's."""
+    values[:] = others
+    return values
+
+
+def filled_with(  # noqa: PLR0917  the arguments are C++'s
+    context: Context, count: int, value: Any, copy: Callable[[Any], Any], width: int, site: int
+) -> Values:
+    """`std::vector<T>(count, value)`."""
+    context.allocate(count * width, site)
+    context.spend(count // 4, site)
+    return [copy(value) for _ in range(count)]
+
+
+def fixed(values: Values, count: int, site: int) -> Values:
+    """The elements for an array of fixed length: exactly so many."""
+    if len(values) != count:
+        raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
+    return values

@@ -1,0 +1,169 @@
+"""The bytes of messages: pieces of decoding and encoding that generated code is made of.
+
+`buffer` is anything with the buffer interface that indexes bytes (bytes, bytearray, memoryview); positions count
+from its start. Reading past the end raises `MalformedError` or `struct.error`.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from appliance.rosmop.runtime.context import Context, MalformedError
+from appliance.rosmop.runtime.times import with_part
+
+Buffer = bytes | bytearray | memoryview
+
+_LENGTH = struct.Struct("<I")
+_MAX_EMPTY = 1_000_000  # elements without bytes that one array may have
+
+
+def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
+    """The string at `start`, and where it ends."""
+    first = start + 4
+    end = first + _LENGTH.unpack_from(buffer, start)[0]
+    if end > len(buffer):
+        raise MalformedError(f"a string ends at byte {end} of a message of {len(buffer)}")
+    return bytes(buffer[first:end]), end
+
+
+def text_end(buffer: Buffer, start: int) -> int:
+    """Where the string at `start` ends."""
+    return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
+
+
+def count(buffer: Buffer, start: int, least: int) -> int:
+    """How many elements the array at `start` has; each takes at least so many bytes."""
+    number: int = _LENGTH.unpack_from(buffer, start)[0]
+    if number * least > len(buffer) - start - 4 or (not least and number > _MAX_EMPTY):
+        raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
+    return number
+
+
+def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tuple[list[Any], int]:
+    """`number` values of one `struct` code, and where they end."""
+    end = start + number * size
+    if end > len(buffer):
+        raise MalformedError(f"an array ends at byte {end} of a message of {len(buffer)}")
+    if code == "B":
+        return list(bytes(buffer[start:end])), end
+    return list(struct.unpack_from(f"<{number}{code}", buffer, start)), end
+
+
+def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[int], int]:
+    """`number` times (code `I`) or durations (`i`) as nanoseconds, and where they end."""
+    pairs, end = numbers(buffer, start, 2 * number, code, 4)
+    return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
+
+
+def elements(
+    buffer: Buffer, start: int, number: int, decode: Callable[[Buffer, int], tuple[Any, int]]
+) -> tuple[list[Any], int]:
+    """`number` values, each by `decode`, and where they end."""
+    values = []
+    for _ in range(number):
+        value, start = decode(buffer, start)
+        values.append(value)
+    return values, start
+
+
+def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int]) -> int:
+    """Where `number` elements end, each of which ends where `end` says."""
+    for _ in range(number):
+        start = end(buffer, start)
+    return start
+
+
+def put_text(value: bytes, out: bytearray) -> None:
+    """Append a string."""
+    out += len(value).to_bytes(4, "little")
+    out += value
+
+
+def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
+    """Append values of one `struct` code."""
+    out += struct.pack(f"<{len(values)}{code}", *values)
+
+
+def put_moments(values: list[int], code: str, out: bytearray) -> None:
+    """Append times (code `I`) or durations (`i`)."""
+    out += struct.pack(
+        f"<{2 * len(values)}{code}", *(part for v in values for part in divmod(v, 1_000_000_000))
+    )
+
+
+class Message:
+    """The message that events look at: its bytes as changed so far, and what has become of it."""
+
+    __slots__ = ("_owned", "buffer", "dropped", "original", "past", "time")
+
+    def __init__(self, buffer: Buffer, time: int) -> None:
+        self.buffer = buffer
+        self.time = time
+        self.original: bytes | None = None  # the bytes as received, once something was changed
+        self.dropped = False
+        self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
+        self._owned = isinstance(buffer, bytearray) or (
+            isinstance(buffer, memoryview) and not buffer.readonly
+        )
+
+    @property
+    def changed(self) -> bool:
+        """Whether the bytes differ from those received."""
+        return self.original is not None and self.buffer != self.original
+
+    def patch(self, start: int, new: bytes) -> None:
+        """Put bytes in the place of as many."""
+        end = start + len(new)
+        if self.buffer[start:end] != new:
+            self._keep()
+            if not self._owned:
+                self.buffer = bytearray(self.buffer)
+                self._owned = True
+            self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
+
+    def splice(self, edits: list[tuple[int, int, bytes]]) -> None:
+        """Put bytes in the place of those from the first to before the second number, for every edit."""
+        if all(len(new) == end - start for start, end, new in edits):
+            for start, _, new in edits:
+                self.patch(start, new)
+            return
+        self._keep()
+        pieces = []
+        last = 0
+        for start, end, new in sorted(edits):
+            pieces += [bytes(self.buffer[last:start]), new]
+            last = end
+        pieces.append(bytes(self.buffer[last:]))
+        self.buffer = bytearray(b"".join(pieces))
+        self._owned = True
+
+    def _keep(self) -> None:
+        if self.original is None:
+            self.original = bytes(self.buffer)
+
+
+def whole(
+    message: Message,
+    context: Context,
+    decode: Callable[[Buffer, int], tuple[Any, int]],
+    pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
+    site: int,
+) -> list[Any]:
+    """All of a message, with the fields that the running action has assigned: (whether it has, path, value)."""
+    context.allocate(len(message.buffer), site)
+    value: list[Any] = decode(message.buffer, 0)[0]
+    for assigned, path, new in pending:
+        if assigned:
+            _set(value, path, new, site)
+    return value
+
+
+def _set(value: list[Any], path: tuple[int | str, ...], new: Any, site: int) -> None:
+    *above, last = path
+    for index in above[:-1] if isinstance(last, str) else above:
+        value = value[index]  # type: ignore[index]  # only the last is the part of a time
+    if isinstance(last, str):
+        place = above[-1]
+        value[place] = with_part(value[place], last, new, site)  # type: ignore[index]
+    else:
+        value[last] = new
