@@ -46,7 +46,8 @@ class RelayProcess:
             "descriptors": _raise_descriptor_limit(2 * self._limits.connections + _DESCRIPTORS_BESIDE),
         }
         level = logging.INFO if detail["congestion"] == "cubic" else logging.WARNING
-        logging.getLogger(__name__).log(level, "relay %s serves: %s", self._index, detail)
+        said = ", ".join(f"{name} {value}" for name, value in detail.items() if name != "index")
+        logging.getLogger(__name__).log(level, "relay %s serves: %s", self._index, said)
         self._lifeline.send(Ready(detail))
         self._loop.run()
         self._engine.close()

@@ -28,6 +28,9 @@ from appliance.relay.frames import Batch, MemoryBudget
 class Member(Protocol):
     """A subscriber, as its topic sees it."""
 
+    caller_id: str
+    """Who it says it is."""
+
     behind_since: float | None
     """When so much waited for it first that it is behind; None once it has caught up completely."""
 
@@ -62,6 +65,9 @@ class Upstream(Protocol):
 
     def resume(self) -> None:
         """Read on."""
+
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """These are served now, of a topic of this type."""
 
 
 class RelayedTopic:
@@ -112,6 +118,7 @@ class RelayedTopic:
         """A subscriber's connection is closed."""
         self._waiting = tuple(one for one in self._waiting if one is not member)
         self._served = tuple(one for one in self._served if one is not member)
+        self._announce()
         self._reported = False
         self._forget_header()
         self.relieve()
@@ -130,6 +137,7 @@ class RelayedTopic:
         waiting, self._waiting = self._waiting, ()
         for member in waiting:
             self._serve(member, header)
+        self._announce()
         if self.members and self.upstream is not None:
             self.upstream.want()
 
@@ -184,6 +192,7 @@ class RelayedTopic:
         if not member.greet(header):
             return
         self._served += (member,)
+        self._announce()
         self._reported = False
         if self._latched is not None:
             member.deliver(self._latched)
@@ -193,6 +202,12 @@ class RelayedTopic:
         """Without a connection the header is only good for those who have been given it."""
         if not self._connected and not self._served:
             self._header = None
+
+    def _announce(self) -> None:
+        """Tell the upstream who is served."""
+        if self.upstream is not None and self._header is not None:
+            names = frozenset(member.caller_id for member in self._served)
+            self.upstream.announce(names, self._header.get("type", ""))
 
     def _latch(self, batch: Batch | None) -> None:
         """Remember the last message; it counts as memory in use."""

@@ -14,6 +14,7 @@ from appliance.channel.messages import UpstreamLost, UpstreamWanted
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import FrameReceiver
 from appliance.relay.loop import READ, Timer
+from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.relay.topic import RelayedTopic
 from appliance.ros.errors import PeerError
@@ -43,6 +44,8 @@ class Publisher:
         self._socket: socket.socket | None = None
         self._recv_into: Callable[[memoryview], int]
         self._parser = HeaderParser(limits.header_bytes)
+        self._address = ("", 0)
+        self._presences = Presences(context, topic.topic)
 
     def want(self) -> None:
         """Somebody is to be served: connect unless that is done or under way."""
@@ -75,6 +78,7 @@ class Publisher:
         if not self._asked:
             return
         self._asked = False
+        self._address = (host, port)
         try:
             sock = begin_connect(host, port)
         except (OSError, OverflowError) as error:
@@ -113,6 +117,11 @@ class Publisher:
             self._pause = None
             if self._socket is not None:
                 self._loop.watch(self._socket.fileno(), READ, self._ready)
+
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """Who is served: the publishers of some types must see it by name."""
+        if self._socket is not None and looks_for_names(type_name):
+            self._presences.want(names, self._address)
 
     def _connected(self) -> None:
         fields = {
@@ -206,6 +215,7 @@ class Publisher:
         self._drop_connection()
 
     def _drop_connection(self) -> None:
+        self._presences.close()
         if self._stream is not None:
             self._stream.close()
             self._stream = None

@@ -22,6 +22,7 @@ class RecordedUpstream:
 
     def __init__(self) -> None:
         self.asked: list[str] = []
+        self.announced: tuple[list[str], str] = ([], "")
 
     def want(self) -> None:
         """Somebody is there."""
@@ -39,11 +40,16 @@ class RecordedUpstream:
         """Read."""
         self.asked.append("resume")
 
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """These are served."""
+        self.announced = (sorted(names), type_name)
+
 
 class RecordedMember:
     """A subscriber that takes everything until it is told that it is behind."""
 
-    def __init__(self, *, fits: bool = True) -> None:
+    def __init__(self, *, fits: bool = True, caller_id: str = "/listener") -> None:
+        self.caller_id = caller_id
         self.header: Mapping[str, str] = {}
         self.received = b""
         self.behind_since: float | None = None
@@ -254,3 +260,16 @@ def test_a_withdrawn_topic_cuts_who_is_served_and_who_waits() -> None:
     waiting = other.join()
     other.topic.cut_all("gone")
     assert waiting.was_cut == "gone"
+
+
+def test_the_upstream_hears_who_is_served() -> None:
+    """By name and type: when a subscriber is served, and when one leaves."""
+    scene = Story()
+    topic, upstream = scene.topic, scene.upstream
+    one, other = RecordedMember(caller_id="/one"), RecordedMember(caller_id="/other")
+    topic.join(one)
+    topic.upstream_opened({"type": "actionlib/TestActionGoal", "md5sum": "*"})
+    topic.join(other)
+    assert upstream.announced == (["/one", "/other"], "actionlib/TestActionGoal")
+    topic.leave(one)
+    assert upstream.announced == (["/other"], "actionlib/TestActionGoal")
