@@ -11,6 +11,7 @@ Invariants:
 
 import asyncio
 import contextlib
+import contextvars
 import itertools
 import sqlite3
 import threading
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
+import structlog
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.folding import Folder, FoldSettings, Key, summary
@@ -46,6 +48,7 @@ _AGE_SECONDS = 3600.0
 _HOUSE_SECONDS = 10.0
 _ASK_AGAIN_SECONDS = 30.0
 _WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
+_logger = structlog.get_logger()
 
 
 class Lag(NamedTuple):
@@ -135,7 +138,10 @@ class AuditLog:
         self._hurry = threading.Event()
         self._stopping = threading.Event()
         self._opened = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="audit log", daemon=True)
+        said_with_logs = contextvars.copy_context()  # which process this is
+        self._thread = threading.Thread(
+            target=said_with_logs.run, args=(self._run,), name="audit log", daemon=True
+        )
         self._thread.start()
         self._opened.wait()
 
@@ -342,10 +348,11 @@ class AuditLog:
             self._degraded = None
 
     def _fail(self, error: Exception) -> None:
-        if self._failed_since == 0:
-            self._failed_since = self._clock()
         reason = str(error)
         self._failed = reason if str(self.path) in reason else f"{self.path}: {reason}"
+        if self._failed_since == 0:
+            self._failed_since = self._clock()
+            _logger.error("the audit log cannot be written", reason=self._failed)
         if self._writer is not None:
             writer, self._writer = self._writer, None
             with contextlib.suppress(sqlite3.Error):
@@ -386,6 +393,8 @@ class AuditLog:
             self._folder.touched.difference_update(touched)
             self._unsealed += len(batch) + len(report)
             self._caught_up = self._written_at = time.monotonic()
+            if self._failed_since:
+                _logger.warning("the audit log is written again")
             self._failed, self._failed_since = None, 0
             if self._lost.count:
                 self._held.append(

@@ -4,6 +4,7 @@ Strangers' text is escaped (`printable`) and handed to the terminal as text, nev
 """
 
 import sys
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -122,8 +123,12 @@ def _joined(*parts: str | None) -> str:
 
 
 def _why(record: Record) -> str:
-    rule = _rule(record)
-    return printable(record.reason) + (f" ({printable(rule)})" if rule and rule not in record.reason else "")
+    """The reason; the rule unless the reason names its place; how often, where one record stands for many."""
+    rule = record.rule
+    named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
+    why = record.reason if named else f"{record.reason} ({_rule(record)})"
+    count = record.detail.get("count") if record.event == "denials folded" else None
+    return printable(f"{count} more: {why}" if count else why)
 
 
 def _rule(record: Record) -> str | None:

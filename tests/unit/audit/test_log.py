@@ -13,6 +13,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+import structlog
 
 from appliance.audit.folding import FoldSettings
 from appliance.audit.log import AuditLog
@@ -216,6 +217,28 @@ def test_full_disk(small_disk: Path) -> None:
     assert all("full" in report.record.reason for report in reports)
     assert log.close() is None
     assert verify(path).ok
+
+
+def test_failure_and_recovery_are_logged_once(small_disk: Path) -> None:
+    """Who reads standard error learns that nothing is recorded, with the file and the reason, and when it is over."""
+    filler = small_disk / "filler"
+    with structlog.testing.capture_logs() as said:
+        log = AuditLog(small_disk / "audit.db")
+        assert settle(log) is None
+        fill(filler)
+        while log.failed is None:
+            log.record(decision(log))
+            settle(log)
+        settle(log)
+        filler.unlink()
+        await_state(log, failed=False)
+        assert log.close() is None
+    assert [one["event"] for one in said] == [
+        "the audit log cannot be written",
+        "the audit log is written again",
+    ]
+    assert str(small_disk / "audit.db") in said[0]["reason"]
+    assert "full" in said[0]["reason"]
 
 
 def test_queue_is_bounded_and_says_what_was_lost(small_disk: Path) -> None:

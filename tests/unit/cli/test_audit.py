@@ -99,6 +99,20 @@ def test_search_in_a_pipe_is_plain_lines(state: Path) -> None:
     assert line.isprintable()
 
 
+def test_repetitions_say_how_many(tmp_path: Path) -> None:
+    """Repetitions of a denial say how many they were; a rule that the reason names is not named again."""
+    (tmp_path / "control").mkdir()
+    log = AuditLog(tmp_path / "control" / "audit.db")
+    for _ in range(4):
+        log.record(
+            decision(log, decision="deny", reason="only ocu may, by [Publishers] /cmd_* (robot.ini:12)")
+        )
+    log.close()
+    folded, first = rosrv("search", "--deny", state=tmp_path).stdout.splitlines()
+    assert folded.endswith(": 3 more: only ocu may, by [Publishers] /cmd_* (robot.ini:12)")
+    assert first.endswith(": only ocu may, by [Publishers] /cmd_* (robot.ini:12)")
+
+
 def test_search_on_a_terminal_is_a_table(state: Path) -> None:
     """On a terminal there is a table, and nothing of a stranger's text is interpreted."""
     ours, theirs = pty.openpty()
