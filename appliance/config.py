@@ -135,8 +135,8 @@ class Liveness(_Section):
 class Relay(_Section):
     """What the relay accepts and holds; each key is a field of `appliance.relay.limits.Limits`."""
 
-    connections: Count = Field(default=4096, description="of all hosts")
-    connections_per_host: Count = 512
+    connections: Count = Field(default=16_384, description="of all hosts")
+    connections_per_host: Count = 8_192
     header_bytes: Size = Field(default=ByteSize(64 << 10), description="TCPROS connection header")
     header_seconds: Seconds = Field(default=10, description="until the connection header must be there")
     message_bytes: Size = Field(default=ByteSize(256 << 20), ge=1 << 20, description="one message")
@@ -187,7 +187,7 @@ class Settings(_Section):
         description="loopback port of the hidden ROSMaster; 0: any free one",
     )
     isolation: Literal["container", "netns", "none"] = Field(
-        default="none", description="where the appliance lives; none: no firewall, for development only"
+        default="netns", description="where the appliance lives; none: no firewall, for development only"
     )
     relaying: Literal["all", "monitored"] = Field(
         default="all",

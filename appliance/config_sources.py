@@ -31,6 +31,7 @@ _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN"}
 # What Kubernetes and container links put there for a service that happens to be named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
 _PATH_KEYS = ("policy", "state")
+_FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 
 KeyPath = tuple[str | int, ...]
 
@@ -129,7 +130,7 @@ class _Gathered:
     def add_flags(self, flags: Mapping[str, Any]) -> None:
         for key, value in flags.items():
             if value is not None:
-                self._set((key,), value, "--" + key.replace("_", "-"))
+                self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
 
     def settings(self) -> Settings:
         try:
@@ -180,9 +181,10 @@ class _Gathered:
             return Mistake(place, _unknown_key(path))
         if kind == "missing":
             return Mistake(place, f"{_dotted(path)} must be given")
-        if kind == "value_error" and context:
-            text = str(context["error"])
-        return Mistake(place, f"{_dotted(path)}: {text[:1].lower()}{text[1:]}, not {self._value_at(path)!r}")
+        if kind == "value_error" and context:  # a sentence of ours, which names the value where that helps
+            return Mistake(place, f"{_about(path, place)}{context['error']}")
+        text = f"{text[:1].lower()}{text[1:]}, not {self._value_at(path)!r}"
+        return Mistake(place, f"{_about(path, place)}{text}")
 
     def _place_of(self, path: KeyPath) -> str:
         for length in range(len(path), 0, -1):
@@ -201,6 +203,11 @@ class _Gathered:
             except (KeyError, IndexError, TypeError):
                 break
         return str(value) if isinstance(value, Path) else value
+
+
+def _about(path: KeyPath, place: str) -> str:
+    """Which key a mistake is about, unless its place is the flag of that name."""
+    return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
 
 
 def _dotted(path: KeyPath) -> str:

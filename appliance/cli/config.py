@@ -14,6 +14,7 @@ from appliance.config_sources import ConfigError, resolve
 
 app = typer.Typer(help="Check or show the configuration.", no_args_is_help=True)
 
+_CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
 _File = Annotated[
     Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
 ]
@@ -21,13 +22,13 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 
 
 @app.command()
-def check(config: _File = None, as_json: _Json = False) -> None:
+def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
     """Report every mistake in the file and the environment; exit status 1 when there is one.
 
-    Example: rosrv config check --config appliance.yaml
+    Example: rosrv config check appliance.yaml
     """
     try:
-        resolve(config, os.environ, {})
+        resolve(file or config, os.environ, {})
     except ConfigError as error:
         if not as_json:
             raise

@@ -32,6 +32,14 @@ class PolicyRefusedError(Exception):
         self.findings = findings
 
 
+def _said(error: OSError | UnicodeDecodeError) -> str:
+    return (
+        error.strerror or str(error)
+        if isinstance(error, OSError)
+        else f"it is not UTF-8 text: {error.reason}"
+    )
+
+
 class RevisionChangedError(Exception):
     """Another revision came into force than the one the change was meant for; the text says which."""
 
@@ -203,7 +211,7 @@ class Policies:
         try:
             return self.file.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {error}"]) from error
+            raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 
     def _compile(self, text: str, file: str) -> Policy:
         try:
@@ -218,7 +226,9 @@ class Policies:
         except FileNotFoundError:
             return
         except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError([f"{cases}: the policy's tests cannot be read: {error}"]) from error
+            raise PolicyRefusedError(
+                [f"{cases}: the policy's tests cannot be read: {_said(error)}"]
+            ) from error
         try:
             failed = [str(one) for one in run_cases(policy, text, str(cases)) if not one.passed]
         except PolicyError as error:

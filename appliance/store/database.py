@@ -38,7 +38,7 @@ class Database:
             self._connection.execute("PRAGMA synchronous=NORMAL")
             self._connection.executescript(schema)
         except sqlite3.Error as error:
-            raise StoreError(f"{path}: {error}; move the file away to start with an empty state") from error
+            raise StoreError(f"{path}: {error}; {_advice(error)}") from error
         self._queue: queue.SimpleQueue[tuple[str, Parameters] | Callable[[], None] | None] = (
             queue.SimpleQueue()
         )
@@ -110,6 +110,13 @@ class Database:
                     return
             else:
                 return
+
+
+def _advice(error: sqlite3.Error) -> str:
+    # Subclasses are about the place (a full disk, a lock, rights); the class itself means that the content is wrong.
+    if type(error) is sqlite3.DatabaseError:
+        return "move the file away to start with an empty state"
+    return "make room there and let it be written, or name another directory with --state DIR"
 
 
 def _call_back(loop: asyncio.AbstractEventLoop, tell: Callable[[], None]) -> None:

@@ -32,7 +32,7 @@ def test_later_sources_override_earlier_ones(file: Path) -> None:
     assert settings.listen == "127.0.0.1:3"
     assert settings.rosmaster_port == 2
     assert (settings.limits.nesting, settings.limits.elements) == (9, 8)
-    assert settings.isolation == "none"
+    assert settings.isolation == "netns"
 
 
 def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
@@ -48,7 +48,7 @@ def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
         one.startswith(f"{file}:6: audit.durability: ") and "'strict' or 'batched'" in one for one in found
     )
     assert any(one.startswith("ROSRV_RELAYS: relays: ") for one in found)
-    assert any(one.startswith("--isolation: isolation: ") and "'vm'" in one for one in found)
+    assert any(one.startswith("--isolation: input ") and "'vm'" in one for one in found)
     assert len(found) == 6
 
 

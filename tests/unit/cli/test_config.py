@@ -24,6 +24,9 @@ def test_check_tells_every_mistake_without_a_traceback(tmp_path: Path) -> None:
     assert done.stderr.splitlines()[0] == "rosrv: appliance.yaml:1: unknown key listn: did you mean listen?"
     assert "appliance.yaml:2: relays: " in done.stderr
     assert "Traceback" not in done.stderr
+    (tmp_path / "appliance.yaml").rename(tmp_path / "other.yaml")
+    assert "other.yaml:2: relays: " in rosrv("config", "check", "other.yaml", cwd=tmp_path).stderr
+    (tmp_path / "other.yaml").rename(tmp_path / "appliance.yaml")
     as_json = rosrv("config", "check", "--json", cwd=tmp_path)
     assert [json.loads(line)["place"] for line in as_json.stdout.splitlines()] == [
         "appliance.yaml:1",

@@ -79,3 +79,10 @@ def test_a_file_that_is_no_database_is_named_with_what_to_do(tmp_path: Path) -> 
     with pytest.raises(StoreError, match=r"state\.db.*move the file away"):
         Database(file, SCHEMA, failed=pytest.fail)
     assert file.read_bytes().startswith(b"this is not")
+
+
+def test_a_place_that_cannot_be_written_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
+    """Where the place is at fault (a full disk, a folder that is not there), nobody is told to move the state away."""
+    with pytest.raises(StoreError, match=r"state\.db.*make room") as caught:
+        Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail)
+    assert "move" not in str(caught.value)
