@@ -5,7 +5,7 @@ import traceback
 
 import typer
 
-from appliance.cli import audit, config, demo, policy, policy_running, protect, status, token, up
+from appliance.cli import audit, config, demo, monitor, policy, policy_running, protect, status, token, up
 from appliance.config_sources import ConfigError
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
@@ -29,6 +29,7 @@ for verb in (
 ):
     policy.app.command()(verb)
 app.add_typer(policy.app, name="policy")
+app.add_typer(monitor.app, name="monitor")
 app.add_typer(config.app, name="config")
 app.add_typer(token.app, name="token")
 

@@ -21,7 +21,7 @@ from typing import Literal
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compile.specification import Compiled, compile_files
-from appliance.rosmop.faults import explain
+from appliance.rosmop.faults import explain, line_of
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
@@ -245,8 +245,10 @@ class MonitorSet:
         try:
             happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            if line_of(error) >= step.event.action_line:
+                outcome.events.append(step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
-            message.dropped = message.dropped or self._on_fault == "drop"
+            self._block(message)
             return
         if not happened:
             if message.past:
@@ -344,6 +346,7 @@ class MonitorSet:
             happened = step.function(None)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
             self._fault(error, step.monitor, step.event.position, outcome)
+            outcome.events.append(step.name)
             happened = False
         if happened:
             outcome.events.append(step.name)

@@ -25,6 +25,16 @@ def explain(error: Exception, module: Module, monitor: str, otherwise: Position)
     return Fault(monitor, site.position, _text(error), values)
 
 
+def line_of(error: Exception) -> int:
+    """The line of the outermost function of generated code at which the exception came about."""
+    traceback = error.__traceback__
+    while traceback is not None:
+        if traceback.tb_frame.f_code.co_filename == FILENAME:
+            return traceback.tb_lineno
+        traceback = traceback.tb_next
+    return 0
+
+
 _MISSING = object()
 
 

@@ -43,6 +43,8 @@ class EventCode:
     part: str | None = None
     service_type: str | None = None
     period_ns: int | None = None
+    action_line: int = 0
+    """The line of the code at which the action begins: what faults there has happened."""
 
 
 @dataclass(eq=False)
@@ -71,11 +73,21 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
     body = _body(scope, event, trigger, bound, kind)
-    lines = _assemble(scope, event, bound, body, kind)
+    lines, action_starts = _assemble(scope, event, bound, body)
     header = [(f"def {function}(m):", -1), *_globals(scope)]
+    action_line = shared.module.next_line + len(header) + action_starts
     shared.module.add(header + lines)
     service = trigger.type if trigger.part is not None else None
-    return EventCode(event.name, function, event.position, trigger.topic, kind, trigger.part, service)
+    return EventCode(
+        event.name,
+        function,
+        event.position,
+        trigger.topic,
+        kind,
+        trigger.part,
+        service,
+        action_line=action_line,
+    )
 
 
 def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, function: str) -> EventCode:
@@ -234,14 +246,14 @@ def _assemble(
     event: tree.Event,
     bound: list[Bound],
     body: tuple[list[tuple[str, int]], list[tuple[str, int]]],
-    kind: str,
-) -> list[tuple[str, int]]:
+) -> tuple[list[tuple[str, int]], int]:
+    """All lines of the function, and how many stand before the action."""
     conditions, action = body
     lines = Lines()
     lines.site = scope.site(event)
     scope.lines = lines
     lines.add("b = m.buffer")
-    _read(scope, bound, kind)
+    _read(scope, bound)
     written = [each for each in bound if each.variable is not None and each.variable.assigned]
     _check_overlaps(scope, bound, written)
     for each in written:
@@ -249,10 +261,12 @@ def _assemble(
         lines.add(f"{each.variable.flag} = False")
     if scope.whole_asked is not None:
         lines.add(f"{scope.whole_asked} = lambda: {_pending(scope, written)}")
-    lines.lines += conditions + action
+    lines.lines += conditions
+    before = len(lines.lines)
+    lines.lines += action
     _write_back(scope, written)
     lines.add("return True")
-    return lines.lines
+    return lines.lines, before
 
 
 def _pending(scope: Scope, written: list[Bound]) -> str:
@@ -293,9 +307,9 @@ def _as_field(scope: Scope, each: Bound) -> str:
 # Reading and writing fields
 
 
-def _read(scope: Scope, bound: list[Bound], kind: str) -> None:
+def _read(scope: Scope, bound: list[Bound]) -> None:
     lines = scope.lines
-    layout = scope.messages.definitions.layout(kind)
+    layout = scope.messages.definitions.layout(scope.message_type or "")
     walk = Walk(Locator(scope.module, scope.codecs, lines), layout, Spot(None, 0))
     fixed: list[Bound] = []
     large = False

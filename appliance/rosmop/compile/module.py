@@ -66,6 +66,11 @@ class Module:
             self._lines.append(line)
             self._line_sites.append(site)
 
+    @property
+    def next_line(self) -> int:
+        """The number of the line that is added next."""
+        return len(self._lines) + 1
+
     def site_of_line(self, number: int) -> int:
         """The site of a line of the source, counted from 1."""
         return self._line_sites[number - 1] if 0 < number <= len(self._line_sites) else -1

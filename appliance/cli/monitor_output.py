@@ -1,0 +1,79 @@
+"""How the monitor verbs show things: findings, and what came of every message of a recording."""
+
+from collections.abc import Iterator
+
+from appliance.cli.policy_output import say, say_json
+from appliance.rosmop.outcomes import Fault, Outcome
+from appliance.rosmop.positions import Finding
+
+BILLION = 1_000_000_000
+
+
+def say_finding(finding: Finding, *, as_json: bool) -> None:
+    """Write an error or a warning."""
+    if not as_json:
+        say(str(finding), "red" if finding.severity == "error" else "yellow")
+        return
+    place = finding.position
+    say_json(
+        {
+            "file": place.file,
+            "line": place.line,
+            "column": place.column,
+            "severity": finding.severity,
+            "text": finding.text,
+        }
+    )
+
+
+def record(outcome: Outcome, index: int | None = None, topic: str | None = None) -> dict[str, object]:
+    """The record of a message, or of a tick or deadline."""
+    head: dict[str, object] = (
+        {"index": index, "topic": topic} if topic is not None else {"timer": outcome.timer}
+    )
+    head["time"] = outcome.time / BILLION
+    if topic is not None:
+        head["outcome"] = outcome.result
+    return head | {
+        "events": outcome.events,
+        "verdicts": [
+            {
+                "monitor": verdict.monitor,
+                "property": verdict.property,
+                "logic": verdict.logic,
+                "category": verdict.category,
+            }
+            for verdict in outcome.verdicts
+        ],
+        "published": [{"topic": message.topic, "type": message.type} for message in outcome.published],
+        "log": [{"level": line.level, "text": line.text, "monitor": line.monitor} for line in outcome.log],
+        "faults": [_fault(fault) for fault in outcome.faults],
+    }
+
+
+def _fault(fault: Fault) -> dict[str, object]:
+    return {
+        "file": fault.position.file,
+        "line": fault.position.line,
+        "column": fault.position.column,
+        "text": fault.text,
+        "values": dict(fault.values),
+    }
+
+
+def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) -> Iterator[str]:
+    """The same for people: nothing for a message that nobody had anything to say about."""
+    seconds = f"{outcome.time / BILLION:.3f}"
+    head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} #{index} {topic}"
+    if topic is not None and outcome.result != "passed":
+        yield f"{head}: {outcome.result}"
+    for verdict in outcome.verdicts:
+        name = f"{verdict.monitor} ({verdict.logic} property {verdict.property})"
+        yield f"{head}: {verdict.category} of {name}"
+    for message in outcome.published:
+        yield f"{head}: published {message.topic} {message.type}"
+    for line in outcome.log:
+        yield f"{head}: {line.level} {line.monitor}: {line.text}"
+    for fault in outcome.faults:
+        values = ", ".join(f"{name} = {value}" for name, value in fault.values.items())
+        yield f"{head}: fault at {fault.position}: {fault.text}" + (f" ({values})" if values else "")

@@ -1,0 +1,133 @@
+"""The automata of properties as pictures: for Graphviz (`--dot`), and drawn here (`--svg`), so that nothing needs
+to be installed.
+
+The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve
+for each pair of states with all events that lead from one to the other.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+from appliance.rosmop.logics.dot import to_dot
+from appliance.rosmop.logics.interface import CompiledProperty
+
+_STATE = re.compile(r'^  (\d+) \[label="((?:\\.|[^"\\])*)"(, peripheries=2)?\];$', re.MULTILINE)
+_EDGE = re.compile(r'^  (\w+) -> (\d+)(?: \[label="((?:\\.|[^"\\])*)"\])?;$', re.MULTILINE)
+_WIDTH, _HEIGHT = 150, 44  # of a state
+_COLUMN, _ROW, _MARGIN = 300, 120, 60
+
+
+@dataclass(frozen=True)
+class _State:
+    name: str
+    double: bool
+    x: int
+    y: int
+
+
+def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
+    """The automata in Graphviz's language, one `digraph` after the other; None if there is none."""
+    graphs = [graph for graph in map(to_dot, properties) if graph is not None]
+    return "\n".join(graphs) if graphs else None
+
+
+def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
+    """The automata as a picture, one below the other; None if there is none."""
+    parts: list[str] = []
+    top, right = 0, 0
+    for compiled in properties:
+        graph = to_dot(compiled)
+        if graph is None:
+            continue
+        title = f"{compiled.logic}: {' '.join(compiled.formula.split())[:120]}"
+        parts.append(f'<text class="title" x="{_MARGIN}" y="{top + 30}">{escape(title)}</text>')
+        states = _placed(graph, top + _MARGIN)
+        parts += [_edge(states, *found) for found in _EDGE.findall(graph)]
+        parts += [_drawn(state) for state in states.values()]
+        top = max(state.y for state in states.values()) + _ROW
+        right = max(right, *(state.x for state in states.values()))
+    if not parts:
+        return None
+    return _document(parts, right + _COLUMN, top)
+
+
+def _document(parts: Sequence[str], width: int, height: int) -> str:
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+            f'viewBox="0 0 {width} {height}">',
+            "<style>text{font:13px sans-serif;fill:#222;text-anchor:middle}.title{text-anchor:start;font-weight:bold}"
+            "rect{fill:#fff;stroke:#345;stroke-width:1.5}path{fill:none;stroke:#678;stroke-width:1.3}"
+            ".event{font-size:11px;fill:#135}</style>",
+            '<defs><marker id="arrow" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" '
+            'orient="auto"><path d="M0 0L8 4L0 8z" style="fill:#678;stroke:none"/></marker></defs>',
+            *parts,
+            "</svg>",
+            "",
+        ]
+    )
+
+
+def _placed(graph: str, top: int) -> dict[str, _State]:
+    """Every state at its place: the column is the distance from the start."""
+    edges = [(source, target) for source, target, _ in _EDGE.findall(graph)]
+    distance = {"start": -1}
+    waiting = ["start"]
+    while waiting:
+        current = waiting.pop(0)
+        for source, target in edges:
+            if source == current and target not in distance:
+                distance[target] = distance[current] + 1
+                waiting.append(target)
+    rows: dict[int, int] = {}
+    states = {}
+    for number, label, double in _STATE.findall(graph):
+        column = distance.get(number, 0)
+        row = rows[column] = rows.get(column, -1) + 1
+        x, y = _MARGIN + column * _COLUMN, top + row * _ROW + (column % 2) * 30 + 30
+        states[number] = _State(_plain(label), bool(double), x, y)
+    return states
+
+
+def _plain(label: str) -> str:
+    return label.replace("\\n", " · ").replace('\\"', '"').replace("\\\\", "\\")
+
+
+def _drawn(state: _State) -> str:
+    inner = ""
+    if state.double:
+        inner = (
+            f'<rect x="{state.x + 4}" y="{state.y + 4}" width="{_WIDTH - 8}" height="{_HEIGHT - 8}" rx="7"/>'
+        )
+    middle = f'x="{state.x + _WIDTH // 2}" y="{state.y + _HEIGHT // 2 + 5}"'
+    shown = state.name if len(state.name) <= 22 else state.name[:21] + "…"
+    return (
+        f'<rect x="{state.x}" y="{state.y}" width="{_WIDTH}" height="{_HEIGHT}" rx="10"/>{inner}'
+        f"<text {middle}><title>{escape(state.name)}</title>{escape(shown)}</text>"
+    )
+
+
+def _edge(states: dict[str, _State], source: str, target: str, label: str) -> str:
+    to = states[target]
+    middle = to.y + _HEIGHT // 2
+    if source == "start":
+        return f'<path d="M{to.x - 30} {middle}H{to.x}" marker-end="url(#arrow)"/>'
+    shown = escape(_plain(label))
+    at = states[source]
+    if source == target:
+        x, y = at.x + _WIDTH // 2, at.y
+        path = f"M{x - 20} {y}C{x - 35} {y - 34} {x + 35} {y - 34} {x + 20} {y}"
+        return _labelled(path, x, y - 30, shown)
+    if to.x > at.x:
+        x1, y1, x2, y2 = at.x + _WIDTH, at.y + _HEIGHT // 2, to.x, middle
+        path = f"M{x1} {y1}C{x1 + 60} {y1} {x2 - 60} {y2} {x2} {y2}"
+        return _labelled(path, (x1 + x2) // 2, (y1 + y2) // 2 - 6, shown)
+    x1, y1, x2, y2 = at.x + _WIDTH // 2, at.y + _HEIGHT, to.x + _WIDTH // 2, to.y + _HEIGHT
+    depth = max(y1, y2) + 40
+    return _labelled(f"M{x1} {y1}C{x1} {depth} {x2} {depth} {x2} {y2}", (x1 + x2) // 2, depth - 6, shown)
+
+
+def _labelled(path: str, x: int, y: int, label: str) -> str:
+    return f'<path d="{path}" marker-end="url(#arrow)"/><text class="event" x="{x}" y="{y}">{label}</text>'
