@@ -63,21 +63,30 @@ class RosMaster:
 
     async def call(self, method: str, *params: Value) -> Answer:
         """Call for a node; waits while the door is shut. Raises `CallFailedError` when it stays shut."""
+        if self._open.is_set():
+            with contextlib.suppress(RefusedError, BrokenOffError):
+                return await self._pass(method, *params)
         try:
             async with asyncio.timeout(self._hold):
                 while True:
                     while not self._open.is_set():  # it may be shut again before we are woken
                         await self._open.wait()
-                    self._enter()
-                    try:
-                        return await self.call_now(method, *params)
-                    except (RefusedError, BrokenOffError):
-                        self._open.clear()
-                        self._lost()
-                    finally:
-                        self._leave()
+                    with contextlib.suppress(RefusedError, BrokenOffError):
+                        return await self._pass(method, *params)
         except TimeoutError:
             raise CallFailedError(f"the ROS Master did not come back within {self._hold:g} s") from None
+
+    async def _pass(self, method: str, *params: Value) -> Answer:
+        """Call through the open door; shuts it when nobody is behind it."""
+        self._enter()
+        try:
+            return await self.call_now(method, *params)
+        except (RefusedError, BrokenOffError):
+            self._open.clear()
+            self._lost()
+            raise
+        finally:
+            self._leave()
 
     async def call_now(self, method: str, *params: Value) -> Answer:
         """Call whether or not the door is open: for the reconcile loop."""
