@@ -241,8 +241,8 @@ def _runs(parts: list[Value]) -> Iterator[list[Value]]:
 
 
 def denial_text(decision: Decision, record: str) -> str:
-    """What a denied caller is told: reason, rule and the id of the record."""
-    return f"{decision.reason} [{decision.rule or 'no rule'}] [{record}]"
+    """What a denied caller is told: the reason, which names the rule and where it stands, and the record's id."""
+    return f"{decision.reason} [{record}]"
 
 
 def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[Caller, tuple[object, ...]]:

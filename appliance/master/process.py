@@ -400,7 +400,7 @@ class _Control:
             category="command",
             resource="",
         )
-        return build_fault(1, f"{reason} [no rule] [{record}]")
+        return build_fault(1, f"{reason} [{record}]")
 
     def _peer_troubled(self, peer: Peer, reason: str) -> None:
         self._recorder.happened(
