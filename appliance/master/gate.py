@@ -13,7 +13,7 @@ from appliance.master.arguments import ApiUri
 from appliance.master.call import Call, Caller, Identity, Touch
 from appliance.master.registry import Incarnation, Life, Registry
 from appliance.policy import Policy
-from appliance.policy.model import Category, Decision, Request, Rule
+from appliance.policy.model import Category, Decision, Request
 from appliance.ros.names import resolve_parameter
 
 
@@ -202,8 +202,8 @@ def _both(first: Decision, second: Decision) -> Decision:
     return second if not second.allowed or (second.would_deny and not first.would_deny) else first
 
 
-def _no(reason: str, rule: Rule | None = None) -> Decision:
-    return Decision(False, rule, reason)
+def _no(reason: str) -> Decision:
+    return Decision(False, None, reason)
 
 
 def _node_request(request: Request) -> Request:
