@@ -15,6 +15,7 @@ import contextlib
 import ipaddress
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import structlog
@@ -163,6 +164,7 @@ class Contained(Enclosure):
             own_port=self._ports.own,
             master_port=self._ports.master,
             node_ports=PortRange(nodes.start, nodes.stop - 1),
+            client_ports=self._namespace.run(_client_ports),
             api_port=self._ports.api,
             api_networks=self._api_networks(),
         )
@@ -226,3 +228,9 @@ def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptable
     if isolation == "container":
         return Contained(ports, backend)
     return InNamespace(ports, backend) if isolation == "netns" else Enclosure()
+
+
+def _client_ports() -> PortRange:
+    """The ports that the kernel of this namespace gives to sockets that do not choose."""
+    first, last = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()
+    return PortRange(int(first), int(last))

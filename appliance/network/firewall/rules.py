@@ -70,6 +70,10 @@ class PortRange:
         """Return the range of one port."""
         return cls(port, port)
 
+    def overlaps(self, other: "PortRange") -> bool:
+        """Return whether some port is in both."""
+        return self.first <= other.last and other.first <= self.last
+
     def __str__(self) -> str:
         return str(self.first) if self.first == self.last else f"{self.first}-{self.last}"
 
@@ -164,7 +168,8 @@ class FirewallSettings:
     `rosmaster_port`, `inner_port` and `own_port` may be unknown (None) before their processes run: `Firewall.update`
     adds them. Hosts in `tunnel_only` are accepted through IPsec only: by the kernel's policy, or, when ESP
     runs in user space, on `tunnel_interface`. `api_networks` says who reaches the REST port besides
-    loopback: nobody, if empty.
+    loopback: nobody, if empty. `client_ports` are those that the kernel gives to whoever does not choose: the own
+    nodes (rosout) listen there on every address, whatever ROS_IP says.
     """
 
     control_uid: int
@@ -174,6 +179,7 @@ class FirewallSettings:
     own_port: int | None = None
     master_port: int = 11311
     node_ports: PortRange | None = None
+    client_ports: PortRange | None = None
     api_port: int | None = None
     api_networks: tuple[str, ...] = ()
     tunnel_only: tuple[str, ...] = ()
@@ -214,6 +220,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
         *inner_port("own nodes' master", settings.own_port, "rosmaster", settings.rosmaster_uid),
         *_api(settings),
         *_rate_limits(settings),
+        *_chosen_by_the_kernel(settings),
     )
 
 
@@ -322,6 +329,39 @@ def _rate_limits(settings: FirewallSettings) -> tuple[Rule, ...]:
     if settings.node_ports is not None:
         ports.append(("node and relay ports", settings.node_ports))
     return tuple(rule for name, one in ports for rule in _rate_limit(settings.new_connections, name, one))
+
+
+def _chosen_by_the_kernel(settings: FirewallSettings) -> tuple[Rule, ...]:
+    """Nobody outside has business with the ports of the own nodes; with those that were chosen, he may have."""
+    if settings.client_ports is None:
+        return ()
+    chosen = (
+        ("RVMaster port", PortRange.one(settings.master_port)),
+        ("node and relay ports", settings.node_ports),
+        ("REST port", PortRange.one(settings.api_port) if settings.api_port is not None else None),
+    )
+    return (
+        *(
+            Rule(
+                chain=Chain.IN,
+                purpose=f"{name}: not one of the kernel's choice",
+                verdict=Verdict.RETURN,
+                arrives_on=OUTSIDE,
+                tcp_ports=ports,
+                opening=True,
+            )
+            for name, ports in chosen
+            if ports is not None and ports.overlaps(settings.client_ports)
+        ),
+        Rule(
+            chain=Chain.IN,
+            purpose="own nodes' ports: not from outside",
+            verdict=Verdict.RESET,
+            arrives_on=OUTSIDE,
+            tcp_ports=settings.client_ports,
+            opening=True,
+        ),
+    )
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[Rule, ...]:

@@ -1,5 +1,7 @@
 """Tests of the list of rules, without a kernel."""
 
+from dataclasses import replace
+
 import pytest
 
 from appliance.network.firewall.backend import RuleCounter
@@ -137,3 +139,24 @@ def test_a_rule_describes_itself() -> None:
     """The description has the matches and the verdict in words of netfilter."""
     _, owner, _ = inner_port("ROSMaster port", 11312, "control", 61011)
     assert owner.describe() == "out lo, tcp 11312, uid 61011, syn -> RETURN"
+
+
+def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
+    """What the kernel chose is nobody's business outside; ports of ours that lie there were chosen by us."""
+    bare = FirewallSettings(
+        control_uid=1, rosmaster_uid=2, new_connections=None, client_ports=PortRange(32768, 60999)
+    )
+    [closed] = appliance_rules(bare)
+    assert (closed.chain, closed.verdict, closed.tcp_ports) == (
+        Chain.IN,
+        Verdict.RESET,
+        PortRange(32768, 60999),
+    )
+    assert closed.arrives_on == Interface("lo", other=True)
+    inside = replace(bare, node_ports=PortRange(40000, 40099), master_port=50000)
+    *ours, last = appliance_rules(inside)
+    assert last == closed
+    assert [(rule.verdict, rule.tcp_ports) for rule in ours] == [
+        (Verdict.RETURN, PortRange(50000, 50000)),
+        (Verdict.RETURN, PortRange(40000, 40099)),
+    ]
