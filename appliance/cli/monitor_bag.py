@@ -139,14 +139,16 @@ def _outcome(
 ) -> Outcome:
     if refusal is None:
         return monitors.process(connection.topic, data, time_ns)
-    return Outcome("dropped", data, time_ns, before=monitors.advance(time_ns), reason=refusal)
+    outcome = Outcome(data, time_ns)
+    outcome.result, outcome.reason, outcome.before = "dropped", refusal, monitors.advance(time_ns)
+    return outcome
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
     """The outcome of the first message, with what `init` put out in front."""
-    outcome.log[:0] = started.log
-    outcome.published[:0] = started.published
-    outcome.faults[:0] = started.faults
+    outcome.log = [*started.log, *outcome.log]
+    outcome.published = [*started.published, *outcome.published]
+    outcome.faults = [*started.faults, *outcome.faults]
     return outcome
 
 

@@ -35,7 +35,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
     if topic is not None:
         head["outcome"] = outcome.result
     return head | {
-        "events": outcome.events,
+        "events": list(outcome.events),
         "verdicts": [
             {
                 "monitor": verdict.monitor,

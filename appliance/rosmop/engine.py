@@ -209,27 +209,48 @@ class MonitorSet:
     # One message
 
     def _process(self, steps: tuple[Step, ...], buffer: Buffer, time_ns: int) -> Outcome:
-        before = self.advance(time_ns) if self._due is not None and self._due <= time_ns else []
-        outcome = Outcome(buffer=buffer, time=time_ns, before=before)
+        outcome = Outcome(buffer, time_ns)
+        if self._due is not None and self._due <= time_ns:
+            outcome.before = self.advance(time_ns)
         if not steps:
             return outcome
-        turn = self._turn
-        turn.now = time_ns
+        self._turn.now = time_ns
         message = Message(buffer, time_ns)
-        monitor: Monitor | None = None
         for step in steps:
-            if step.monitor is not monitor:
+            if step.first:
                 monitor = step.monitor
                 monitor.context.budget = BUDGET
-                if not monitor.seen:
-                    self._first_message(monitor, time_ns)
-                if monitor.held:
-                    outcome.reason = f"{monitor.name} holds its topics until it is resumed"
-                    message.dropped = True
+                if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     break
-            self._happen(step, message, outcome)
-            if message.dropped:
+            if self._happen(step, message, outcome):
                 break
+        self._finish(message, outcome)
+        return outcome
+
+    def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event; whether it was dropped."""
+        try:
+            happened = step.function(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            if line_of(error) >= step.event.action_line:
+                outcome.events = (*outcome.events, step.name)
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message)
+            return message.dropped
+        if not happened:
+            if message.past:
+                self._past(step, message)
+            return False
+        outcome.events = (*outcome.events, step.name)
+        if message.dropped:
+            return True
+        if step.monitor.properties:
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+        return False
+
+    def _finish(self, message: Message, outcome: Outcome) -> None:
+        turn = self._turn
         if turn.log or turn.published:
             self._collect(outcome)
         if message.dropped:
@@ -239,24 +260,18 @@ class MonitorSet:
             outcome.buffer = message.buffer
         if self._timed:
             self._schedule()
-        return outcome
 
-    def _happen(self, step: Step, message: Message, outcome: Outcome) -> None:
-        try:
-            happened = step.function(message)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            if line_of(error) >= step.event.action_line:
-                outcome.events.append(step.name)
-            self._fault(error, step.monitor, step.event.position, outcome)
-            self._block(message)
-            return
-        if not happened:
-            if message.past:
-                self._past(step, message)
-            return
-        outcome.events.append(step.name)
-        if not message.dropped:
-            self._step_properties(step, message, message.time, outcome)
+    def _first(self, monitor: Monitor, message: Message, outcome: Outcome) -> bool:
+        """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
+        if monitor.held:
+            outcome.reason = f"{monitor.name} holds its topics until it is resumed"
+            message.dropped = True
+            return True
+        monitor.seen = True
+        for timer in monitor.timers:
+            if not timer.ticked:
+                timer.due = message.time + timer.period
+        return False
 
     def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
         for running in step.monitor.properties:
@@ -286,7 +301,7 @@ class MonitorSet:
         self._turn.reset = False
         for category, handler in handlers:
             logic = running.code.property.logic
-            outcome.verdicts.append(Verdict(monitor.name, running.index, logic, category))
+            outcome.verdicts = (*outcome.verdicts, Verdict(monitor.name, running.index, logic, category))
             self._handle(monitor, handler, message, running, outcome)
         if self._turn.reset:
             running.run = running.code.property.start(self._turn.now)
@@ -313,7 +328,7 @@ class MonitorSet:
     def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
         fault: Fault = explain(error, self._compiled.module, monitor.name, otherwise)
         monitor.faults += 1
-        outcome.faults.append(fault)
+        outcome.faults = (*outcome.faults, fault)
 
     def _past(self, step: Step, message: Message) -> None:
         """Count an event that did not happen, and tell it once in a while."""
@@ -337,19 +352,18 @@ class MonitorSet:
     def _tick(self, timer: Timer, time_ns: int, ticks: dict[int, int]) -> Outcome:
         step = timer.step
         due = timer.due or 0
-        outcome = Outcome(time=due, timer=step.name)
+        outcome = Outcome(time=due)
+        outcome.timer = step.name
         self._turn.now = due
         step.monitor.context.budget = BUDGET
         timer.ticked = True
         timer.due = due + timer.period
+        outcome.events = (step.name,)
         try:
-            happened = step.function(None)
+            step.function(None)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
             self._fault(error, step.monitor, step.event.position, outcome)
-            outcome.events.append(step.name)
-            happened = False
-        if happened:
-            outcome.events.append(step.name)
+        else:
             self._step_properties(step, None, due, outcome)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1
         if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
@@ -363,19 +377,14 @@ class MonitorSet:
     def _expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
         deadline = running.run.deadline or 0
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
-        outcome = Outcome(time=deadline, timer=f"{monitor.name}.{word}")
+        outcome = Outcome(time=deadline)
+        outcome.timer = f"{monitor.name}.{word}"
         self._turn.now = deadline
         monitor.context.budget = BUDGET
         categories = running.run.expire()
         self._tell(monitor, running, categories, None, outcome, in_order_told=True)
         self._collect(outcome)
         return outcome
-
-    def _first_message(self, monitor: Monitor, time_ns: int) -> None:
-        monitor.seen = True
-        for timer in monitor.timers:
-            if not timer.ticked:
-                timer.due = time_ns + timer.period
 
     def _next_timer(self) -> Timer | None:
         timers = [
@@ -441,6 +450,9 @@ class MonitorSet:
                     steps.setdefault(topic, []).append(step)
                 else:
                     requests.setdefault((topic, part), []).append(step)
+        for found in (*steps.values(), *requests.values()):
+            for place, step in enumerate(found):
+                step.first = not place or found[place - 1].monitor is not step.monitor
         self._steps = {topic: tuple(found) for topic, found in steps.items()}
         self._requests = {key: tuple(found) for key, found in requests.items()}
         self._timed = any(

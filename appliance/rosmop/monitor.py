@@ -35,6 +35,8 @@ class Step:
     index: int
     name: str
     function: Callable[[Message | None], bool]
+    first: bool = False
+    """The first of its monitor on its topic."""
     past: int = 0
     told: int | None = None
 

@@ -1,7 +1,7 @@
 """What comes of a message, of a tick and of a deadline, as values for the relay and for `rosrv monitor run`."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 from appliance.rosmop.positions import Position
@@ -31,25 +31,32 @@ class Fault:
     values: Mapping[str, object]
 
 
-@dataclass(slots=True)
 class Outcome:
     """What is to be done with a message, and everything that happened on the way.
 
     `buffer` is what to relay: the buffer that came in (changed in place where that was possible), or another.
     `events` are named `specification.event`. `timer` names what a tick or deadline belongs to
     (`specification.tick`, `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before`
-    are ticks and deadlines that were due before this message. `reason` says why a message of a service was
-    refused, or of a held specification dropped.
+    are ticks and deadlines that were due before this message. `reason` says why the messages of a held
+    specification are dropped.
+
+    Most messages have nothing to tell; so there is nothing to make for them but the object itself.
     """
 
     result: Result = "passed"
-    buffer: Buffer = b""
-    time: int = 0
     timer: str | None = None
-    events: list[str] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
-    published: list[Published] = field(default_factory=list)
-    log: list[LogLine] = field(default_factory=list)
-    faults: list[Fault] = field(default_factory=list)
-    before: list["Outcome"] = field(default_factory=list)
+    events: Sequence[str] = ()
+    verdicts: Sequence[Verdict] = ()
+    published: Sequence[Published] = ()
+    log: Sequence[LogLine] = ()
+    faults: Sequence[Fault] = ()
+    before: Sequence["Outcome"] = ()
     reason: str | None = None
+
+    def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
+        self.buffer = buffer
+        self.time = time
+
+    def __repr__(self) -> str:
+        told = {name: value for name, value in vars(self).items() if name != "buffer"}
+        return f"Outcome({self.result}, {told})"

@@ -94,7 +94,7 @@ def put_moments(values: list[int], code: str, out: bytearray) -> None:
 class Message:
     """The message that events look at: its bytes as changed so far, and what has become of it."""
 
-    __slots__ = ("_owned", "buffer", "dropped", "original", "past", "time")
+    __slots__ = ("buffer", "dropped", "original", "past", "time")
 
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
@@ -102,9 +102,6 @@ class Message:
         self.original: bytes | None = None  # the bytes as received, once something was changed
         self.dropped = False
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
-        self._owned = isinstance(buffer, bytearray) or (
-            isinstance(buffer, memoryview) and not buffer.readonly
-        )
 
     @property
     def changed(self) -> bool:
@@ -116,9 +113,6 @@ class Message:
         end = start + len(new)
         if self.buffer[start:end] != new:
             self._keep()
-            if not self._owned:
-                self.buffer = bytearray(self.buffer)
-                self._owned = True
             self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes]]) -> None:
@@ -135,11 +129,15 @@ class Message:
             last = end
         pieces.append(bytes(self.buffer[last:]))
         self.buffer = bytearray(b"".join(pieces))
-        self._owned = True
 
     def _keep(self) -> None:
+        """Before the first change: keep the bytes as received, and see that the buffer can be written."""
         if self.original is None:
             self.original = bytes(self.buffer)
+            if isinstance(self.buffer, bytes) or (
+                isinstance(self.buffer, memoryview) and self.buffer.readonly
+            ):
+                self.buffer = bytearray(self.buffer)
 
 
 def whole(
