@@ -243,6 +243,7 @@ class _Connection(asyncio.Protocol):
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
         self._received = 0  # bytes of the request that is being read, framing included
         self._body = bytearray()
+        self._in_request = False
         self._head_done = False
         self._unsent = 0  # bytes of an answer that the peer does not take, as they were counted
         self._writable = True
@@ -299,6 +300,8 @@ class _Connection(asyncio.Protocol):
                 self._reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
 
     def _bound(self, size: int) -> None:
+        if not self._in_request:
+            return
         self._received += size
         if not self._head_done:
             if self._received > self._limits.head_bytes:
@@ -324,6 +327,7 @@ class _Connection(asyncio.Protocol):
     def on_message_begin(self) -> None:
         self._url = b""
         self._received = 0
+        self._in_request = True
         self._head_done = False
         self._expects = False
         if self._busy is None and self._writable:
@@ -373,6 +377,7 @@ class _Connection(asyncio.Protocol):
     def on_message_complete(self) -> None:
         if self._closing:
             return
+        self._in_request = False
         body, self._body = bytes(self._body), bytearray()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), body, time.monotonic_ns())
         self._pending.append((request, self._parser.should_keep_alive()))
@@ -468,7 +473,7 @@ class _Connection(asyncio.Protocol):
             self._unsent = unsent
             self.deadline = time.monotonic() + self._limits.stall_seconds
             return
-        if not self._closing and not self._head_done and self._received:
+        if not self._closing and self._in_request and not self._head_done:
             self.server.troubled(self.peer, f"{self.peer.text} did not finish a request in time")
         self.abort()
 

@@ -195,6 +195,25 @@ def test_peer_path_and_body() -> None:
     run(test())
 
 
+@pytest.mark.parametrize("size", [1 << 16, 1 << 20, 3 << 20, 16 << 20])
+def test_large_bodies(size: int) -> None:
+    """Bodies up to the limit are served, one after the other, by length and in chunks."""
+
+    async def test() -> None:
+        async with serving() as server:
+            client = await server.connect()
+            for _ in range(2):
+                await client.send(post(b"x" * size))
+                assert (await client.response())[0] == 200
+            await client.send(b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n")
+            chunk = b"10000\r\n" + b"x" * 0x10000 + b"\r\n"
+            await client.send(chunk * (size >> 16) + b"0\r\n\r\n")
+            assert (await client.response())[0] == 200
+            assert [len(request.body) for request in server.requests] == [size] * 3
+
+    run(test())
+
+
 def test_pipelined_requests() -> None:
     """Requests sent without waiting are answered one after the other, in order, none twice."""
 
