@@ -7,7 +7,7 @@ process cannot be told anything that is not written here. A struct that travels 
 Strings from strangers (names, header values) are carried as values and never interpreted on the way.
 """
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
@@ -165,6 +165,65 @@ class SignatureRefused(Message):
 
     number: int
     reason: str
+
+
+class AuthorityWanted(Message):
+    """Control asks the signer for the certificate of the appliance's authority; `number` pairs all these."""
+
+    number: int
+
+
+class AuthorityStated(Message):
+    """The authority's certificate, in PEM."""
+
+    number: int
+    certificate: bytes
+
+
+class CertificateWanted(Message):
+    """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM)."""
+
+    number: int
+    request: bytes
+    name: str
+    days: float
+
+
+class CertificateMade(Message):
+    """The certificate (PEM), its serial number in hexadecimal, and its end in seconds since the epoch."""
+
+    number: int
+    certificate: bytes
+    serial: str
+    expires: float
+
+
+class CertificateRefused(Message):
+    """The signer makes no certificate for this request and says why."""
+
+    number: int
+    reason: str
+
+
+class RevokedCertificate(msgspec.Struct, frozen=True):
+    """A serial number in hexadecimal, at most 160 bits, and since when (seconds since the epoch)."""
+
+    serial: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{1,40}$")]
+    moment: Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
+
+
+class RevocationsWanted(Message):
+    """Control asks for the signed list of exactly these revoked certificates."""
+
+    number: int
+    revoked: list[RevokedCertificate]
+
+
+class RevocationsMade(Message):
+    """The list of revoked certificates (CRL, PEM)."""
+
+    number: int
+    revocations: bytes
 
 
 # --- link: control <-> relay ------------------------------------------------------------------------------
@@ -407,9 +466,13 @@ RelayLink = (
     StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
     | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | ConnectionOpened | ConnectionClosed
-    | ConnectionRefused | TrafficReported
+    | ConnectionRefused | TrafficReported | SpecificationsStated | MonitorSwitched | MonitorResumed
+    | SpecificationsTaken | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted
 )  # fmt: skip
 
-SignerLink = SignatureWanted | SignatureMade | SignatureRefused
+SignerLink = (
+    SignatureWanted | SignatureMade | SignatureRefused | AuthorityWanted | AuthorityStated | CertificateWanted
+    | CertificateMade | CertificateRefused | RevocationsWanted | RevocationsMade
+)  # fmt: skip
 
 ApiLink = RequestMade | RequestAnswered | TokensStated | RestCalled

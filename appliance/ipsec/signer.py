@@ -1,9 +1,10 @@
-"""The signer: the process that holds the audit key and signs checkpoints with it. It has no network.
+"""The signer: the process that holds the audit key and the authority's, and signs with them. It has no network.
 
 Invariants:
 1. The private key is made at the first start in the signer's own directory (mode 0600) and never leaves the
    process; a key file that is damaged or readable by others is an error, never replaced.
-2. It parses only the messages of its lifeline and its link to control, and signs only audit checkpoints.
+2. It parses only the messages of its lifeline and its link to control (and the signing requests in them), and
+   signs only audit checkpoints, certificates of the appliance's own authority and its list of revoked ones.
 3. It remembers what it signed (`checkpoints.py`) and signs no second past; `rosrv audit verify` holds the log
    against that memory, so cutting the log's end or taking its signatures away is found.
 """
@@ -11,7 +12,6 @@ Invariants:
 import asyncio
 import os
 import socket
-import stat
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,26 +27,32 @@ from cryptography.hazmat.primitives.serialization import (
 
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
+    AuthorityStated,
+    AuthorityWanted,
+    CertificateMade,
+    CertificateRefused,
+    CertificateWanted,
     Failed,
     Lifeline,
     LinkOpened,
+    Message,
     Ping,
     Pong,
     Ready,
+    RevocationsMade,
+    RevocationsWanted,
     SignatureMade,
     SignatureRefused,
     SignatureWanted,
     SignerLink,
     Stop,
 )
+from appliance.ipsec.authority import Authority, RequestRefusedError
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
-
-
-class SignerKeyError(Exception):
-    """The key file cannot be used; the message says which, why, and what to do."""
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
@@ -54,10 +60,7 @@ def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
     path = directory / KEY_FILE
     if not path.exists():
         _create_key(directory)
-    status = path.stat()
-    if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise SignerKeyError(f"{path}: others may read this private key (mode {status.st_mode & 0o777:o});"
-                             " treat it as stolen, or set its mode to 600 if you know better")  # fmt: skip
+    require_private(path)
     try:
         key = load_pem_private_key(path.read_bytes(), password=None)
     except (ValueError, TypeError) as error:
@@ -67,7 +70,7 @@ def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
     if not isinstance(key, Ed25519PrivateKey):
         raise SignerKeyError(f"{path}: not an Ed25519 key; restore it from a backup")
     public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-    _write(directory / PUBLIC_KEY_FILE, public, 0o644)
+    write_whole(directory / PUBLIC_KEY_FILE, public, 0o644)
     return key
 
 
@@ -76,26 +79,19 @@ def _create_key(directory: Path) -> None:
         raise SignerKeyError(f"{directory / KEY_FILE}: missing, but its public half is there; restore it from"
                              f" a backup, or remove {PUBLIC_KEY_FILE} to begin with a new key")  # fmt: skip
     key = Ed25519PrivateKey.generate()
-    _write(directory / KEY_FILE, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600)
-
-
-def _write(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file as a whole, on the disk when this returns."""
-    making = path.with_name(path.name + ".new")
-    making.unlink(missing_ok=True)
-    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    making.rename(path)
+    write_whole(
+        directory / KEY_FILE, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600
+    )
 
 
 class Signer:
     """Answers one lifeline and the link to control until it is told to stop."""
 
-    def __init__(self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey) -> None:
+    def __init__(
+        self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority
+    ) -> None:
         self._lifeline = lifeline
+        self._authority = authority
         self._signed = SignedCheckpoints(directory)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
@@ -138,19 +134,41 @@ class Signer:
             self._control = None
 
     def _control_said(self, link: Channel, message: Any) -> None:
-        if not isinstance(message, SignatureWanted):
+        answer = self._answer(message)
+        if answer is None:
             return
-        answer: SignatureMade | SignatureRefused
-        try:
-            self._signed.approve(message.text)
-        except (CheckpointRefusedError, OSError) as error:
-            answer = SignatureRefused(message.number, str(error))
-        else:
-            answer = SignatureMade(message.number, self._key.sign(message.text), self._public_key)
         try:
             link.send(answer)
         except ChannelClosedError:
             self._link_closed(link)  # control asks again over its next link
+
+    def _answer(self, message: Any) -> Message | None:
+        match message:
+            case SignatureWanted(number, text):
+                return self._sign(number, text)
+            case AuthorityWanted(number):
+                return AuthorityStated(number, self._authority.certificate)
+            case CertificateWanted(number, request, name, days):
+                return self._issue(number, request, name, days)
+            case RevocationsWanted(number, revoked):
+                rows = [(one.serial, one.moment) for one in revoked]
+                return RevocationsMade(number, self._authority.revocations(rows))
+            case _:
+                return None
+
+    def _sign(self, number: int, text: bytes) -> Message:
+        try:
+            self._signed.approve(text)
+        except (CheckpointRefusedError, OSError) as error:
+            return SignatureRefused(number, str(error))
+        return SignatureMade(number, self._key.sign(text), self._public_key)
+
+    def _issue(self, number: int, request: bytes, name: str, days: float) -> Message:
+        try:
+            issued = self._authority.issue(request, name, days)
+        except RequestRefusedError as error:
+            return CertificateRefused(number, str(error))
+        return CertificateMade(number, issued.certificate, issued.serial, issued.expires)
 
 
 def main(lifeline_fd: int, directory: Path) -> None:
@@ -158,8 +176,8 @@ def main(lifeline_fd: int, directory: Path) -> None:
     lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
     try:
         os.umask(0o077)
-        key = load_or_create_key(directory)
+        key, authority = load_or_create_key(directory), Authority(directory)
     except (SignerKeyError, OSError) as error:
         lifeline.send(Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)
-    asyncio.run(Signer(lifeline, directory, key).run())
+    asyncio.run(Signer(lifeline, directory, key, authority).run())

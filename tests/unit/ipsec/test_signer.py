@@ -12,8 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
 from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.audit.checkpoints import read_remembered
 from appliance.audit.log import AuditLog
@@ -23,12 +27,20 @@ from appliance.audit.signatures import read_public_key
 from appliance.audit.verify import verify
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
+    AuthorityStated,
+    AuthorityWanted,
+    CertificateMade,
+    CertificateRefused,
+    CertificateWanted,
     Failed,
     Lifeline,
     LinkOpened,
     Ping,
     Pong,
     Ready,
+    RevocationsMade,
+    RevocationsWanted,
+    RevokedCertificate,
     SignatureMade,
     SignatureRefused,
     SignatureWanted,
@@ -211,3 +223,38 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     assert result.signed_checkpoints >= 5
     assert read_remembered(tmp_path / "signer", result.log) is not None
     assert not search(path, Filter(event="signature refused")).entries
+
+
+def test_certificates_over_the_link(tmp_path: Path) -> None:
+    """Control gets the authority's certificate, certificates for requests, and the list of revoked ones."""
+    signer = SignerProcess(tmp_path)
+    key = ec.generate_private_key(ec.SECP384R1())
+    request = (
+        x509.CertificateSigningRequestBuilder()
+        .subject_name(x509.Name([]))
+        .sign(key, hashes.SHA384())
+        .public_bytes(Encoding.PEM)
+    )
+    try:
+        link = signer.open_link()
+        link.send(AuthorityWanted(1))
+        stated = hear(link)
+        assert isinstance(stated, AuthorityStated)
+        link.send(CertificateWanted(2, request, "ocu-1", 90))
+        made = hear(link)
+        assert isinstance(made, CertificateMade)
+        root = x509.load_pem_x509_certificate(stated.certificate)
+        x509.load_pem_x509_certificate(made.certificate).verify_directly_issued_by(root)
+        link.send(RevocationsWanted(3, [RevokedCertificate(made.serial, 1_700_000_000)]))
+        revocations = hear(link)
+        assert isinstance(revocations, RevocationsMade)
+        assert [one.serial_number for one in x509.load_pem_x509_crl(revocations.revocations)] == [
+            int(made.serial, 16)
+        ]
+        link.send(CertificateWanted(4, b"rubbish", "ocu-1", 90))
+        refused = hear(link)
+        assert isinstance(refused, CertificateRefused)
+        assert refused.number == 4
+        assert "not a signing request" in refused.reason
+    finally:
+        assert signer.end() == 0

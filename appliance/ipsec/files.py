@@ -1,0 +1,31 @@
+"""Key files: written whole and durably, and refused when others may read them."""
+
+import os
+import stat
+from pathlib import Path
+
+
+class SignerKeyError(Exception):
+    """The key file cannot be used; the message says which, why, and what to do."""
+
+
+def require_private(path: Path) -> None:
+    """Raise `SignerKeyError` if others than its owner may read a private key."""
+    mode = path.stat().st_mode
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise SignerKeyError(
+            f"{path}: others may read this private key (mode {mode & 0o777:o});"
+            " treat it as stolen, or set its mode to 600 if you know better"
+        )
+
+
+def write_whole(path: Path, data: bytes, mode: int) -> None:
+    """Replace a file as a whole, on the disk when this returns."""
+    making = path.with_name(path.name + ".new")
+    making.unlink(missing_ok=True)
+    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    making.rename(path)
