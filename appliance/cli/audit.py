@@ -40,7 +40,8 @@ _POLL_SECONDS = 0.2
 _PROGRESS_EVERY = 1000
 
 _State = Annotated[
-    Path, typer.Option("--state", envvar="ROSRV_STATE", help="State directory of the appliance")
+    Path,
+    typer.Option("--state", envvar="ROSRV_STATE", help="State directory of the appliance", readable=False),
 ]
 _Deny = Annotated[bool, typer.Option("--deny", help="Only what was denied (and summaries of denials)")]
 _Allow = Annotated[bool, typer.Option("--allow", help="Only what was allowed")]
@@ -227,6 +228,8 @@ class _Errors:
                 raise typer.Exit(0)
             case KeyboardInterrupt():
                 raise typer.Exit(0)
+            case PermissionError():
+                _fail(f"{error.filename}: {error.strerror}; run this as root", CANNOT_READ)
             case OSError():
                 _fail(f"{error.filename or 'output'}: {error.strerror}", CANNOT_READ)
 

@@ -194,7 +194,9 @@ def compare(
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", envvar="ROSRV_STATE", help="State directory with the audit log"),
+        typer.Option(
+            metavar="DIR", envvar="ROSRV_STATE", help="State directory with the audit log", readable=False
+        ),
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,

@@ -13,7 +13,13 @@ from appliance.config import Settings
 ADMIN_SOCKET = "admin.sock"
 DEFAULT_STATE: Path = Settings.model_fields["state"].default
 State = Annotated[
-    Path, typer.Option("--state", envvar="ROSRV_STATE", help="State directory of the running appliance")
+    Path,
+    typer.Option(
+        "--state",
+        envvar="ROSRV_STATE",
+        help="State directory of the running appliance",
+        readable=False,  # it may be passed through, not looked into; who may not connect is told so below
+    ),
 ]
 _SECONDS = 30.0
 

@@ -80,11 +80,16 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
     grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
     shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""
     grid.add_row(
-        "graph", f"{body['nodes']} nodes{shadows}, {body['topics']} topics, {body['services']} services"
+        "graph",
+        f"{counted(body['nodes'], 'node')}{shadows}, {counted(body['topics'], 'topic')}, "
+        f"{counted(body['services'], 'service')}",
     )
     dropped = f", {body['dropped']} dropped at slow subscribers" if body["dropped"] else ""
-    grid.add_row("relay", f"{body['connections']} connections, {body['messages']} messages{dropped}")
-    grid.add_row("audit log", f"{audit['lag_records']} records waiting to be written")
+    grid.add_row(
+        "relay",
+        f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}",
+    )
+    grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written")
     console.print(grid)
     table = Table("process", "pid", "for", "restarts", box=None, padding=(0, 2, 0, 0), header_style="dim")
     for process in body["processes"]:
