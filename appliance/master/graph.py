@@ -166,6 +166,10 @@ class Graph:
         for topic in sorted(topics):
             self.tell(topic, always=True)
 
+    def remind(self, subscriber: Incarnation, topic: str) -> None:
+        """Give a subscriber its list of a topic once more."""
+        self._tell_one(subscriber, topic, always=True)
+
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
         """The list that answers a registration: what the subscriber is told from here on is relative to it."""
         uris = self._publishers_for(subscriber, topic)

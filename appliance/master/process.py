@@ -45,6 +45,7 @@ from appliance.master.recorder import Recorder
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
+from appliance.master.reminders import Reminders
 from appliance.master.rest import RestLink
 from appliance.master.revocation import Revocation
 from appliance.master.robot import own_address, robot_addresses
@@ -215,6 +216,7 @@ class _Control:
             mediation,
             closed=self._close_faces,
         )
+        self._reminders = Reminders(registry, relay, graph)
         rosmaster = RosMaster(
             settings.rosmaster_port,
             lost=self._rosmaster_lost,
@@ -374,6 +376,7 @@ class _Control:
         for server in self._servers:
             server.close()
         self._faces.close_all()
+        self._reminders.close()
         self._delivery.close()
         self._master.rosmaster.close()
         self._recorder.happened(
@@ -449,6 +452,7 @@ class _Control:
     def _relay_link(self, descriptor: int) -> None:
         self._master.relay.attach(Channel(socket.socket(fileno=descriptor), messages.RelayLink))
         self._master.graph.tell_everybody()
+        self._reminders.begin()
 
     def _signer_link(self, descriptor: int) -> None:
         channel = Channel(socket.socket(fileno=descriptor), messages.SignerLink)

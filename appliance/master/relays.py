@@ -211,6 +211,18 @@ class RelayControl:
         for key in [one for one in self.traffic if one[0] == incarnation.key]:
             del self.traffic[key]
 
+    def unconnected(self) -> list[PermissionRow]:
+        """Grants for topics of live publishers whose subscriber is not connected."""
+        there = {(one.key, one.resource, one.host, one.caller_id) for one in self.connections.values()}
+        return [
+            row
+            for incarnation in self._registry.live()
+            for row in self._permissions.get(incarnation.key, ())
+            if row.kind == TOPIC
+            and (Kind.PUBLICATION, row.resource) in incarnation.registrations
+            and (row.key, row.resource, row.host, row.caller_id) not in there
+        ]
+
     # --- grants ---
 
     def permissions(self) -> list[PermissionRow]:

@@ -1,0 +1,67 @@
+"""Subscribers that do not come back to a new relay are told again."""
+
+import asyncio
+import ipaddress
+from typing import Any, cast
+
+import pytest
+
+from appliance.master import reminders
+from appliance.master.registry import Incarnation, Kind, Registry
+from appliance.master.reminders import Reminders
+from appliance.ros.uris import parse_node_uri
+from appliance.store.state import PermissionRow
+
+HOST = ipaddress.ip_address("10.0.0.5")
+
+
+class NoJournal:
+    """Nothing is written down."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given: None
+
+
+class Told:
+    """Counts the reminders; the relay's side says who is absent for how many looks."""
+
+    def __init__(self, row: PermissionRow, absent_for: int) -> None:
+        self.row, self.absent_for = row, absent_for
+        self.reminded: list[tuple[str, str]] = []
+
+    def unconnected(self) -> list[PermissionRow]:
+        """As `RelayControl`."""
+        self.absent_for -= 1
+        return [self.row] if self.absent_for >= 0 else []
+
+    def remind(self, subscriber: Incarnation, topic: str) -> None:
+        """As `Graph`."""
+        self.reminded.append((subscriber.name, topic))
+
+
+def subscriber(registry: Registry, name: str) -> Incarnation:
+    """A live subscriber of /chatter."""
+    uri = "http://10.0.0.5:4000/"
+    node = Incarnation(f"key of {name}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
+    registry.add(node)
+    registry.register(node, Kind.SUBSCRIPTION, "/chatter", "std_msgs/String")
+    return node
+
+
+@pytest.mark.parametrize(("absent_for", "times"), [(0, 0), (2, 2), (99, 8)])
+def test_reminded_until_back(monkeypatch: pytest.MonkeyPatch, absent_for: int, times: int) -> None:
+    """Nobody is told who is back, the others at each look, and nobody for ever."""
+    monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
+    registry = Registry(NoJournal())
+    subscriber(registry, "/ear")
+    subscriber(registry, "/other")
+    told = Told(PermissionRow("key of a publisher", "topic", "/chatter", str(HOST), "/ear"), absent_for)
+
+    async def run() -> None:
+        looks = Reminders(registry, cast(Any, told), cast(Any, told))
+        looks.begin()
+        assert looks._round is not None
+        await looks._round
+
+    asyncio.run(run())
+    assert told.reminded == [("/ear", "/chatter")] * times
