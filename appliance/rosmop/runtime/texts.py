@@ -8,7 +8,12 @@ NOT_FOUND = (1 << 64) - 1
 """`std::string::npos`."""
 
 _LONG = 64  # bytes; shorter strings are not charged
-_INTEGER = re.compile(rb"\s*([+-]?)(0[xX][0-9a-fA-F]+|[0-9]+)")
+_INTEGERS = {
+    2: re.compile(rb"\s*([+-]?[01]+)"),
+    8: re.compile(rb"\s*([+-]?[0-7]+)"),
+    10: re.compile(rb"\s*([+-]?[0-9]+)"),
+    16: re.compile(rb"\s*([+-]?)(?:0[xX](?=[0-9a-fA-F]))?([0-9a-fA-F]+)"),
+}
 _FLOATING = re.compile(
     rb"\s*([+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf(?:inity)?|nan))", re.IGNORECASE
 )
@@ -154,16 +159,10 @@ def terminated(buffer: bytes) -> bytes:
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
     """`std::stoi` and its like; a fault where C++ throws."""
-    found = _INTEGER.match(text[:1000])
+    found = _INTEGERS[base].match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
-    digits = found[2].decode()
-    if base == 10 and digits[:2] in ("0x", "0X"):
-        digits = "0"
-    try:
-        value = int(found[1].decode() + digits, 16 if digits[:2] in ("0x", "0X") else base)
-    except ValueError:
-        raise FaultError(site, "the string does not begin with a number of this base") from None
+    value = int(b"".join(found.groups()), base)
     if not least <= value <= most:
         raise FaultError(site, f"the number does not fit; it must be from {least} to {most}")
     return value

@@ -35,6 +35,9 @@ _FOUND = re.compile(
     r'"(?:\\.|[^"\\\n])*"|[A-Za-z_]\w*|\d[\w.]*|->|::|<<=|>>=|[-+*/%&|^<>=!]=|\+\+|--|&&|\|\||<<|>>|.',
     re.DOTALL,
 )
+_CONTAINER = re.compile(
+    r"(?:std\s*::\s*)?\b(map|unordered_map|set|list|deque|queue|pair|array|tuple|shared_ptr|function)\s*<[^;{}]*\Z"
+)
 _HINTS = {
     "->": "there are no pointers; write `.`",
     "&": "there are no addresses; pass the variable itself",
@@ -103,6 +106,9 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
             piece = "->"
         found = shown(piece)
         hint = FORBIDDEN.get(piece, _HINTS.get(piece, ""))
+    container = _CONTAINER.search(text, max(0, offset - 100), offset)
+    if container is not None:
+        hint = f"there is no `{container[1]}`; use a `std::vector`"
     expected = _expected(accepted)
     if accepted == {"AT"}:
         return f"found {found} after the formula; a property needs a handler: `@category {{ … }}`"

@@ -1,0 +1,300 @@
+"""Expressions have the values that C++ gives them on a 64-bit machine."""
+
+import pytest
+
+from tests.unit.rosmop.acting import act, refused_action, shown
+
+INTEGERS = [
+    ("1 + 2", 3),
+    ("7 / 2", 3),
+    ("-7 / 2", -3),
+    ("7 / -2", -3),
+    ("-7 % 3", -1),
+    ("7 % -3", 1),
+    ("2147483647 + 1", -2147483648),
+    ("-2147483647 - 2", 2147483647),
+    ("2147483647 * 2", -2),
+    ("5 & 3 | 8 ^ 1", 9),
+    ("~5", -6),
+    ("1 << 33", 2),
+    ("1 << 31", -2147483648),
+    ("1 << -1", -2147483648),
+    ("-16 >> 2", -4),
+    ("0x10", 16),
+    ("010", 8),
+    ("'a'", 97),
+    ("'a' + 1", 98),
+    (r"'\n'", 10),
+    (r"'\x41'", 65),
+    ("(int) 2.9", 2),
+    ("(int) -2.9", -2),
+    ("(int) 1e20", 2147483647),
+    ("(int) -1e20", -2147483648),
+    ("(int) (0.0 / 0.0)", 0),
+    ("(char) 200", -56),
+    ("(unsigned char) 300", 44),
+    ("(short) 40000", -25536),
+    ("int(3.7)", 3),
+    ("static_cast<int>(3.7)", 3),
+    ("(bool) 7", 1),
+    ("true + true", 2),
+    ("!0", 1),
+    ("!!7", 1),
+    ("-1 < 1u", 0),
+    ("-1 < 1", 1),
+    ("1 == 1.0", 1),
+    ("3 > 2 && 2 > 1", 1),
+    ("3 < 2 || 2 < 1", 0),
+    ("1 ? 2 : 3", 2),
+    ("0 ? 2 : 3", 3),
+    ("x++ + ++x", 2),
+    ("x-- - --x", 2),
+    ("x += 3", 3),
+    ("(x = 5, x * 2)", 10),
+    ("std::max(1, 2)", 2),
+    ("std::min(3, 2)", 2),
+    ("abs(-3)", 3),
+    ("std::abs(-3)", 3),
+    ("std::stoi(\"42\")", 42),
+    ("std::stoi(\" -42abc\")", -42),
+    ("std::stoi(\"ff\", 0, 16)", 255),
+    ("atoi(\"17x\")", 17),
+    ("atoi(\"x\")", 0),
+    ("strcmp(\"a\", \"b\")", -1),
+    ("INT_MAX", 2147483647),
+    ("std::numeric_limits<int>::max()", 2147483647),
+    ("std::numeric_limits<short>::min()", -32768),
+    ("std::string(\"abc\")[1]", 98),
+    ("std::string(\"abc\")[3]", 0),
+    ("std::vector<int>(3, 7)[2]", 7),
+    ("std::vector<int>{1, 2, 3}[1]", 2),
+    ("std::vector<int>{1, 2, 3}.back()", 3),
+    ("ros::Duration(1.5).sec", 1),
+    ("ros::Duration(1.5).nsec", 500000000),
+    ("ros::Duration(-0.5).sec", -1),
+    ("ros::Time(3, 7).nsec", 7),
+    ("ros::Time(1) < ros::Time(2)", 1),
+    ("ros::Time::now().sec", 1),
+    ("isnan(0.0 / 0.0)", 1),
+    ("std::isinf(1.0 / 0)", 1),
+    ("geometry_msgs::Point().x == 0", 1),
+    ("landshark_msgs::PaintballTrigger::SINGLE_SHOT", 1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("expression", "value"), INTEGERS)
+def test_an_integer_expression(expression: str, value: int) -> None:
+    """What an integer expression is, C++ would have it be."""
+    assert shown(expression, conversion="%d") == str(value)
+
+
+LONG = [
+    ("3000000000", "3000000000"),
+    ("-2147483648 / -1", "2147483648"),
+    ("9223372036854775807 + 1", "-9223372036854775808"),
+    ("1L << 40", "1099511627776"),
+    ("18446744073709551615u + 1", "0"),
+    ("4294967295u + 1u", "0"),
+    ("2147483647u + 1", "2147483648"),
+    ("0u - 1", "4294967295"),
+    ("std::string::npos", "18446744073709551615"),
+    ("std::string(\"abc\").size()", "3"),
+    ("std::string(\"abc\").size() - 4", "18446744073709551615"),
+    ("std::string(\"hello\").find(\"l\")", "2"),
+    ("std::string(\"hello\").find(\"l\", 3)", "3"),
+    ("std::string(\"hello\").rfind(\"l\")", "3"),
+    ("std::string(\"hello\").find('o')", "4"),
+    ("std::stol(\"5000000000\")", "5000000000"),
+    ("ros::Time(1.5).toNSec()", "1500000000"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("expression", "value"), LONG)
+def test_a_long_expression(expression: str, value: str) -> None:
+    """64-bit and unsigned arithmetic wraps at its own width."""
+    conversion = "%ld" if value.startswith("-") else "%lu"
+    assert shown(expression, conversion=conversion) == value
+
+
+DOUBLES = [
+    ("7 / 2.0", "3.5"),
+    ("1.0 / 0.0", "inf"),
+    ("-1.0 / 0", "-inf"),
+    ("0.0 / 0.0", "nan"),
+    ("1.0 / -0.0", "-inf"),
+    ("1e308 * 10", "inf"),
+    ("1.5f * 3", "4.5"),
+    ("(double) 3 / 2", "1.5"),
+    ("double(1) / 4", "0.25"),
+    ("5 / 2 * 2.0", "4"),
+    ("sqrt(2.25)", "1.5"),
+    ("sqrt(-1)", "nan"),
+    ("log(0)", "-inf"),
+    ("log(-1)", "nan"),
+    ("exp(1000)", "inf"),
+    ("pow(2, 10)", "1024"),
+    ("pow(0, -1)", "inf"),
+    ("pow(-8, 1.0 / 3)", "nan"),
+    ("fmod(5.5, 2)", "1.5"),
+    ("fmod(1, 0)", "nan"),
+    ("round(2.5)", "3"),
+    ("round(-2.5)", "-3"),
+    ("rint(2.5)", "2"),
+    ("floor(-1.5)", "-2"),
+    ("ceil(1.2)", "2"),
+    ("trunc(-1.7)", "-1"),
+    ("fabs(-3.5)", "3.5"),
+    ("hypot(3, 4)", "5"),
+    ("atan2(0, -1)", "3.14159"),
+    ("M_PI", "3.14159"),
+    ("std::min(1.5, 2.0)", "1.5"),
+    ("std::max(1, 2.5)", "2.5"),
+    ("-x + 0.5", "0.5"),
+    ("std::stod(\"2.5e1\")", "25"),
+    ("true ? 1 : 2.5", "1"),
+    ("ros::Time::now().toSec()", "1.5"),
+    ("(ros::Time(5.5) - ros::Time(2)).toSec()", "3.5"),
+    ("(ros::Duration(2) * 0.5).toSec()", "1"),
+    ("std::numeric_limits<double>::infinity()", "inf"),
+    (".5 + 1.", "1.5"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("expression", "value"), DOUBLES)
+def test_a_floating_expression(expression: str, value: str) -> None:
+    """Floating-point arithmetic is IEEE's, division by zero and overflow included."""
+    assert shown(expression, conversion="%g") == value
+
+
+def test_a_float_is_rounded_to_32_bits() -> None:
+    """A `float` holds what 32 bits hold, also between two operations."""
+    assert shown("0.1f", conversion="%.10f") == "0.1000000015"
+    assert shown("16777216.0f + 1.0f", conversion="%.1f") == "16777216.0"
+    assert shown("(float) 1e300", conversion="%f") == "inf"
+    assert shown("f", conversion="%.10f", before="float f = 0.1;") == "0.1000000015"
+
+
+STRINGS = [
+    ('std::string("ab") + "cd"', "abcd"),
+    ('"ab" + std::string("cd")', "abcd"),
+    ("std::string(\"ab\") + 'c'", "abc"),
+    ("std::to_string(5)", "5"),
+    ("std::to_string(1.5)", "1.500000"),
+    ("std::to_string(-1L)", "-1"),
+    ('std::string("hello").substr(1, 3)', "ell"),
+    ('std::string("hello").substr(2)', "llo"),
+    ("std::string(3, 'z')", "zzz"),
+    ('std::string("abc").c_str()', "abc"),
+    ('x ? "a" : "b"', "b"),
+    ('std::min(std::string("b"), std::string("a"))', "a"),
+    (r'"tab\tquote\"back\\"', 'tab\tquote"back\\'),
+    ('"one" "two"', "onetwo"),
+    ('"\u00e4\u20ac"', "\u00e4\u20ac"),
+]
+
+
+@pytest.mark.parametrize(("expression", "value"), STRINGS)
+def test_a_string_expression(expression: str, value: str) -> None:
+    """Strings join, are cut and are made as in C++."""
+    assert shown(expression) == value
+
+
+def test_a_string_is_bytes() -> None:
+    """The length of a string counts bytes, as in C++."""
+    assert shown('std::string("\u00e4").size()', conversion="%d") == "2"
+    assert shown('std::string("\u00e4")[0]', conversion="%d") == str(0xC3 - 256)
+
+
+FAULTS = [
+    ("10 / x", "division by zero"),
+    ("10 % x", "division by zero"),
+    ("std::vector<int>{1}[1]", "index 1 is past the end of a vector of 1"),
+    ("std::vector<int>{1}[-1]", "index -1 is past the end of a vector of 1"),
+    ("std::vector<int>{1}.at(5)", "index 5 is past the end of a vector of 1"),
+    ('std::string("ab")[7]', "index 7 is past the end of a string of 2 characters"),
+    ('std::string("ab").at(2)', "index 2 is past the end of a string of 2 characters"),
+    ('std::stoi("x")', "the string does not begin with a number"),
+    ('std::stoi("99999999999")', "the number does not fit; it must be from -2147483648 to 2147483647"),
+    ('std::stod("")', "the string does not begin with a number"),
+    ("ros::Time(-1.0).sec", "the time is out of range: from 0 to 2^32 seconds"),
+]
+
+
+@pytest.mark.parametrize(("expression", "text"), FAULTS)
+def test_a_fault(expression: str, text: str) -> None:
+    """What C++ leaves undefined, or throws for, is a fault that says what happened."""
+    outcome = act(f'ROS_INFO("%d", {expression});')
+    assert [fault.text for fault in outcome.faults] == [text]
+    assert outcome.result == "dropped"
+    assert outcome.log == ()
+
+
+def test_a_fault_stands_where_the_expression_does() -> None:
+    """A fault names file, line and column of the expression, and the values of its variables."""
+    outcome = act("\n  int q = 3;\n  x = 1 + q / (x - 7);", data=7)
+    [fault] = outcome.faults
+    assert (fault.position.file, fault.position.line, fault.position.column) == ("x.rv", 3, 11)
+    assert fault.values == {"q": 3, "x": 7}
+
+
+REFUSED = [
+    ('x = "a";', 3, 5, "std::string cannot become int; write `std::stod(…)` or `std::stoi(…)`"),
+    ("std::string s = 5;", 3, 17, "int cannot become std::string; write `std::to_string(…)`"),
+    ('std::string s = "a" + 5;', 3, 23, "a int is no string; write `std::to_string(…)`"),
+    ("y = 1;", 3, 1, "there is no variable `y`"),
+    ("counter = 1; int count;", 3, 1, "there is no variable `counter`"),
+    ("foo(1);", 3, 1, "there is no function `foo`"),
+    ("sqr(1.0);", 3, 1, "there is no function `sqr`; did you mean `sqrt`?"),
+    ("sqrt(1, 2);", 3, 1, "`sqrt` takes 1 argument(s), not 2"),
+    ("x = 1.5 % 2;", 3, 5, "`%` has no meaning for double and int; write `fmod(…)`"),
+    ("5 = x;", 3, 1, "`=` needs a variable, a field or an element"),
+    ("x = ros::Time::now();", 3, 5, "ros::Time cannot become int; write `.toSec()`, `.sec` or `.nsec`"),
+    ("geometry_msgs::Point p; x = p.w;", 3, 29, "geometry_msgs/Point has no field `w`; there are: x, y, z"),
+    ("geometry_msgs::Pont p;", 3, 1, "there is no message type `geometry_msgs/Pont`; did you mean"),
+    ("std::map<int, int> m;", 3, 13, "there is no `map`; use a `std::vector`"),
+    ("int v[3]; x = v[3];", 3, 17, "index 3 is past the end of an array of 3 elements"),
+    ("if (std::string()) x = 1;", 3, 5, "std::string is no condition; write `.empty()` or compare it"),
+    ('ROS_INFO("%f");', 3, 10, "`%f` has no argument; for a percent sign write `%%`"),
+    ('ROS_INFO("%s", 5);', 3, 16, "`%s` needs a string; this is int"),
+    ('ROS_INFO("a", 5);', 3, 15, "this argument has no conversion in the format, such as `%f` or `%s`"),
+    ("std::string s; ROS_INFO(s, 5);", 3, 25, "the format must be a literal"),
+    ("int i = i2;", 3, 9, "there is no variable `i2`"),
+    ("int x2; int x2;", 3, 13, "`x2` is declared twice in this block"),
+    ("const int c = 1; c = 2;", 3, 18, "`c` is const"),
+    ("return 5;", 3, 8, "there is nobody to return a value to; write `return;` to drop the message"),
+    ("break;", 3, 1, "`break` stands in a loop or a `switch`"),
+    ("continue;", 3, 1, "`continue` stands in a loop"),
+    ("__RESET;", 3, 1, "`__RESET;` stands in the handlers of a property"),
+    ("std::vector<int> v; v.push_front(1);", 3, 21, "std::vector<int> has no function `push_front`; did you mean `front`?"),
+    ("std::vector<int> v; x = v;", 3, 25, "std::vector<int> cannot become int; write an index, `[0]`"),
+    ("std::vector<int> v; std::vector<double> w = v;", 3, 45, "std::vector<int> cannot become std::vector<double>"),
+    ("int *p;", 3, 1, "there are no pointers but `char *`; write `int`"),
+    ("x = rand();", 3, 5, "there is no function `rand`: verdicts are functions of what was received"),
+    ('system("rm -rf /");', 3, 1, "there is no function `system`: there are no programs to start"),
+    ("x = 99999999999999999999;", 3, 5, "`99999999999999999999` is larger than any integer type holds"),
+    ("x = 08;", 3, 5, "`08` is no number; one that begins with 0 is octal"),
+    ("switch (x) { case x: break; }", 3, 19, "a case needs a constant: a number or a character"),
+    ("switch (x) { case 1: case 1: break; }", 3, 27, "case 1 occurs twice"),
+    ("switch (1.5) { }", 3, 9, "`switch` needs an integer; this is double"),
+    ("MESSAGE = 1;", 3, 1, "`MESSAGE` cannot be assigned; bind the fields you want to change"),
+    ("PUBLISH(/a, std_msgs/Int32, x);", 3, 29, "this is int, but std_msgs::Int32 is to be published"),
+    ("std_msgs::Int32 m; PUBLISH(a, std_msgs/Int32, m);", 3, 20, "`a` is no global name; write `/a`"),
+    ("goto end;", 3, 1, "`goto` is not part of the language; there are no jumps"),
+    ("delete x;", 3, 1, "`delete` is for `char` buffers; int needs none"),
+    ("auto y;", 3, 6, "`auto` needs a value: `auto x = …;`"),
+    ("static int n;", 3, 1, "there are no static variables in functions; declare it before the events"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "line", "column", "text"), REFUSED)
+def test_a_refusal(body: str, line: int, column: int, text: str) -> None:
+    """What is outside the language is an error with its exact place, what was found, and what to write."""
+    finding = refused_action(body)[0]
+    assert (finding.position.line, finding.position.column) == (line, column)
+    assert text in finding.text
+
+
+def test_one_check_finds_all_errors_of_an_action() -> None:
+    """A wrong statement does not hide the next one."""
+    findings = refused_action("y = 1;\nz = 2;\nif (x) { q = 3; }\nx = 5;")
+    assert [finding.position.line for finding in findings] == [3, 4, 5]

@@ -1,0 +1,233 @@
+"""Statements do what C++ statements do."""
+
+import pytest
+
+from tests.unit.rosmop.acting import act, refused_action
+
+
+def printed(body: str, *, before: str = "", data: int = 0) -> str:
+    """The lines an action prints, with spaces between them; a fault's text if there is one."""
+    outcome = act(body, before=before, data=data)
+    if outcome.faults:
+        return f"fault: {outcome.faults[0].text}"
+    return " ".join(line.text for line in outcome.log)
+
+
+LOOPS = [
+    ('for (int i = 0; i < 3; i++) ROS_INFO("%d", i);', "0 1 2"),
+    ('for (int i = 0, j = 9; i < j; ++i, j -= 4) ROS_INFO("%d-%d", i, j);', "0-9 1-5"),
+    ('for (int i = 0; ; i++) { if (i == 2) break; ROS_INFO("%d", i); }', "0 1"),
+    ('for (int i = 0; i < 5; i++) { if (i % 2) continue; ROS_INFO("%d", i); }', "0 2 4"),
+    ('int i = 3; while (i--) ROS_INFO("%d", i);', "2 1 0"),
+    ('int i = 0; do { ROS_INFO("%d", i); } while (++i < 2);', "0 1"),
+    ('int i = 0; do { i++; if (i == 2) continue; ROS_INFO("%d", i); } while (i < 3);', "1 3"),
+    ('int i = 5; do ROS_INFO("%d", i); while (i < 2);', "5"),
+    ('std::vector<int> v{1, 2, 3}; for (int e : v) ROS_INFO("%d", e);', "1 2 3"),
+    ('std::vector<int> v{1, 2}; for (auto& e : v) e *= 10; ROS_INFO("%d %d", v[0], v[1]);', "10 20"),
+    ('std::vector<int> v{1, 2}; for (auto e : v) e *= 10; ROS_INFO("%d %d", v[0], v[1]);', "1 2"),
+    ('std::vector<int> v{1, 2}; for (const auto& e : v) ROS_INFO("%d", e);', "1 2"),
+    ('std::vector<std::string> v{"a", "b"}; for (std::string& s : v) s += "!"; ROS_INFO("%s", v[1].c_str());', "b!"),
+    ('std::string s = "ab"; for (char c : s) ROS_INFO("%c", c);', "a b"),
+    ('for (int i = 0; i < 2; i++) for (int j = 0; j < 2; j++) { if (j) break; ROS_INFO("%d%d", i, j); }', "00 10"),
+    ('for (int i = 0; i < 2; i++) { int n; n++; ROS_INFO("%d", n); }', "1 1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "lines"), LOOPS)
+def test_a_loop(body: str, lines: str) -> None:
+    """Loops run, break and continue as in C++."""
+    assert printed(body) == lines
+
+
+SWITCH = (
+    'switch (x) { case 1: ROS_INFO("one"); case 2: ROS_INFO("two"); break; '
+    'default: ROS_INFO("other"); case 5: ROS_INFO("five"); }'
+)
+
+
+@pytest.mark.parametrize(("data", "lines"), [(1, "one two"), (2, "two"), (5, "five"), (7, "other five")])
+def test_a_switch_falls_through_until_a_break(data: int, lines: str) -> None:
+    """`switch` begins at the case and goes on until `break`; `default` may stand anywhere."""
+    assert printed(SWITCH, data=data) == lines
+
+
+def test_a_switch_without_a_fitting_case_does_nothing() -> None:
+    """Without `default` nothing runs."""
+    assert printed('switch (x) { case 1: ROS_INFO("one"); }', data=3) == ""
+
+
+def test_continue_in_a_switch_is_that_of_the_loop() -> None:
+    """`continue` inside a `switch` goes on with the loop around it, step included."""
+    body = """for (int i = 0; i < 4; i++) {
+        switch (i) { case 1: continue; case 2: break; default: ROS_INFO("d%d", i); }
+        ROS_INFO("e%d", i);
+    }"""
+    assert printed(body) == "d0 e0 e2 d3 e3"
+
+
+def test_a_character_can_be_a_case() -> None:
+    """Cases may be characters, and constants of message types."""
+    assert printed("switch ('b') { case 'a': ROS_INFO(\"a\"); break; case 'b': ROS_INFO(\"b\"); }") == "b"
+
+
+IFS = [
+    ('if (x == 0) ROS_INFO("a"); else ROS_INFO("b");', "a"),
+    ('if (x) ROS_INFO("a"); else if (!x) ROS_INFO("b"); else ROS_INFO("c");', "b"),
+    ('if (1) if (0) ROS_INFO("a"); else ROS_INFO("b");', "b"),
+    ('if (x == 0) { int x = 5; ROS_INFO("%d", x); } ROS_INFO("%d", x);', "5 0"),
+    ('{ int y = 1; { int y = 2; ROS_INFO("%d", y); } ROS_INFO("%d", y); }', "2 1"),
+    ('if (double d = 0.5) ROS_INFO("a");', None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "lines"), IFS)
+def test_an_if(body: str, lines: str | None) -> None:
+    """Branches and the scopes of blocks."""
+    if lines is None:
+        assert refused_action(body)
+    else:
+        assert printed(body) == lines
+
+
+ASSIGNMENTS = [
+    ("int a = 7; a += 3; a -= 1; a *= 2; a /= 4; a %= 3;", "a", "1"),
+    ("int a = 6; a &= 3; a |= 8; a ^= 1; a <<= 2; a >>= 1;", "a", "22"),
+    ("int a, b; a = b = 4; a += b;", "a", "8"),
+    ("int a = 2.9;", "a", "2"),
+    ("int a = 1; a += 1.7;", "a", "2"),
+    ("int8_t a = 127; a++;", "a", "-128"),
+    ("unsigned char a = 0; a--;", "a", "255"),
+    ("uint16_t a = 65535; a += 2;", "a", "1"),
+    ("unsigned int a = -1; a /= 2;", "a", "2147483647"),
+    ("bool a = 5;", "a", "1"),
+    ("int a[3] = {1, 2}; a[2] = a[1] + 5;", "a[2]", "7"),
+    ("int a[] = {4, 5};", "a[1]", "5"),
+    ("std::vector<std::vector<int>> a(2, std::vector<int>(2, 1)); a[0][1] = 9;", "a[0][1] + a[1][1]", "10"),
+    ("std::vector<int> a; a.push_back(4); a.push_back(5); a.pop_back();", "a.size()", "1"),
+    ("std::vector<int> a(3); a.resize(5); a.resize(1);", "a.size()", "1"),
+    ("std::vector<int> a{1, 2}; std::vector<int> b = a; b[0] = 7;", "a[0]", "1"),
+    ("std::vector<int> a{1, 2}; a = {3};", "a[0] + a.size()", "4"),
+    ("auto a = 3; a += 4;", "a", "7"),
+    ("int a(5);", "a", "5"),
+    ("int a{6};", "a", "6"),
+    ("geometry_msgs::Twist a; a.linear.x = 3; geometry_msgs::Twist b = a; b.linear.x = 4;", "(int) a.linear.x", "3"),
+    ("std_msgs/Header a; a.stamp = ros::Time(5, 6); a.stamp.sec = 7;", "a.stamp.sec * 10 + a.stamp.nsec", "76"),
+    ("std_msgs::Header a; a.stamp.nsec += 4; a.stamp.sec++;", "a.stamp.sec * 10 + a.stamp.nsec", "14"),
+    ("ros::Duration a(2.5); a.nsec = 0;", "(int) (a.toSec() * 10)", "20"),
+    ("std::vector<std::string> a(2); a[1] += \"xy\"; a[1][0] = 'z';", "a[1][0]", "122"),
+    ("std::string a = \"abc\"; a[1] = 'x';", "a[1]", "120"),
+    ("std::string a = \"abc\"; a[1]++;", "a[1]", "99"),
+    ("long a = 1; a = a << 40; a++;", "(int) (a >> 40)", "1"),
+    ("double a = 1; a++; a /= 4;", "(int) (a * 100)", "50"),
+    ("float a = 0.1; a *= 3;", "(int) (a * 1000)", "300"),
+    ("int a = 3; int b = a++ * 2 + --a;", "b", "9"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "expression", "value"), ASSIGNMENTS)
+def test_an_assignment(body: str, expression: str, value: str) -> None:
+    """Variables, elements, fields and parts of times are assigned with C++'s conversions."""
+    assert printed(f'{body} ROS_INFO("%d", {expression});') == value
+
+
+STRINGS = [
+    ('s += "d"; s.append("e"); s.push_back(\'f\');', "abcdef"),
+    ("s.clear();", ""),
+    ("s.erase(1, 1);", "ac"),
+    ('s.insert(1, "XY");', "aXYbc"),
+    ('s.replace(0, 2, "q");', "qc"),
+    ("s.pop_back();", "ab"),
+    ("s.resize(2);", "ab"),
+    ('s = s + "-" + s;', "abc-abc"),
+    ('s.assign("zz");', "zz"),
+]
+
+
+@pytest.mark.parametrize(("body", "value"), STRINGS)
+def test_a_string_is_changed(body: str, value: str) -> None:
+    """Member functions change a string in its variable."""
+    assert printed(f'std::string s = "abc"; {body} ROS_INFO("%s", s.c_str());') == value
+
+
+def test_character_buffers_as_in_the_samples_of_rosrv() -> None:
+    """`new char[]`, `strcpy`, `%s` and `delete[]` work, and a buffer that is too small is a fault."""
+    body = 'std::string m = "hello"; char * c = new char[m.length() + 1]; std::strcpy(c, m.c_str()); '
+    assert printed(body + 'ROS_INFO("%s", c); delete[] c;') == "hello"
+    assert printed('char c[3]; strcpy(c, "hello");') == "fault: strcpy of 6 characters into a buffer of 3"
+    assert printed('char c[10]; sprintf(c, "%d-%s", 5, "x"); strcat(c, "!"); ROS_INFO("%s %d", c, (int) strlen(c));') \
+        == "5-x! 4"  # fmt: skip
+
+
+FUNCTIONS = [
+    ("int twice(int a) { return a * 2; }", "twice(4)", "8"),
+    ("int twice(int a) { return a * 2; } int four(int a) { return twice(twice(a)); }", "four(1)", "4"),
+    ("double half(int a) { return a / 2.0; }", "(int) (half(3) * 10)", "15"),
+    ("int later(int a) { return other(a); } int other(int a) { return a + 1; }", "later(1)", "2"),
+    ("int fact(int a) { return a < 2 ? 1 : a * fact(a - 1); }", "fact(5)", "120"),
+    ("bool even(int a) { if (a == 0) return true; return odd(a - 1); } "
+     "bool odd(int a) { if (a == 0) return false; return even(a - 1); }", "even(10)", "1"),
+    ("int first(const std::vector<int>& v) { return v[0]; }", "first(std::vector<int>{7})", "7"),
+    ("int keep(int a) { a = 9; return a; }", "keep(1) + x", "9"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("before", "expression", "value"), FUNCTIONS)
+def test_a_helper_function(before: str, expression: str, value: str) -> None:
+    """Helper functions take values, call each other in any order, and return converted values."""
+    assert printed(f'ROS_INFO("%d", {expression});', before=before) == value
+
+
+def test_reference_parameters_are_handed_back() -> None:
+    """A function changes what it takes by reference, and returns a value besides."""
+    before = """bool split(int a, int& high, int& low, std::vector<int>& all) {
+        high = a / 10; low = a % 10; all.push_back(a); return a > 0; }"""
+    body = """int h, l; std::vector<int> v; bool ok = split(42, h, l, v);
+        ROS_INFO("%d %d %d %d", ok, h, l, v[0]);"""
+    assert printed(body, before=before) == "1 4 2 42"
+
+
+def test_a_procedure_needs_no_type() -> None:
+    """A function without a result type returns nothing, as in the samples of ROSRV."""
+    assert printed('go(); go(); ROS_INFO("%d", n);', before="int n; go() { n++; }") == "2"
+
+
+OUTPUT = [
+    ('ROS_INFO("100%% of %s", "it");', "100% of it"),
+    ('ROS_INFO("%5.2f|%-5d|%05d|%+d", 3.14159, 42, 42, 42);', " 3.14|42   |00042|+42"),
+    ('ROS_INFO("%x %X %o %u", 255, 255, 8, -1);', "ff FF 10 4294967295"),
+    ('ROS_INFO("%d %f", 2.9, 3);', "2 3.000000"),
+    ('ROS_INFO("%ld %llu %zu %hd", 1L, 2ul, 3ul, 4);', "1 2 3 4"),
+    ("ROS_INFO(\"%c%c\", 'h', 105);", "hi"),
+    ('ROS_INFO_STREAM("a" << 1 << \' \' << 2.5 << " " << true);', "a1 2.5 1"),
+    ('ROS_INFO_STREAM(1 + 2);', "3"),
+    ('std::cout << "x = " << 0.1 + 0.2 << std::endl;', "x = 0.3"),
+    ('std::cout << std::fixed << std::setprecision(2) << 3.14159 << "\\n";', "3.14"),
+    ('std::cerr << "e";', "e"),
+    ('printf("%s\\n", "p");', "p"),
+    ('std::string s = "%d"; ROS_INFO(s.c_str());', "%d"),
+    ('std::cout << ros::Time(1, 5);', "1.000000005"),
+    ('ROS_INFO_COND(x == 0, "yes"); ROS_INFO_COND(x != 0, "no");', "yes"),
+    ('for (int i = 0; i < 3; i++) ROS_INFO_ONCE("once");', "once"),
+    ('for (int i = 0; i < 3; i++) ROS_INFO_THROTTLE(1.0, "often");', "often"),
+    ('ROS_INFO_NAMED("name", "text %d", 1);', "text 1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "text"), OUTPUT)
+def test_output(body: str, text: str) -> None:
+    """Formats and streams print what C++ prints."""
+    assert printed(body) == text
+
+
+@pytest.mark.parametrize("level", ["DEBUG", "INFO", "WARN", "ERROR", "FATAL"])
+def test_the_level_of_output(level: str) -> None:
+    """Every macro of rosconsole logs at its own level, under the name of the monitor."""
+    [line] = act(f'ROS_{level}("text");').log
+    assert (line.level, line.text, line.monitor) == (level, "text", "s")
+
+
+def test_assigning_a_converted_parameter_twice_keeps_the_last() -> None:
+    """What an action assigns last is what is relayed."""
+    outcome = act("x = 5; x = x + 1;", data=1)
+    assert outcome.result == "changed"
+    assert bytes(outcome.buffer) == b"\x06\0\0\0"
