@@ -1,0 +1,27 @@
+"""A robot under attack, shared by the tests of a file."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.network.lab import Lab
+from tests.support.field import Field
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_root, needs
+
+
+@pytest.fixture(scope="module")
+def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
+    """The appliance with the policy (and the options) of the test file, and its hosts."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    policy, options = request.module.POLICY, getattr(request.module, "OPTIONS", ())
+    with Lab("rosrv-test") as lab, Field(lab, tmp_path_factory.mktemp("field"), policy, options) as field:
+        yield field
+
+
+@pytest.fixture
+def field(battlefield: Field) -> Iterator[Field]:
+    """The field of one attack: afterwards talker and listener must have gone on as if nothing had been."""
+    yield battlefield
+    battlefield.unharmed()

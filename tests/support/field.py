@@ -1,0 +1,234 @@
+"""An appliance under attack: a robot and its operator talk, a rogue host tries everything, somebody watches the log.
+
+with Field(lab, home, POLICY) as field:
+    answer = field.rogue("unregisterPublisher", "/voice", "/chatter", field.api)
+    field.denied(answer, "held by 10.77.0.10")
+    field.unharmed()
+"""
+
+import contextlib
+import http.client
+import re
+import socket
+import threading
+import xmlrpc.client
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import ROSRV, Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT, Event, Process, ThisMachine
+
+_RECORD_ID = re.compile(r"\[([0-9a-f]{20})\]\Z")
+
+
+class Field:
+    """Hosts: `robot` 10.77.0.10 (talker `/voice`), `ocu` 10.77.0.20 (listener `/ear`), `attacker` 10.77.0.66,
+    `stranger` 10.77.0.99, whom no rule names; the appliance is 10.77.0.2.
+    """
+
+    api = "http://10.77.0.66:40404/"  # nobody listens there unless a test does
+
+    def __init__(self, lab: Lab, home: Path, policy: str, options: tuple[str, ...] = ()) -> None:
+        self.middle = lab.host("appliance", "10.77.0.2/24")
+        self.robot = lab.host("robot", "10.77.0.10/24")
+        self.ocu = lab.host("ocu", "10.77.0.20/24")
+        self.attacker = lab.host("attacker", "10.77.0.66/24")
+        self.stranger = lab.host("stranger", "10.77.0.99/24")
+        self.policy = policy
+        self.home = home
+        self.appliance = Appliance(self.middle, policy=policy, options=options)
+        self.answers: list[tuple[str, Any]] = []
+        self._closing = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(self.appliance)
+            command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
+            self.trail = stack.enter_context(
+                Process(ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail")
+            )
+            self.ros = stack.enter_context(RosSession(self.appliance.master_uri, self.home, self.robot))
+            self.talker = self.ros.talker("rospy", "/chatter", "--rate", "50", name="voice")
+            self.listener = self.ros.on(self.ocu).listener("roscpp", "/chatter", name="ear")
+            self.listener.wait_for(event="received")
+            self._closing = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._closing.close()
+
+    @property
+    def master(self) -> str:
+        """The URI of RVMaster."""
+        return self.appliance.master_uri
+
+    # --- what the rogue does ---
+
+    def rogue(self, method: str, *parameters: Any, uri: str | None = None) -> Any:
+        """One XML-RPC call from the attacker's host: its answer; a fault or an HTTP error as the exception."""
+        return self.call(self.attacker, method, *parameters, uri=uri)
+
+    def call(self, host: Host, method: str, *parameters: Any, uri: str | None = None) -> Any:
+        """One XML-RPC call from a host."""
+
+        def call() -> Any:
+            with xmlrpc.client.ServerProxy(uri or self.master, allow_none=True) as server:
+                try:
+                    return server.__getattr__(method)(*parameters)
+                except (xmlrpc.client.Error, http.client.HTTPException) as error:
+                    return error
+
+        answer = host.run(call)
+        if host is not self.robot:
+            self.answers.append((method, answer))
+        return answer
+
+    def raw(self, data: bytes, host: Host | None = None, port: int = 11311) -> bytes:
+        """Send bytes to the appliance and read until it closes, or until an answer is whole and nothing follows."""
+        with self.connect(host, port) as sock:
+            sock.sendall(data)
+            received = b""
+            with contextlib.suppress(ConnectionResetError):
+                while piece := sock.recv(65536):
+                    received += piece
+                    if whole(received):
+                        break
+        self.answers.append(("raw", received))
+        return received
+
+    def connect(self, host: Host | None = None, port: int = 11311) -> socket.socket:
+        """A TCP connection to the appliance."""
+        return (host or self.attacker).run(lambda: socket.create_connection(("10.77.0.2", port), LIMIT))
+
+    # --- what must be true afterwards ---
+
+    def denied(
+        self, answer: Any, reason: str, *, rule: str | None = None, code: int = 0, **fields: Any
+    ) -> Event:
+        """The answer is a denial of the right shape for this reason, and the log has it, with the rule and its line.
+
+        `rule` is its section and key, as `[Nodes] default`. Returns the record.
+        """
+        assert isinstance(answer, list), answer
+        assert (len(answer), answer[0]) == (3, code), answer
+        assert reason in answer[1], answer
+        found = _RECORD_ID.search(answer[1])
+        assert found is not None, answer
+        record = self.trail.wait_for(id=found[1])
+        assert reason in record["reason"], record
+        expected = {"decision": "deny", "host": "10.77.0.66"} | fields
+        assert {key: record[key] for key in expected} == expected
+        if rule is None:
+            assert record["rule"] is None, record
+        else:
+            place = record["rule"]
+            assert f"[{place['section']}] {place['key']}" == rule, record
+            assert place["file"] == str(self.appliance.policy_file), record
+            lines = self.policy.splitlines()[: place["line"]]
+            assert re.match(re.escape(place["key"]) + r" *=", lines[-1]), record
+            assert [line for line in lines if line.startswith("[")][-1] == f"[{place['section']}]", record
+            assert rule in answer[1], answer
+        return record
+
+    def recorded(self, **fields: Any) -> Event:
+        """The first record with these fields, once it is there."""
+        return self.trail.wait_for(**fields)
+
+    def unharmed(self, messages: int = 3) -> None:
+        """Talker and listener go on: every message arrives, once, in order, and from the talker."""
+        count = len(self.listener.seen(event="received"))
+        heard = self.listener.wait_for_count(count + messages, event="received")
+        numbers = [int(event["data"].rsplit(" ", 1)[1]) for event in heard]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (
+            "messages are missing or doubled"
+        )
+        assert {event["publisher"] for event in heard} == {"/voice"}
+        assert self.talker.running
+        assert self.listener.running
+
+    def memory(self, role: str = "control") -> int:
+        """Resident bytes of a process of the appliance."""
+        status = Path(f"/proc/{self.appliance.pids(role)[0]}/status").read_text()
+        return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) << 10  # type: ignore[index]  # it is there
+
+    def story(self) -> str:
+        """What everybody said, for the message of a failure."""
+        return "\n".join([self.appliance.story(), self.trail.story(), self.ros.story()])
+
+
+class Impostor:
+    """A TCP server on a host that answers as `behave(connection, request)` says; counts who came."""
+
+    def __init__(
+        self, host: Host, behave: Callable[[socket.socket, bytes], None], address: str | None = None
+    ) -> None:
+        self.requests: list[bytes] = []
+        self.peers: list[str] = []
+        self.called = threading.Event()
+        self._behave = behave
+        self._socket = host.run(lambda: socket.create_server((address or host.address, 0)))
+        self.port: int = self._socket.getsockname()[1]
+        self.uri = f"http://{host.address}:{self.port}/"
+        self._open: set[socket.socket] = set()
+        self._thread = threading.Thread(target=self._accept, daemon=True)
+        self._thread.start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, peer = self._socket.accept()
+            except OSError:
+                return
+            self.peers.append(peer[0])
+            self._open.add(connection)
+            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection:
+            request = b""
+            while not whole(request):
+                piece = connection.recv(65536)
+                if not piece:
+                    break
+                request += piece
+            self.requests.append(request)
+            self.called.set()
+            self._behave(connection, request)
+        self._open.discard(connection)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        for connection in list(self._open):
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        self._thread.join(LIMIT)
+
+
+def whole(message: bytes) -> bool:
+    """Whether an HTTP message has arrived whole (by its Content-Length)."""
+    head, end, body = message.partition(b"\r\n\r\n")
+    found = re.search(rb"(?i)content-length: *(\d+)", head)
+    return bool(end) and found is not None and len(body) >= int(found[1])
+
+
+def answering(value: Any) -> Callable[[socket.socket, bytes], None]:
+    """The behaviour of a node that answers every call with this value."""
+
+    def behave(connection: socket.socket, _request: bytes) -> None:
+        connection.sendall(response(value))
+
+    return behave
+
+
+def response(value: Any) -> bytes:
+    """An HTTP response with an XML-RPC answer."""
+    body = xmlrpc.client.dumps((value,), methodresponse=True).encode()
+    return b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n" % len(body) + body
