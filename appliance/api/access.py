@@ -49,7 +49,9 @@ class Doorkeeper:
         self._tokens: dict[str, TokenKept] = {}
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
-        self._failures = Buckets(failures_per_minute / 60, failures_per_minute)
+        # Apart, so that somebody who tries ids at random does not lock out a neighbour with a good token.
+        self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
+        self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
@@ -76,16 +78,16 @@ class Doorkeeper:
             if time.time() < kept.expires:
                 return Bearer(kept.id, kept.name, Role[kept.role.upper()], kept.expires)
             raise self._refusal("the token has expired: ask for another one (rosrv token add)")
-        if kept is None:
-            self._require_patience(host)
-        self._failures.take(host, time.monotonic())
+        failures = self._unknown if kept is None else self._wrong
+        _require_patience(failures, host)
+        failures.take(host, time.monotonic())
         raise self._refusal("the token is wrong, or was revoked")
 
     async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
         digest = hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)
         if self._recognised.get(digest) == kept.id:
             return True
-        self._require_patience(host)
+        _require_patience(self._wrong, host)
         async with self._checking:
             if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
                 return False
@@ -93,17 +95,18 @@ class Doorkeeper:
             self._recognised[digest] = kept.id
         return True
 
-    def _require_patience(self, host: str) -> None:
-        seconds = self._failures.wait(host, time.monotonic())
-        if seconds:
-            raise ProblemError(
-                429,
-                "too-many-failures",
-                "too many requests of this host came without a good token",
-                headers={"Retry-After": str(int(seconds) + 1)},
-            )
-
     def _refusal(self, detail: str) -> ProblemError:
         return ProblemError(
             401, "not-recognised", detail, headers={"WWW-Authenticate": 'Bearer realm="rosrv"'}
+        )
+
+
+def _require_patience(failures: Buckets, host: str) -> None:
+    seconds = failures.wait(host, time.monotonic())
+    if seconds:
+        raise ProblemError(
+            429,
+            "too-many-failures",
+            "too many requests of this host came without a good token",
+            headers={"Retry-After": str(int(seconds) + 1)},
         )

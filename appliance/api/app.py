@@ -6,6 +6,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
+from starlette.routing import Match, Route
 
 import appliance
 from appliance.api import audit, explaining, graph, health, metrics, policy
@@ -70,12 +71,26 @@ async def _defect(request: Request, error: Exception) -> Response:
 
 async def _of_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)  # noqa: S101  registered for it
-    known = {
-        404: ("unknown-path", "there is nothing here"),
-        405: ("wrong-method", "this cannot be done here"),
-    }
-    kind, detail = known.get(error.status_code, ("bad-request", str(error.detail)))
-    return _answer(request, ProblemError(error.status_code, kind, detail, headers=error.headers))
+    match error.status_code:
+        case 404:
+            problem = ProblemError(404, "unknown-path", "there is nothing here")
+        case 405:
+            allowed = {"Allow": ", ".join(sorted(_methods(request)))}
+            problem = ProblemError(405, "wrong-method", "this cannot be done here", headers=allowed)
+        case 400:  # FastAPI's word for a body that is not even text
+            problem = ProblemError(422, "not-json", "the body is not JSON in UTF-8")
+        case status:
+            problem = ProblemError(status, "bad-request", str(error.detail), headers=error.headers)
+    return _answer(request, problem)
+
+
+def _methods(request: Request) -> set[str]:
+    """What can be done at a path; a path with two methods is two routes."""
+    found: set[str] = set()
+    for route in request.app.routes:
+        if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE:
+            found |= route.methods or set()
+    return found
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

@@ -13,6 +13,7 @@ IfMatch = Annotated[
     str | None,
     Header(
         alias="If-Match",
+        max_length=100,
         description="The ETag of the policy the change is meant for, or `*` for whichever is in force.",
     ),
 ]

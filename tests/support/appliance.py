@@ -12,6 +12,7 @@ import ssl
 import subprocess
 import sys
 import tempfile
+import urllib.parse
 from pathlib import Path
 from typing import Any, Self
 
@@ -41,10 +42,13 @@ class Appliance:
         policy: str = OPEN_POLICY,
         isolation: str | None = None,
         options: tuple[str, ...] = (),
+        json: bool = True,
     ) -> None:
+        """`json` False: as a person starts it; there is no `ready` then, only the lines in `process`."""
         self.host: Host = host or ThisMachine()
         self.isolation = isolation or ("none" if isinstance(self.host, ThisMachine) else "container")
         self.options = options
+        self.json = json
         # Not pytest's folder: that is closed to the users the appliance's processes run as.
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-test-"))
         self.directory.chmod(0o755)
@@ -62,13 +66,24 @@ class Appliance:
     def start(self) -> Self:
         """Start (again, on the same state); returns when nodes may connect."""
         loopback = isinstance(self.host, ThisMachine)
-        command = [ROSRV, "up", "--json", "--isolation", self.isolation, "--state", str(self.state)]
+        command = [
+            ROSRV,
+            "up",
+            *(["--json"] if self.json else []),
+            "--isolation",
+            self.isolation,
+            "--state",
+            str(self.state),
+        ]
         command += ["--policy", str(self.policy_file), *self.options]
         command += ["--listen", "127.0.0.1:0" if loopback else f"{self.host.address}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
         self.process = Process(self.host, command, env=_environment(), label="rosrv up")
-        self.ready = self.process.wait_for(event="ready", timeout=60)
+        if self.json:
+            self.ready = self.process.wait_for(event="ready", timeout=60)
+        else:
+            self.process.wait_for_text("Nodes may connect", timeout=60)
         return self
 
     def stop(self) -> int:
@@ -76,10 +91,10 @@ class Appliance:
         return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
 
     def rosrv(
-        self, *arguments: str, check: bool = True, timeout: float = LIMIT
+        self, *arguments: str, check: bool = True, timeout: float = LIMIT, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Another verb of the command, told of this appliance by `--state`."""
-        command = [ROSRV, *arguments, "--state", str(self.state)]
+        """Another verb of the command, told of this appliance by `--state` (unless it does not take that)."""
+        command = [ROSRV, *arguments, *(["--state", str(self.state)] if state else [])]
         done = subprocess.run(
             command, env=_environment(), capture_output=True, text=True, timeout=timeout, check=False
         )
@@ -114,7 +129,8 @@ class Appliance:
         certificate = None
         if url.startswith("https:"):
             # The kernel takes connections before the process is there: one answer says that it is.
-            served = ssl.get_server_certificate((Rest(url).url.hostname, Rest(url).url.port), timeout=LIMIT)
+            place = urllib.parse.urlsplit(url)
+            served = ssl.get_server_certificate((str(place.hostname), place.port or 443), timeout=LIMIT)
             certificate = self.state / "api" / "certificate.pem"
             assert certificate.read_text() == served
         return Rest(url, token or self.ready["token"], certificate)

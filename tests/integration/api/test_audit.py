@@ -1,0 +1,176 @@
+"""The audit log over REST: searched, followed live, verified, exported; what REST did is in it."""
+
+import json
+import xmlrpc.client
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.rest import Rest
+
+POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault = *\n"
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance that denies every publisher but that of /allowed; what it answered is in the log."""
+    config = tmp_path_factory.mktemp("config") / "appliance.yaml"
+    config.write_text("audit: {durability: strict}\napi: 127.0.0.1:0\napi_tls: off\n")
+    with Appliance(policy=POLICY, options=("--config", str(config))) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def rest(appliance: Appliance) -> Rest:
+    """REST as an admin."""
+    return appliance.rest()
+
+
+def publish(appliance: Appliance, topic: str) -> Any:
+    """Ask RVMaster to be a publisher."""
+    with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
+
+
+def test_a_denial_is_seen_live(appliance: Appliance, rest: Rest) -> None:
+    """A client that follows denials hears of one as it happens, with rule and reason; of nothing else."""
+    events = rest.events("/v1/audit/stream?decision=deny&category=publish")
+    next(events)
+    publish(appliance, "/allowed")
+    publish(appliance, "/cmd_vel")
+    event = next(events)
+    record = json.loads(event["data"])
+    assert (event["event"], event["id"]) == ("record", str(record["sequence"]))
+    assert (record["decision"], record["resource"], record["caller_id"]) == ("deny", "/cmd_vel", "/tester")
+    assert record["host"] == "127.0.0.1"
+
+
+def test_a_client_that_comes_back_misses_nothing(appliance: Appliance, rest: Rest) -> None:
+    """With Last-Event-ID (what a browser sends), or `after`, the stream goes on after that record."""
+    publish(appliance, "/first")
+    first = rest.get("/v1/audit?resource=/first&event=decision").json["records"][0]
+    publish(appliance, "/second")
+    for events in (
+        rest.events("/v1/audit/stream?category=publish", Last_Event_ID=str(first["sequence"])),
+        rest.events(f"/v1/audit/stream?category=publish&after={first['sequence']}"),
+    ):
+        next(events)
+        assert json.loads(next(events)["data"])["resource"] == "/second"
+
+
+def test_search_is_what_the_command_finds(appliance: Appliance, rest: Rest) -> None:
+    """The same filters give the same records, field by field."""
+    publish(appliance, "/sought")
+    found = rest.get("/v1/audit?resource=/sou*&decision=deny&since=1h").json["records"]
+    assert found == appliance.audit("--topic", "/sou*", "--deny", "--since", "1h")
+    assert found[0]["rule"] is None or found[0]["rule"]["section"] == "Publishers"
+    assert rest.get("/v1/audit?resource=/nothing").json == {"records": [], "cursor": None}
+
+
+def test_pages_join_without_gap_or_repetition(appliance: Appliance, rest: Rest) -> None:
+    """Following the cursor gives every record that matches once, in both orders."""
+    for number in range(7):
+        publish(appliance, f"/page/{number}")
+    for order in ("newest", "oldest"):
+        seen: list[str] = []
+        cursor = ""
+        while True:
+            page = rest.get(f"/v1/audit?resource=/page/*&event=decision&limit=3&order={order}{cursor}").json
+            assert len(page["records"]) <= 3
+            seen += [one["resource"] for one in page["records"]]
+            if page["cursor"] is None:
+                break
+            cursor = f"&cursor={page['cursor']}"
+        wanted = [f"/page/{number}" for number in range(7)]
+        assert seen == (wanted if order == "oldest" else wanted[::-1])
+
+
+def test_one_record_and_what_was_around_it(appliance: Appliance, rest: Rest) -> None:
+    """By id and by sequence it is the same; its neighbours are of the same host or caller."""
+    publish(appliance, "/middle")
+    record = rest.get("/v1/audit?resource=/middle&event=decision").json["records"][0]
+    shown = rest.get(f"/v1/audit/{record['id']}").json
+    assert shown["record"] == record
+    assert shown == rest.get(f"/v1/audit/{record['sequence']}").json | {"after": shown["after"]}
+    assert all(one["host"] == "127.0.0.1" for one in shown["before"] + shown["after"] if one["host"])
+    assert rest.get("/v1/audit/ffffffffffffffffffff").status == 404
+    assert rest.get("/v1/audit/99999999").status == 404
+
+
+def test_the_log_is_proven(rest: Rest) -> None:
+    """Verification says that the chain is whole, and how much a signature covers."""
+    verified = rest.get("/v1/audit/verify").json
+    assert verified["ok"] is True
+    assert verified["records"] > 0
+    assert verified["findings"] == []
+
+
+def test_export_is_ndjson_oldest_first(appliance: Appliance, rest: Rest) -> None:
+    """A record a line, in order, as `rosrv audit export` writes them."""
+    publish(appliance, "/exported")
+    answer = rest.get("/v1/audit/export?event=decision")
+    assert answer.headers["content-type"].startswith("application/x-ndjson")
+    lines = answer.body.decode("ascii").splitlines()
+    sequences = [json.loads(line)["sequence"] for line in lines]
+    assert sequences == sorted(sequences)
+    assert lines == appliance.rosrv("audit", "export", "--event", "decision").stdout.splitlines()
+
+
+def test_what_rest_did_is_in_the_log(rest: Rest) -> None:
+    """Each call has who, method, path and status; repeated reads are one record and a count."""
+    events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/graph")
+    next(events)
+    for _ in range(5):
+        rest.get("/v1/graph")
+    first, rest_of_them = (json.loads(next(events)["data"]) for _ in range(2))
+    assert first["detail"] | {"took_us": 0} == {
+        "count": 1, "method": "GET", "status": 200, "took_us": 0, "who": "first",
+    }  # fmt: skip
+    assert (first["host"], first["category"], first["decision"]) == ("127.0.0.1", "rest", "allow")
+    assert rest_of_them["detail"]["count"] == 4
+
+
+def test_who_was_refused_is_in_the_log(rest: Rest) -> None:
+    """A call without a good token is a denial, and names nobody."""
+    rest.with_token(None).get("/v1/graph?from=stranger")
+    events = rest.events("/v1/audit/stream?event=rest%20call&decision=deny&after=0")
+    next(events)
+    refused = json.loads(next(events)["data"])
+    assert (refused["decision"], refused["detail"]["status"], refused["detail"]["who"]) == ("deny", 401, None)
+    assert refused["severity"] == "warning"
+
+
+@pytest.mark.parametrize(
+    "query", ["since=yesterday", "limit=0", "limit=100000", "cursor=-1", "decision=maybe", "severity=loud",
+              "host=" + "*" * 9, "since=9999999999999999999999w"],
+)  # fmt: skip
+def test_a_filter_that_makes_no_sense_is_told(rest: Rest, query: str) -> None:
+    """A problem that names the parameter or says what can be given; the same for search, stream and export."""
+    for path in ("/v1/audit", "/v1/audit/export"):
+        if path.endswith("export") and query.startswith(("limit", "cursor")):
+            continue
+        answer = rest.get(f"{path}?{query}")
+        assert answer.status == 422, query
+        assert answer.json["detail"]
+
+
+def test_followers_are_bounded(rest: Rest) -> None:
+    """Beyond `api_limits.streams` a follower is told to come back; when one leaves there is room again."""
+    open_ones = [rest.events("/v1/audit/stream?event=nothing") for _ in range(16)]
+    for one in open_ones:
+        next(one)
+    refused = rest.get("/v1/audit/stream?event=nothing")
+    assert refused.status == 503
+    assert int(refused.headers["retry-after"]) > 0
+    for one in open_ones:
+        one.close()  # type: ignore[attr-defined]  # a generator
+    for _ in range(100):
+        try:
+            next(rest.events("/v1/audit/stream?event=nothing"))
+            break
+        except AssertionError:
+            rest.get("/healthz")  # the api notices that a client left when the kernel tells it
+    else:
+        raise AssertionError("no room again")

@@ -1,0 +1,231 @@
+"""Policies over REST: tried, refused, loaded, explained, taken back, kept over a restart."""
+
+import json
+import time
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.rest import Rest
+
+WITHOUT_PUBLISHERS = OPEN_POLICY.replace("[Publishers]\ndefault = *\n", "[Publishers]\n/allowed = *\n")
+TRANSPORT = ("--api", "127.0.0.1:0", "--api-tls", "off")
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance of its own for a test that changes its policy."""
+    with Appliance(options=TRANSPORT) as running:
+        yield running
+
+
+def register(uri: str, topic: str) -> Any:
+    """What RVMaster says to a publisher."""
+    with xmlrpc.client.ServerProxy(uri) as master:
+        return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
+
+
+def test_a_wrong_policy_is_refused_whole_with_every_place(appliance: Appliance) -> None:
+    """Each finding has line and column, the problem those of the first; nothing changes; the refusal is recorded."""
+    rest = appliance.rest()
+    answer = rest.post("/v1/policy", "[Nodes]\ndefault = *\nbogus\n[Publishrs]\n", match='"1"')
+    assert answer.status == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json
+    assert (problem["line"], problem["column"]) == (3, 1)
+    assert [(one["line"], one["severity"]) for one in problem["findings"]] == [(3, "error"), (4, "error")]
+    assert "did you mean Publishers?" in problem["findings"][1]["text"]
+    assert rest.get("/v1/policy").json["revision"] == 1
+    calls = appliance.audit("--event", "rest call", resource="/v1/policy")
+    refused = next(one for one in calls if one["detail"]["status"] == 422)
+    assert refused["detail"]["who"] == "first"
+    assert "policy:3:1" in refused["reason"]
+
+
+def test_a_right_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
+    """What it no longer allows is denied from the answer on; the revision has its author; a restart keeps it."""
+    rest = appliance.rest()
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 1
+    posted = rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "no publishers"}, match='"1"')
+    assert posted.status == 200
+    assert posted.json | {"changes": [], "warnings": []} == {
+        "loaded": True, "revision": 2, "replaced": 1, "revoked": 1, "confirm_by": None, "warnings": [], "changes": [],
+    }  # fmt: skip
+    assert posted.etag == '"2"'
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 0
+    loaded = appliance.audit("--event", "policy loaded")[0]
+    assert loaded["detail"]["who"] == "first"
+    status = appliance.status()["policy"]
+    assert (status["revision"], status["differs_from_file"], status["who"]) == (2, True, "first")
+    assert "loaded by first" in appliance.rosrv("status", check=False).stdout.replace("\n", " ")
+    appliance.stop()
+    appliance.start()
+    assert appliance.ready["revision"] == 2
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 0
+
+
+def test_a_dry_run_says_what_would_change_and_changes_nothing(appliance: Appliance) -> None:
+    """Registrations that would be taken back are listed with the new policy's reason; no If-Match is needed."""
+    rest = appliance.rest()
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 1
+    answer = rest.post("/v1/policy?dry_run=1", WITHOUT_PUBLISHERS)
+    assert answer.status == 200
+    report = answer.json
+    assert (report["loaded"], report["revision"], report["revoked"]) == (False, 1, None)
+    (change,) = report["changes"]
+    assert (change["resource"], change["now"], change["then"]) == ("/cmd_vel", "allow", "deny")
+    assert "/cmd_vel" in change["reason"]
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 1
+    assert rest.get("/v1/policy").json["revision"] == 1
+
+
+def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None:
+    """Every change needs If-Match (428) and is refused (412) when another revision is in force by now."""
+    rest = appliance.rest()
+    changes = [
+        ("/v1/policy", {"text": OPEN_POLICY}), ("/v1/policy/rollback", {}), ("/v1/policy/reload", None),
+        ("/v1/policy/confirm", None),
+    ]  # fmt: skip
+    assert rest.get("/v1/policy").etag == '"1"'
+    assert rest.post("/v1/policy", WITHOUT_PUBLISHERS, match='"1"').etag == '"2"'
+    for path, body in changes:
+        assert rest.post(path, body).status == 428, path
+        for stale in ('"1"', 'W/"2"', "2", '"x"'):
+            assert rest.post(path, body, match=stale).status == 412, (path, stale)
+    assert rest.get("/v1/policy").json["revision"] == 2
+    assert rest.post("/v1/policy/rollback", {}, match='"2"').status == 200
+
+
+def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
+    """A text that fails FILE.tests.yaml is refused with the place of the case, also as a dry run."""
+    cases = Path(f"{appliance.policy_file}.tests.yaml")
+    cases.write_text("cases:\n  - host: 10.0.0.9\n    node: /joy\n    allow: [publish /cmd_vel]\n")
+    rest = appliance.rest()
+    for path, match in (("/v1/policy?dry_run=1", None), ("/v1/policy", '"1"')):
+        answer = rest.post(path, WITHOUT_PUBLISHERS, match=match)
+        assert answer.status == 422
+        (finding,) = answer.json["findings"]
+        assert (finding["file"], finding["line"]) == (str(cases), 4)
+        assert "expected allow" in finding["text"]
+    assert rest.post("/v1/policy", OPEN_POLICY, match='"1"').status == 200
+
+
+def test_back_by_itself_unless_confirmed(appliance: Appliance) -> None:
+    """A change with confirm_within goes back when nobody confirms, and stays when somebody does."""
+    rest = appliance.rest()
+    events = rest.events("/v1/audit/stream?event=policy%20*")
+    next(events)
+    assert (
+        rest.post("/v1/policy?confirm_within=1", WITHOUT_PUBLISHERS, match='"1"').json["confirm_by"]
+        > time.time()
+    )
+    back = next(one for one in events if "rolled back" in one.get("data", ""))
+    assert json.loads(back["data"])["detail"]["who"] == "not confirmed in time"
+    assert register(appliance.master_uri, "/cmd_vel")[0] == 1
+    kept = rest.post("/v1/policy?confirm_within=3600", WITHOUT_PUBLISHERS, match='"3"')
+    assert rest.get("/v1/policy").json["confirm_by"] == kept.json["confirm_by"]
+    assert rest.post("/v1/policy/confirm", match='"4"').json == {"confirmed": True, "revision": 4}
+    assert rest.get("/v1/policy").json["confirm_by"] is None
+
+
+def test_revisions_are_kept_and_come_back(appliance: Appliance) -> None:
+    """All that were in force are listed with their author and text; a rollback makes a new one of an old text."""
+    rest = appliance.rest()
+    rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "trial"}, match='"1"')
+    assert rest.post("/v1/policy/rollback", {"revision": 1}, match='"2"').json["revision"] == 3
+    rows = rest.get("/v1/policy/revisions").json["revisions"]
+    assert [(one["revision"], one["who"], one["in_force"]) for one in rows] == [
+        (3, "first", True), (2, "first", False), (1, "disk", False),
+    ]  # fmt: skip
+    assert rows[1]["note"] == "trial"
+    assert rest.get("/v1/policy/revisions/2").json["text"] == WITHOUT_PUBLISHERS
+    assert rest.get("/v1/policy/revisions/77").status == 404
+    assert rest.post("/v1/policy/rollback", {"revision": 77}, match='"3"').status == 422
+
+
+def test_reload_takes_the_file(appliance: Appliance) -> None:
+    """What REST loaded is replaced by the file, which the answer says; the revision is the disk's again."""
+    rest = appliance.rest()
+    rest.post("/v1/policy", WITHOUT_PUBLISHERS, match='"1"')
+    answer = rest.post("/v1/policy/reload", match='"2"')
+    assert (answer.json["revision"], answer.json["replaced"]) == (3, 2)
+    assert rest.get("/v1/policy").json["differs_from_file"] is False
+    assert rest.get("/v1/policy").json["who"] == "disk"
+    assert appliance.audit("--event", "policy loaded")[0]["detail"]["who"] == "first"
+    appliance.policy_file.write_text("[Nodes]\nnonsense\n")
+    refused = rest.post("/v1/policy/reload", match='"3"')
+    assert refused.status == 422
+    assert f"{appliance.policy_file}:2:1" in refused.json["detail"]
+
+
+def test_why_is_what_rosrv_policy_explain_says(running: Appliance, rest: Rest) -> None:
+    """The explanation of REST has the same reason as the command's, for the policy in force and for a draft."""
+    running.policy_file.write_text(OPEN_POLICY)
+    question = "host=10.0.0.9&category=publish&resource=/cmd_vel&node=/joy"
+    answer = rest.get(f"/v1/policy/explain?{question}").json
+    assert answer["allowed"] is True
+    assert answer["rule"]["section"] == "Publishers"
+    assert answer["node"]["decision"] == "allow"
+    draft = {"host": "10.0.0.9", "category": "publish", "resource": "/cmd_vel", "node": "/joy"}
+    under = rest.post("/v1/policy/explain", draft | {"text": WITHOUT_PUBLISHERS}).json
+    assert under["allowed"] is False
+    told = running.rosrv(
+        "policy", "explain", str(running.policy_file), "--host", "10.0.0.9", "--node", "/joy", "--publish", "/cmd_vel",
+        "--json", state=False,
+    ).stdout  # fmt: skip
+    assert json.loads(told)["through"] == answer["through"]
+    for bad in (
+        "host=nobody&category=publish&resource=/a&node=/b",
+        "host=robot&category=publish&resource=/a",
+    ):
+        assert rest.get(f"/v1/policy/explain?{bad}").status == 422
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        (b"[Nodes]\n", "application/x-www-form-urlencoded", 415),
+        (b"[Nodes]\n", "", 415),
+        (b'{"text": \n oops}', "application/json", 422),
+        (b'{"txt": "[Nodes]"}', "application/json", 422),
+        (b"[" * 100_000, "application/json", 422),
+        (b"\xff\xfe", "text/plain", 422),
+        (b"", "text/plain", 422),
+    ],
+)
+def test_a_body_that_makes_no_sense_is_told(rest: Rest, body: bytes, kind: str, status: int) -> None:
+    """Another type, no JSON (with line and column), an unknown field, too deep, no text, nothing: an error in words."""
+    headers = {"If-Match": "*"} | ({"Content-Type": kind} if kind else {})
+    answer = rest.request("POST", "/v1/policy", body, headers)
+    assert answer.status == status
+    assert answer.json["detail"]
+    if b"oops" in body:
+        assert (answer.json["line"], answer.json["column"]) == (2, 2)
+
+
+def test_the_graph_shows_who_talks_to_whom(appliance: Appliance, tmp_path: Path) -> None:
+    """Two real nodes: both are there, the topic is mediated, the connection and the rate are seen."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    rest = appliance.rest()
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        ros.talker("rospy", "/chatter", name="talker")
+        listener = ros.listener("rospy", "/chatter", name="listener")
+        for count in range(15, 100, 15):  # some seconds of traffic, as much as it takes to be reported
+            listener.wait_for_count(count, event="received")
+            topic = next(one for one in rest.get("/v1/graph").json["topics"] if one["name"] == "/chatter")
+            if topic["publishers"][0]["messages_per_second"] > 1:
+                break
+    assert topic["type"] == "std_msgs/String"
+    assert topic["mediated"] is True
+    assert topic["subscribers"] == ["/listener"]
+    assert topic["connections"] == [{"from": "/talker", "to": "/listener", "host": "127.0.0.1"}]
+    assert 1 < topic["publishers"][0]["messages_per_second"] < 50
+    metrics = rest.get("/metrics").body.decode()
+    assert 'rosrv_relay_messages_total{resource="/chatter"}' in metrics
+    assert 'rosrv_decisions_total{category="publish",outcome="allow"}' in metrics
