@@ -327,6 +327,7 @@ class _Connection(asyncio.Protocol):
     def on_message_begin(self) -> None:
         self._url = b""
         self._received = 0
+        self._head_bytes = 0
         self._in_request = True
         self._head_done = False
         self._expects = False
@@ -335,8 +336,12 @@ class _Connection(asyncio.Protocol):
 
     def on_url(self, url: bytes) -> None:
         self._url += url
+        self._count_head(len(url))
 
     def on_header(self, name: bytes, value: bytes) -> None:
+        self._count_head(len(name) + len(value))
+        if self._closing:
+            return
         lowered = name.lower()
         if lowered == b"content-length" and value.isdigit() and int(value) > self._limits.body_bytes:
             self._reject(
@@ -345,6 +350,11 @@ class _Connection(asyncio.Protocol):
             )
         elif lowered == b"expect" and value.lower() == b"100-continue":
             self._expects = True
+
+    def _count_head(self, size: int) -> None:
+        self._head_bytes += size
+        if self._head_bytes > self._limits.head_bytes and not self._closing:
+            self._reject(b"431 Request Header Fields Too Large", "sent a request head beyond the limit")
 
     def on_headers_complete(self) -> None:
         self._head_done = True

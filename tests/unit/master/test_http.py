@@ -329,6 +329,8 @@ def test_a_defect_in_the_handler() -> None:
         (b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n", 400, "not HTTP"),
         (b"POST / HTTP/1.1\r\nX:" + b"a" * 70_000, 431, "head beyond the limit"),
         (b"POST /" + b"a" * 70_000, 431, "head beyond the limit"),
+        (b"POST /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n", 431, "head beyond the limit"),
+        (b"POST / HTTP/1.1\r\nX: " + b"a" * 70_000 + b"\r\n\r\n", 431, "head beyond the limit"),
         (b"POST / HTTP/1.1\r\n" + b"X: y\r\n" * 20_000, 431, "head beyond the limit"),
     ],
     ids=lambda value: repr(value[:40]) if isinstance(value, bytes) else None,
