@@ -1,0 +1,96 @@
+"""Tests of `appliance.api.access`."""
+
+import asyncio
+import time
+from typing import Any
+
+import pytest
+
+from appliance.api.access import Doorkeeper, Role
+from appliance.api.problems import ProblemError
+from appliance.channel.messages import TokenKept
+from appliance.store import tokens
+from appliance.store.tokens import TokenRow, make_token
+
+
+def kept(row: TokenRow) -> TokenKept:
+    """What control tells of a token."""
+    return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+
+
+def recognise(door: Doorkeeper, header: str | None, host: str = "10.0.0.1") -> Any:
+    """The bearer, or the status it is refused with."""
+    try:
+        return asyncio.run(door.recognise(header, host))
+    except ProblemError as problem:
+        return problem.status
+
+
+def test_a_token_is_its_holder() -> None:
+    """Name, role and end are those it was made with; the scheme's case does not matter."""
+    row, text = make_token("alice", "operator", now=time.time(), seconds=60)
+    door = Doorkeeper(10)
+    door.state([kept(row)])
+    for scheme in ("Bearer", "bearer"):
+        bearer = recognise(door, f"{scheme} {text}")
+        assert (bearer.name, bearer.role, bearer.expires) == ("alice", Role.OPERATOR, row.expires)
+    assert door.still_good(bearer)
+    door.state([])
+    assert not door.still_good(bearer)
+    assert recognise(door, f"Bearer {text}") == 401
+
+
+def test_an_expired_token_is_nobody() -> None:
+    """From its end on it is refused, also when it was recognised before."""
+    row, text = make_token("a", "viewer", now=time.time() - 100, seconds=50)
+    door = Doorkeeper(10)
+    door.state([kept(row)])
+    assert recognise(door, f"Bearer {text}") == 401
+
+
+def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second request by the same token is recognised without scrypt."""
+    row, text = make_token("a", "viewer", now=time.time(), seconds=60)
+    checks: list[str] = []
+
+    def counted(secret: str, salt: bytes) -> bytes:
+        checks.append(secret)
+        return real(secret, salt)
+
+    real = tokens.hash_secret
+    monkeypatch.setattr(tokens, "hash_secret", counted)
+    door = Doorkeeper(10)
+    door.state([kept(row)])
+    for _ in range(3):
+        assert recognise(door, f"Bearer {text}").name == "a"
+    assert len(checks) == 1
+
+
+def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After so many wrong secrets of a host nothing is computed for it any more; another host is not concerned."""
+    row, text = make_token("a", "viewer", now=time.time(), seconds=60)
+    checks: list[str] = []
+
+    def counted(secret: str, salt: bytes) -> bytes:
+        checks.append(secret)
+        return b"never"
+
+    monkeypatch.setattr(tokens, "hash_secret", counted)
+    door = Doorkeeper(5)
+    door.state([kept(row)])
+    wrong = f"Bearer rosrv_{row.id}_" + "A" * 43
+    assert [recognise(door, wrong) for _ in range(8)] == [401] * 5 + [429] * 3
+    assert len(checks) == 5
+    assert recognise(door, wrong, "10.0.0.2") == 401
+    monkeypatch.undo()
+    assert recognise(door, f"Bearer {text}", "10.0.0.3").name == "a"
+
+
+def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
+    """A host that tries tokens at random is slowed down; a good token from the same address still opens."""
+    row, text = make_token("a", "viewer", now=time.time(), seconds=60)
+    door = Doorkeeper(5)
+    door.state([kept(row)])
+    statuses = [recognise(door, f"Bearer nonsense{number}") for number in range(8)]
+    assert statuses == [401] * 5 + [429] * 3
+    assert recognise(door, f"Bearer {text}").name == "a"

@@ -1,0 +1,80 @@
+"""Tests of `appliance.api.certificate`."""
+
+import datetime
+import socket
+import ssl
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+
+from appliance.api.certificate import CERTIFICATE, KEY, tls_context
+
+NOW = datetime.datetime.now(datetime.UTC)
+
+
+def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | None:
+    """The TLS version a client agrees on that trusts only this certificate; the reason when it does not."""
+    here, there = socket.socketpair()
+
+    def serve() -> None:
+        try:
+            with context.wrap_socket(there, server_side=True) as sock:
+                sock.recv(1)
+        except OSError:
+            there.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        client = ssl.create_default_context(cafile=certificate)
+        with client.wrap_socket(here, server_hostname=name) as sock:
+            return sock.version()
+    except ssl.SSLCertVerificationError as error:
+        return error.verify_message
+    finally:
+        here.close()
+        thread.join(10)
+
+
+@pytest.mark.parametrize("name", ["10.1.2.3", "127.0.0.1", "::1", "localhost", "robot.example"])
+def test_it_is_trusted_for_the_names_it_was_made_for(tmp_path: Path, name: str) -> None:
+    """A client that has the certificate connects by each of its names, with TLS 1.2 or newer."""
+    context = tls_context(tmp_path, ["10.1.2.3", "robot.example"], NOW)
+    assert shake_hands(context, tmp_path / CERTIFICATE, name) in ("TLSv1.2", "TLSv1.3")
+
+
+def test_it_is_not_for_other_names(tmp_path: Path) -> None:
+    """For an address it was not made for the client refuses."""
+    said = shake_hands(tls_context(tmp_path, [], NOW), tmp_path / CERTIFICATE, "10.9.9.9")
+    assert said is not None
+    assert "mismatch" in said
+
+
+def test_it_is_kept_and_its_key_is_its_owners(tmp_path: Path) -> None:
+    """The next start uses the same; nobody else may read the key."""
+    tls_context(tmp_path, ["10.1.2.3"], NOW)
+    first = (tmp_path / CERTIFICATE).read_bytes()
+    tls_context(tmp_path, ["10.1.2.3"], NOW + datetime.timedelta(days=100))
+    assert (tmp_path / CERTIFICATE).read_bytes() == first
+    assert stat.S_IMODE((tmp_path / KEY).stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize(("names", "days"), [(["10.1.2.4"], 0), (["10.1.2.3"], 800)])
+def test_a_new_one_is_made_for_a_new_name_or_before_it_ends(
+    tmp_path: Path, names: list[str], days: int
+) -> None:
+    """An address that is not in it, or an end that is near, gives a new one."""
+    tls_context(tmp_path, ["10.1.2.3"], NOW)
+    first = (tmp_path / CERTIFICATE).read_bytes()
+    tls_context(tmp_path, names, NOW + datetime.timedelta(days=days))
+    assert (tmp_path / CERTIFICATE).read_bytes() != first
+
+
+def test_what_cannot_be_used_is_an_error(tmp_path: Path) -> None:
+    """A damaged certificate is not silently replaced: somebody may have pinned it."""
+    tls_context(tmp_path, [], NOW)
+    (tmp_path / CERTIFICATE).write_text("-----BEGIN CERTIFICATE-----\nnonsense\n-----END CERTIFICATE-----\n")
+    with pytest.raises(ValueError, match=r".+"):
+        tls_context(tmp_path, [], NOW)

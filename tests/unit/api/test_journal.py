@@ -1,0 +1,67 @@
+"""Tests of `appliance.api.journal`."""
+
+from typing import Any
+
+from appliance.api.journal import Journal
+from appliance.channel.messages import RestCalled
+
+
+def answered(journal: Journal, **changes: Any) -> None:
+    """One answer."""
+    fields = {
+        "host": "h",
+        "who": "w",
+        "method": "GET",
+        "path": "/p",
+        "status": 200,
+        "reason": "",
+        "duration_us": 7,
+    }
+    journal.answered(**fields | changes)
+
+
+def test_equal_reads_are_told_once_and_counted() -> None:
+    """The first at once, the others as a number; after a flush it begins again."""
+    told: list[RestCalled] = []
+    journal = Journal(told.append)
+    for _ in range(4):
+        answered(journal)
+    answered(journal, path="/q")
+    assert [(one.path, one.count, one.duration_us) for one in told] == [("/p", 1, 7), ("/q", 1, 7)]
+    journal.flush()
+    assert [(one.path, one.count) for one in told[2:]] == [("/p", 3)]
+    answered(journal)
+    assert told[-1].count == 1
+
+
+def test_changes_are_never_folded() -> None:
+    """What a recognised token changes is told each time; what strangers try to change is folded."""
+    told: list[RestCalled] = []
+    journal = Journal(told.append)
+    for _ in range(3):
+        answered(journal, method="POST")
+    assert len(told) == 3
+    for _ in range(3):
+        answered(journal, method="POST", who="", status=401)
+    assert len(told) == 4
+
+
+def test_a_flood_of_kinds_is_bounded() -> None:
+    """Beyond so many kinds in one time the rest is counted by status, and nothing is lost from the sum."""
+    told: list[RestCalled] = []
+    journal = Journal(told.append, kinds=10)
+    for number in range(1000):
+        answered(journal, who="", path=f"/{number}", status=401)
+    assert len(told) == 10
+    journal.flush()
+    assert sum(one.count for one in told) == 1000
+    assert len(told) == 11
+
+
+def test_strange_methods_are_one_number() -> None:
+    """The metric's labels stay few whatever method a stranger makes up."""
+    journal = Journal(lambda call: None)
+    for number in range(50):
+        answered(journal, method=f"M{number}", status=405)
+    answered(journal)
+    assert journal.calls == {("other", "405"): 50, ("GET", "200"): 1}

@@ -1,0 +1,69 @@
+"""Tests of `appliance.metrics` and `appliance.api.metrics`."""
+
+from pathlib import Path
+from typing import Any
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from appliance.api.metrics import rendered
+from appliance.metrics import BOUNDS, METRICS, Meter, markdown
+
+PAGE = Path(__file__).parents[3] / "docs" / "metrics.md"
+
+
+def body() -> dict[str, Any]:
+    """Control's answer, small."""
+    meter = Meter()
+    meter.decided("publish", "deny", 0.0003)
+    meter.decided("publish", "deny", 99.0)
+    meter.called("getPid", 0.002)
+    return {
+        **meter.values(),
+        "status": {
+            "version": "1", "since": 5.0, "relay": "connected", "rosmaster": "reachable",
+            "policy": {"revision": 3, "differs_from_file": True},
+            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None},
+            "processes": [{"role": "control", "pid": 1, "restarts": 4}],
+        },
+        "queued_deliveries": 6,
+        "nodes": {"live": 2, "lost": 1},
+        "registrations": {"publication": 3},
+        "relayed": {"/a\"\\\n": [1, 2, 3]},
+        "connections": {"topic": 7},
+        "rest": [(("GET", "200"), 8)],
+    }  # fmt: skip
+
+
+def test_every_metric_is_given_as_it_is_listed() -> None:
+    """Names, kinds, labels and helps are those of the list, and a Prometheus parser reads all of it."""
+    families = {one.name: one for one in text_string_to_metric_families(rendered(body()).decode())}
+    for metric in METRICS:
+        family = families[metric.name.removesuffix("_total")]
+        assert family.type == metric.kind
+        assert family.documentation == metric.help
+        for sample in family.samples:
+            assert set(sample.labels) - {"le"} == set(metric.labels), sample
+
+
+def test_values_are_what_was_counted() -> None:
+    """Counters, gauges, histogram buckets (cumulative); a topic's name is escaped and comes back whole."""
+    samples = {
+        (one.name, tuple(sorted(one.labels.items()))): one.value
+        for family in text_string_to_metric_families(rendered(body()).decode())
+        for one in family.samples
+    }
+    assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
+    assert samples["rosrv_decision_seconds_count", ()] == 2
+    assert samples["rosrv_decision_seconds_bucket", (("le", "0.00025"),)] == 0
+    assert samples["rosrv_decision_seconds_bucket", (("le", "0.0005"),)] == 1
+    assert samples["rosrv_decision_seconds_bucket", (("le", str(BOUNDS[-1])),)] == 1
+    assert samples["rosrv_decision_seconds_bucket", (("le", "+Inf"),)] == 2
+    assert samples["rosrv_relay_bytes_total", (("resource", '/a"\\\n'),)] == 2
+    assert samples["rosrv_audit_failed", ()] == 0
+    assert samples["rosrv_process_resident_bytes", (("role", "control"),)] > 0
+
+
+def test_the_page_is_what_the_code_says() -> None:
+    """docs/metrics.md lists what is measured (python -m appliance.metrics)."""
+    generated = PAGE.read_text().split("<!-- generated: python -m appliance.metrics -->\n")[1]
+    assert generated.startswith(markdown())

@@ -1,0 +1,50 @@
+"""Tests of `appliance.store.tokens`."""
+
+import pytest
+
+from appliance.store.tokens import BadTokenNameError, is_secret, make_token, parse_token
+
+
+def test_a_token_proves_itself_and_nothing_else_does() -> None:
+    """Its secret matches what is kept; another token's, a changed one's and the kept hash do not."""
+    row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
+    parsed = parse_token(text)
+    assert parsed is not None
+    assert parsed[0] == row.id
+    assert is_secret(parsed[1], row.salt, row.hash)
+    other = parse_token(make_token("bob", "viewer", now=1000.0, seconds=60)[1])
+    assert other is not None
+    assert not is_secret(other[1], row.salt, row.hash)
+    assert not is_secret(parsed[1][:-1] + ("A" if parsed[1][-1] != "A" else "B"), row.salt, row.hash)
+    assert not is_secret(row.hash.hex()[:43], row.salt, row.hash)
+
+
+def test_what_is_kept_does_not_have_the_secret() -> None:
+    """The row has only a hash, salted: the same name twice gives another."""
+    row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
+    assert text.rpartition("_")[2] not in repr(row)
+    again, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
+    assert (row.salt, row.hash, row.id) != (again.salt, again.hash, again.id)
+
+
+def test_it_ends_in_time() -> None:
+    """Usable until its end or until it is revoked."""
+    row, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
+    assert row.usable(1059.9)
+    assert not row.usable(1060.0)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "rosrv_", "rosrv_0123456789ab_", "rosrv_0123456789AB_" + "a" * 43, "rosrv_0123456789ab_" + "a" * 44,
+             "rosrv_0123456789ab_" + "a" * 42 + "é", " rosrv_0123456789ab_" + "a" * 43],
+)  # fmt: skip
+def test_what_is_no_token_is_none(text: str) -> None:
+    """Only the exact form is parsed."""
+    assert parse_token(text) is None
+
+
+@pytest.mark.parametrize("name", ["", "disk", "operator", "a b", "-a", "a" * 64, "a\n", "é", "../x"])
+def test_names_that_would_confuse_are_refused(name: str) -> None:
+    """A name is short, plain, and none of those that stand for something else in a record."""
+    with pytest.raises(BadTokenNameError, match="is no name for a token"):
+        make_token(name, "viewer", now=0.0, seconds=1)
