@@ -6,7 +6,9 @@ the rule that decided is read from the audit log. The exit status says whether t
 operator wanted and nothing else: scripts can rely on it.
 """
 
+import shutil
 import signal
+import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +18,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from appliance.cli.landshark import (
-    APPLIANCE,
     ATTACKER,
     MASTER_URI,
     NODE_PYTHON,
@@ -59,7 +59,7 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class Result:
-    """One line of the table at the end."""
+    """One thing that should happen, or should not, and what became of it."""
 
     what: str
     good: bool
@@ -77,6 +77,7 @@ class Show:
 
     def run(self) -> bool:
         """All acts; whether everything was as it should be."""
+        self.introduce()
         self.open()
         operator = self.mission()
         self.explain_grants()
@@ -92,13 +93,21 @@ class Show:
         self.summary()
         return all(result.good for result in self.results)
 
+    def introduce(self) -> None:
+        """What is about to be seen, for who has never heard of it."""
+        self.console.print(
+            "ROS 1 trusts everyone who reaches its master. Here a robot stands behind the appliance, which decides\n"
+            "every call by a policy. Four hosts are made on this machine, as network namespaces: the appliance, the\n"
+            "robot, its operator, and an attacker. What each tries, what becomes of it, and the rule that decided:",
+            highlight=False,
+            soft_wrap=True,
+        )
+
     def open(self) -> None:
         """The appliance, then the robot."""
         self.headline("The appliance takes the place of the ROS Master")
         ready = self.stage.start_appliance()
         self.say(f"nodes may connect: ROS_MASTER_URI={ready['master']}  (the real one is hidden)")
-        if ready.get("api"):
-            self.say(f"console and REST:  {ready['api']}")
         self.say(f"policy:            {self.stage.policy}")
         self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
         self.robot = self.stage.start_robot()
@@ -162,11 +171,13 @@ class Show:
         found = self.stage.audit("--deny", "--host", ATTACKER, "--limit", "1000")  # newest first
         denials = [one for one in found if one["event"] != "denials folded"]
         before, self.last_sequence = self.last_sequence, max((one["sequence"] for one in denials), default=-1)
-        for one in denials:
-            new = one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried
-            if new or (one.get("reason") and one["reason"] in attack.answer):
-                return one
-        return None
+        matching = [
+            one
+            for one in denials
+            if (one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried)
+            or (one.get("reason") and one["reason"] in attack.answer)
+        ]
+        return next((one for one in matching if one.get("rule")), matching[0] if matching else None)
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
         """The robot is as it was: every node lives, it still drives, and nobody else fired."""
@@ -185,15 +196,14 @@ class Show:
         self.results += results
 
     def summary(self) -> None:
-        """The table at the end."""
-        table = Table(box=None, pad_edge=False)
-        for column in ("", "what", "how"):
-            table.add_column(column, overflow="fold")
-        for result in self.results:
-            mark = "[green]ok[/]" if result.good else "[red]NOT OK[/]"
-            table.add_row(mark, escape(result.what), escape(result.remark))
-        self.console.print()
-        self.console.print(table)
+        """How much of it was as it should be, and what was not."""
+        bad = [result for result in self.results if not result.good]
+        self.headline(
+            f"{len(self.results) - len(bad)} of {len(self.results)} as it should be"
+            + ("" if bad else ": the robot obeyed its operator, and nobody else")
+        )
+        for result in bad:
+            self.console.print(f"  [bold red]NOT OK[/] {escape(result.what)}: {escape(result.remark)}")
 
     def headline(self, text: str) -> None:
         """Begin an act."""
@@ -249,11 +259,22 @@ def demo(
             lab = stack.enter_context(Lab("rosrv-demo"))
             stage = stack.enter_context(Stage(lab, EXAMPLES))
             good = Show(stage, console).run()
-            if hold:
+            command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
+            if not hold:
                 console.print(
-                    f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} at {APPLIANCE}."
+                    f"  {command} demo --hold    keeps it running, to look around in", soft_wrap=True
                 )
-                console.print(f"Look at it:  rosrv status --state {stage.state}", soft_wrap=True)
+                console.print("  docs/operating.md    how to put the appliance next to a robot of yours")
+            else:
+                console.print(
+                    f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} on these hosts.\n"
+                    f"Look at it:       {command} status --state {stage.state}\n"
+                    f"                  {command} audit tail --deny --state {stage.state}\n"
+                    f"Be the attacker:  ip netns exec {stage.attacker_host.namespace.name} "
+                    f"env ROS_MASTER_URI={MASTER_URI} ROS_IP={ATTACKER} rostopic list",
+                    soft_wrap=True,
+                    highlight=False,
+                )
                 signal.pause()
     except KeyboardInterrupt:
         errors.print("\nEnded; everything is cleared away.")
