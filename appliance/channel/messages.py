@@ -245,13 +245,15 @@ class StateEnded(Message):
 class NodePlaced(Message):
     """An incarnation and the listening socket that stands for its TCPROS port.
 
-    `host` is the address the node is called at, `name` the node's name (its `callerid`).
+    `host` is the address the node is called at, `name` the node's name (its `callerid`). `monitors`: it is the
+    appliance's own publisher; what goes out of its port is what monitors publish.
     """
 
     descriptors: ClassVar[int] = 1
     key: str
     name: str
     host: str
+    monitors: bool = False
 
 
 class NodeWithdrawn(Message):
@@ -403,6 +405,107 @@ class TrafficReported(Message):
     rows: list[TopicTraffic]
 
 
+class SpecificationsStated(Message):
+    """Control states the specifications in force: before anything is placed, and at every change.
+
+    `files` are pairs of name and text, in order; `definitions` are `.msg` and `.srv` files by name, besides ROS's own.
+    `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
+    takes the place of one that died, so monitors with the modifier `hold` block their topics.
+    """
+
+    revision: int
+    files: list[tuple[str, str]]
+    definitions: dict[str, str]
+    enabled: dict[str, bool]
+    restarted: bool
+    on_fault: Literal["drop", "pass"] = "drop"
+
+
+class MonitorSwitched(Message):
+    """From now on the events of this monitor happen, or do not."""
+
+    name: str
+    enabled: bool
+
+
+class MonitorResumed(Message):
+    """A monitor that holds its topics lets them go on."""
+
+    name: str
+
+
+class SpecificationsTaken(Message):
+    """The relay has these specifications in force. `began` are the monitors that started in their initial state."""
+
+    revision: int
+    began: list[str]
+    held: list[str]
+
+
+class SpecificationsRefused(Message):
+    """The relay could not take them: what it had stays in force; without any, everything is blocked."""
+
+    revision: int
+    findings: list[str]
+
+
+class PublicationRefused(Message):
+    """A publisher (or service) is not carried: its definition is another than the specifications'."""
+
+    key: str
+    resource: str
+    reason: str
+
+
+class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
+    """Something a monitor did: the first of its kind and second in full, the others as a count.
+
+    `kind` is verdict, drop, change, fault, log or publish; `time` is nanoseconds since the epoch; `before` and
+    `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
+    else how many more there were.
+    """
+
+    kind: str
+    monitor: str
+    key: str
+    resource: str
+    time: int
+    text: str
+    detail: dict[str, Any]
+    before: bytes = b""
+    after: bytes = b""
+    size: int = 0
+    count: int = 0
+
+
+class MonitorsReported(Message):
+    """What monitors did; batches, a few a second at most. `lost` could not be kept while there was no control."""
+
+    events: list[MonitorEvent]
+    lost: int = 0
+
+
+class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
+    """The state and counters of one running monitor; counters since it was loaded or the relay started."""
+
+    name: str
+    file: str
+    enabled: bool
+    held: bool
+    failing: bool
+    events: int
+    verdicts: int
+    drops: int
+    changes: int
+    faults: int
+
+
+class MonitorsCounted(Message):
+    """All monitors; once a second at most, when something has changed."""
+
+    rows: list[MonitorRow]
+
+
 # --- link: control <-> api --------------------------------------------------------------------------------
 # The api asks on behalf of a token; what it may ask is the union `RestRequest`, which has no way to make a token.
 
@@ -455,10 +558,92 @@ class RestCalled(Message):
     count: int = 1
 
 
+# --- tunnels: control -> supervisor over the lifeline, control <-> the process that runs charon ------------
+
+Esp = Literal["kernel", "user space"]
+
+
+class TunnelsWanted(Message):
+    """Control asks the supervisor for tunnels: addresses of `pool` are accepted through IPsec only from now on,
+    the appliance has `address` (in `pool`), and the process that runs charon is there.
+    """
+
+    pool: str
+    address: str
+
+
+class TunnelsEnclosed(Message):
+    """Answer to `TunnelsWanted`: the firewall is in force and where ESP runs; else `reason` says why not."""
+
+    esp: Esp | None
+    reason: str = ""
+
+
+class CertificateNeeded(Message):
+    """charon's process asks for a certificate for the appliance's own key, by a signing request (PEM)."""
+
+    request: bytes
+
+
+class TunnelHost(msgspec.Struct, frozen=True):
+    """A host that may come: its name, the virtual address kept for it, the serial of its certificate."""
+
+    name: str
+    address: str
+    serial: str
+
+
+class TunnelsStated(Message):
+    """All that charon is to have: certificates and the list of revoked ones in PEM, the hosts that may come."""
+
+    esp: Esp
+    address: str
+    authority: bytes
+    certificate: bytes
+    revocations: bytes
+    hosts: list[TunnelHost]
+
+
+class TunnelChanged(Message):
+    """The tunnel of a host came up from, or went down to, this real address."""
+
+    name: str
+    up: bool
+    remote: str
+
+
+class TunnelRefused(Message):
+    """Somebody at this real address asked for a tunnel and was refused."""
+
+    remote: str
+    reason: str
+
+
+class TunnelSeen(msgspec.Struct, frozen=True):
+    """A tunnel that stands, for so many seconds; bytes as the appliance counts them."""
+
+    name: str
+    remote: str
+    seconds: int
+    bytes_in: int
+    bytes_out: int
+
+
+class TunnelsReported(Message):
+    """All tunnels that stand now; charon has taken what was stated last."""
+
+    rows: list[TunnelSeen]
+
+
+TunnelLink = (
+    CertificateNeeded | TunnelsStated | TunnelChanged | TunnelRefused | TunnelsReported
+)  # fmt: skip
+
 Lifeline = (
     Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | PolicyReloadRequested
     | RouteWanted
+    | TunnelsWanted | TunnelsEnclosed
     | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip
 

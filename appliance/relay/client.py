@@ -12,11 +12,12 @@ connection, as it would without the appliance.
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.channel.messages import TopicTraffic
+from appliance.channel.messages import PublicationRefused, TopicTraffic
 from appliance.relay.context import RelayContext
 from appliance.relay.exchange import ServiceExchange
 from appliance.relay.grants import Service
 from appliance.relay.loop import Timer
+from appliance.relay.middle import Judged
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.ros.errors import PeerError
 from appliance.ros.tcpros import HeaderParser, encode_header
@@ -88,12 +89,14 @@ class ServiceClient:
         self._timer: Timer | None = None
         self._parser = HeaderParser(context.limits.header_bytes)
         self._greeted = False
+        self._header: dict[str, str] = {}
         self._exchange = ServiceExchange(
             context.limits.message_bytes,
             persistent=fields.get("persistent", "") in _TRUE,
             to_service=self._to_service,
             to_client=self._to_client,
             count=traffic.count,
+            judge=self._judge,
         )
         self._client = Stream(
             context.loop, sock, self._client_received, self._client_broken, drained=self._advance
@@ -119,6 +122,13 @@ class ServiceClient:
         self._timer = self._context.loop.after(
             seconds, lambda: self._turn_away(f"the service at {where} does not answer within {seconds:g} s")
         )
+
+    def judge_again(self) -> None:
+        """Other specifications are in force: a service that does not fit them is carried no longer."""
+        if self._greeted:
+            objection = self._context.middle.service_objection(self.service.service, self._header)
+            if objection:
+                self._close(objection)
 
     def cut(self, reason: str) -> None:
         """Close both connections: what they stand on is gone."""
@@ -146,7 +156,13 @@ class ServiceClient:
         if "error" in header:
             self._turn_away(header["error"])
             return
+        objection = self._context.middle.service_objection(self.service.service, header)
+        if objection:
+            self._context.reporter.send(PublicationRefused(self.service.key, self.service.service, objection))
+            self._turn_away(objection)
+            return
         self._greeted = True
+        self._header = header
         if self._timer is not None:
             self._timer.cancel()
         self._number = self._context.reporter.opened(
@@ -155,6 +171,15 @@ class ServiceClient:
         self._traffic.connected(1)
         self._to_client(encode_header(header))
         self._guard(self._exchange.from_service, self._parser.rest)
+
+    def _judge(self, part: str, body: bytes) -> Judged:
+        """What the monitors make of a request or a reply. They may be others than when the client came."""
+        middle, service = self._context.middle, self.service
+        return (
+            middle.request(service.key, service.service, body)
+            if part == "request"
+            else middle.response(service.key, service.service, body)
+        )
 
     def _client_received(self, data: bytes) -> None:
         if not data:
@@ -175,10 +200,12 @@ class ServiceClient:
         """Go on as far as the client has taken what was written to it."""
         if not self._live or not self._greeted:
             return
-        if not self._client.backlog:
+        while self._live and not self._client.backlog:
             if self._exchange.done or self._server is None:
                 self._close("")
                 return
+            if not self._exchange.ready:
+                break
             self._exchange.advance()
         if self._live:
             self._client.read(self._exchange.may_read and not self._client.backlog)

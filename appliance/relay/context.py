@@ -5,15 +5,17 @@ from dataclasses import dataclass
 from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.middle import Middle
 from appliance.relay.report import Reporter
 
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """Loop, bounds, the voice to control, the memory in use, and the area small frames are received into."""
+    """Loop, bounds, the voice to control, the memory in use, the area small frames are received into, monitors."""
 
     loop: Loop
     limits: Limits
     reporter: Reporter
     budget: MemoryBudget
     scratch: memoryview
+    middle: Middle

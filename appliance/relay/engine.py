@@ -16,11 +16,14 @@ from appliance.channel.messages import (
     ClientRevoked,
     GrantRevoked,
     Message,
+    MonitorResumed,
+    MonitorSwitched,
     NodePlaced,
     NodeWithdrawn,
     PublicationPlaced,
     PublicationWithdrawn,
     ServiceWithdrawn,
+    SpecificationsStated,
     StateBegan,
     StateEnded,
     TopicTraffic,
@@ -35,6 +38,8 @@ from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
 from appliance.relay.links import Link
 from appliance.relay.loop import Loop
+from appliance.relay.middle import Middle
+from appliance.relay.own import OwnPublisher
 from appliance.relay.ports import Ports
 from appliance.relay.report import Reporter
 from appliance.relay.sockets import tune
@@ -42,6 +47,7 @@ from appliance.relay.subscriber import Subscriber
 from appliance.relay.topic import RelayedTopic
 from appliance.relay.upstream import Publisher
 from appliance.relay.visitor import Farewell, Visitor
+from appliance.rosmop.runtime.context import Published
 
 
 class Engine:
@@ -52,10 +58,16 @@ class Engine:
         self._limits = limits
         self._reporter = Reporter(limits)
         scratch = memoryview(bytearray(SCRATCH))
-        self._context = RelayContext(loop, limits, self._reporter, MemoryBudget(limits.memory_bytes), scratch)
+        self._middle = Middle(loop, self._reporter)
+        self._middle.publish = self._publish
+        self._middle.changed = self._monitors_changed
+        self._context = RelayContext(
+            loop, limits, self._reporter, MemoryBudget(limits.memory_bytes), scratch, self._middle
+        )
         self._table = StatedTable()
         self._ports = Ports(loop, limits, self._arrived, self._turned_away)
-        self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher]] = {}
+        self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
+        self._own: dict[str, OwnPublisher] = {}
         self._clients: set[ServiceClient] = set()
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self._visitors: set[Visitor] = set()
@@ -82,12 +94,19 @@ class Engine:
             self._upstream_found(message)
         elif isinstance(message, UpstreamRefused):
             self._upstream_refused(message)
+        elif isinstance(message, SpecificationsStated):
+            self._middle.state(message)
+        elif isinstance(message, MonitorSwitched):
+            self._middle.switch(message.name, message.enabled)
+        elif isinstance(message, MonitorResumed):
+            self._middle.resume(message.name)
         else:
             self._table.withdraw(message)
             self._withdrawn(message)
 
     def close(self) -> None:
         """Cut everything."""
+        self._middle.close()
         self._ports.close_all()
         for topic, publisher in self._topics.values():
             topic.cut_all("the relay ends")
@@ -116,6 +135,7 @@ class Engine:
         self._reporter.repeat_connections()
         for _topic, publisher in self._topics.values():
             publisher.ask_again()
+        self._middle.observations.repeat()
 
     def _withdrawn(self, message: Message) -> None:
         if isinstance(message, NodeWithdrawn):
@@ -163,14 +183,44 @@ class Engine:
             clock=self._loop.clock,
             budget=self._context.budget,
         )
-        publisher = Publisher(self._context, relayed)
-        relayed.upstream = publisher
+        publisher: Publisher | OwnPublisher
+        if node is not None and node.monitors:
+            publisher = self._own[topic] = OwnPublisher(relayed, lambda: self._middle.header_of(topic))
+            relayed.upstream = publisher
+        else:
+            publisher = Publisher(
+                self._context, relayed, lambda header: self._middle.objection(topic, header)
+            )
+            relayed.upstream = publisher
+            self._let_monitor(relayed)
         self._topics[key, topic] = (relayed, publisher)
+
+    def _let_monitor(self, relayed: RelayedTopic) -> None:
+        """Messages of a topic go through the monitors if one stands there, and past them otherwise."""
+        middle, key, topic = self._middle, relayed.key, relayed.topic
+        through = (lambda batch: middle.through(key, topic, batch)) if middle.stands(topic) else None
+        relayed.monitor(through, wanted=middle.wants(topic))
+
+    def _monitors_changed(self) -> None:
+        for relayed, publisher in list(self._topics.values()):
+            publisher.judge_again()
+            if isinstance(publisher, Publisher):
+                self._let_monitor(relayed)
+        for client in list(self._clients):
+            client.judge_again()
+
+    def _publish(self, published: Published) -> None:
+        """Between two messages, or in the middle of a batch of another topic: never of this one."""
+        publisher = self._own.get(published.topic)
+        if publisher is not None:
+            publisher.publish(published.data)
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
         if (key, topic) not in self._topics:
             return
         relayed, publisher = self._topics.pop((key, topic))
+        if self._own.get(topic) is publisher:
+            del self._own[topic]
         relayed.cut_all(reason)
         publisher.close()
         row = relayed.traffic()
@@ -316,5 +366,6 @@ class Engine:
             row for (key, name), one in self._services.items() if (row := one.row(key, name)) is not None
         ]
         rows, self._last_rows = self._last_rows + rows, []
+        self._middle.tick()
         self._reporter.tick(rows)
         self._loop.after(self._limits.report_every, self._tick)

@@ -14,6 +14,7 @@ Invariants:
 from collections import deque
 from collections.abc import Callable
 
+from appliance.relay.middle import Judged
 from appliance.ros.errors import ProtocolError
 from appliance.ros.tcpros import (
     FrameParser,
@@ -24,12 +25,14 @@ from appliance.ros.tcpros import (
     encode_service_reply,
 )
 
+_REPLY_HEAD = 5  # bytes before the body of a reply
+
 
 class ServiceExchange:
     """Requests one way, replies the other: `to_service(data)` and `to_client(data)` write.
 
     `count(size)` is called for each request and reply; `held` is the bytes of what is not whole or has to
-    wait.
+    wait. `judge(part, body)` is where monitors stand: it says what becomes of a `request` or `response`.
     """
 
     def __init__(
@@ -40,11 +43,13 @@ class ServiceExchange:
         to_service: Callable[[bytes], None],
         to_client: Callable[[bytes], None],
         count: Callable[[int], None],
+        judge: Callable[[str, bytes], Judged] | None = None,
     ) -> None:
         self._persistent = persistent
         self._to_service = to_service
         self._to_client = to_client
         self._count = count
+        self._judge = judge
         self._requests = FrameParser(limit)
         self._replies = ServiceReplyParser(limit)
         self._waiting: deque[bytes] = deque()
@@ -56,6 +61,11 @@ class ServiceExchange:
     def may_read(self) -> bool:
         """Whether the client may be read: no request is at the service or waits for it."""
         return not self._busy and not self._waiting and not self.done
+
+    @property
+    def ready(self) -> bool:
+        """Whether a request waits that may go to the service."""
+        return bool(self._waiting) and not self._busy and not self.done
 
     def from_client(self, data: bytes) -> None:
         """Bytes from the client. Raises `PeerError` when they are no request."""
@@ -72,23 +82,45 @@ class ServiceExchange:
 
     def advance(self) -> None:
         """The client has taken all that was written to it: its next request goes to the service."""
-        if self._waiting and not self._busy and not self.done:
+        if self.ready:
             self._request(self._waiting.popleft())
 
     def _request(self, body: bytes) -> None:
         data = encode_frame(body)
-        self._busy = True
         self._pass_on(data)
+        if self._judge is not None:
+            judged = self._judge("request", body)
+            if judged.refused is not None:
+                self._refuse(judged.refused)
+                return
+            if judged.body is not body:
+                data = encode_frame(judged.body)
+        self._busy = True
         self._to_service(data)
 
+    def _refuse(self, reason: str) -> None:
+        """The client reads the reason where it expects a reply."""
+        self.done = not self._persistent
+        data = encode_service_error(reason)
+        self._count(len(data))
+        self._to_client(data)
+
     def _reply(self, reply: ServiceReply) -> None:
+        self.held -= len(reply.body) + _REPLY_HEAD
+        if reply.ok and self._judge is not None:
+            judged = self._judge("response", reply.body)
+            reply = (
+                ServiceReply(True, judged.body)
+                if judged.refused is None
+                else ServiceReply(False, judged.refused.encode())
+            )
         if reply.ok:
             data = encode_service_reply(reply.body)
         else:
             data = encode_service_error(reply.body.decode("utf-8", "replace"))
         self._busy = False
         self.done = not self._persistent
-        self._pass_on(data)
+        self._count(len(data))
         self._to_client(data)
 
     def _pass_on(self, data: bytes) -> None:

@@ -39,6 +39,11 @@ class Reporter:
         """Speak to this control from now on."""
         self._link = link
 
+    @property
+    def attached(self) -> bool:
+        """Whether there is a control to hear."""
+        return self._link is not None
+
     def repeat_connections(self) -> None:
         """Tell a new control which connections are open."""
         for message in list(self._open.values()):

@@ -12,6 +12,10 @@ md5sum are they cut: they must read the new header. A publisher that is killed a
 incarnation with another key and port; its subscribers are told by control, and the old connections end with
 the withdrawal.
 
+A topic that monitors want has its upstream without any subscriber, too. What they leave of a batch (`middle`) is
+what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
+(`published`).
+
 When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
 most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
 and large messages do not pile up. One that takes longer is slow: what is beyond its bounds is dropped until it
@@ -70,6 +74,10 @@ class Upstream(Protocol):
         """These are served now, of a topic of this type."""
 
 
+Through = Callable[[Batch], Batch | None]
+"""Monitors: the frames that go on, as they leave them; None when none does."""
+
+
 class RelayedTopic:
     """A topic of an incarnation with its subscribers."""
 
@@ -97,6 +105,8 @@ class RelayedTopic:
         self._latching = False
         self._paused = False
         self._connected = False
+        self._through: Through | None = None
+        self._wanted = False
         self._reported = True
         self._messages = self._bytes = self._dropped = 0
 
@@ -122,7 +132,20 @@ class RelayedTopic:
         self._reported = False
         self._forget_header()
         self.relieve()
-        if not self.members and self.upstream is not None:
+        if not self.members and not self._wanted and self.upstream is not None:
+            self.upstream.spare()
+
+    def monitor(self, through: Through | None, *, wanted: bool) -> None:
+        """From the next batch on messages go `through` monitors (None: past them), who want them or do not."""
+        self._through = through
+        if wanted == self._wanted:
+            return
+        self._wanted = wanted
+        if self.upstream is None:
+            return
+        if wanted:
+            self.upstream.want()
+        elif not self.members:
             self.upstream.spare()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
@@ -138,7 +161,7 @@ class RelayedTopic:
         for member in waiting:
             self._serve(member, header)
         self._announce()
-        if self.members and self.upstream is not None:
+        if (self.members or self._wanted) and self.upstream is not None:
             self.upstream.want()
 
     def upstream_closed(self) -> None:
@@ -150,6 +173,18 @@ class RelayedTopic:
 
     def received(self, batch: Batch) -> None:
         """Frames have come from the publisher: through the middle, to the subscribers."""
+        self._messages += batch.messages
+        self._bytes += len(batch.view)
+        self._reported = False
+        if self._through is None:
+            self._pass_on(batch)
+            return
+        left = self._through(batch)
+        if left is not None:
+            self._pass_on(left)
+
+    def published(self, batch: Batch) -> None:
+        """A monitor publishes: to the subscribers, and to no monitor."""
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False

@@ -10,7 +10,7 @@ A `Publisher` keeps at it while somebody wants the topic; a success resets the w
 import socket
 from collections.abc import Callable
 
-from appliance.channel.messages import UpstreamLost, UpstreamWanted
+from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import FrameReceiver
 from appliance.relay.loop import READ, Timer
@@ -24,9 +24,14 @@ _CALLER_ID = "/rosrv"
 
 
 class Publisher:
-    """The upstream of one relayed topic."""
+    """The upstream of one relayed topic. `objection(header)` says why a publisher is refused, if it is."""
 
-    def __init__(self, context: RelayContext, topic: RelayedTopic) -> None:
+    def __init__(
+        self,
+        context: RelayContext,
+        topic: RelayedTopic,
+        objection: Callable[[dict[str, str]], str] = lambda _header: "",
+    ) -> None:
         self._loop = context.loop
         self._topic = topic
         self._reporter = context.reporter
@@ -45,7 +50,10 @@ class Publisher:
         self._recv_into: Callable[[memoryview], int]
         self._parser = HeaderParser(limits.header_bytes)
         self._address = ("", 0)
+        self._header: dict[str, str] = {}
         self._presences = Presences(context, topic.topic)
+        self._objection = objection
+        self._objected = ""
 
     def want(self) -> None:
         """Somebody is to be served: connect unless that is done or under way."""
@@ -151,11 +159,35 @@ class Publisher:
         if "error" in header or missing:
             self._lose(f"the publisher says: {header.get('error', f'nothing about its {missing[0]}')}")
             return
+        reason = self._objection(header)
+        if reason:
+            self._object(reason)
+            return
+        self._header = header
         self._flow(header, self._stream.take(), self._parser.rest)
+
+    def judge_again(self) -> None:
+        """Other specifications are in force: a publisher that does not fit them is refused, or again carried."""
+        if self._socket is not None:
+            reason = self._objection(self._header)
+            if reason:
+                self._object(reason)
+        elif self._objected and self._timer is not None and not self._asked and self._stream is None:
+            self._failures = 0
+            self.ask()
+
+    def _object(self, reason: str) -> None:
+        """The publisher is not carried; it is tried again, for it may come back with another definition."""
+        if reason != self._objected:
+            self._objected = reason
+            self._reporter.send(PublicationRefused(self._topic.key, self._topic.topic, reason))
+        self._drop_connection()
+        self._retry()
 
     def _flow(self, header: dict[str, str], sock: socket.socket, rest: bytes) -> None:
         self._stream = None
         self._socket = sock
+        self._objected = ""
         self._failures = 0
         self._set_timer(0, None)
         self._loop.watch(sock.fileno(), READ, self._ready)

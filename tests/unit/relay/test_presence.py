@@ -10,6 +10,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.middle import Middle
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.report import Reporter
 from appliance.ros.tcpros import HeaderParser
@@ -37,7 +38,10 @@ def publisher() -> Iterator[socket.socket]:
 def presences(loop: Loop) -> Iterator[Presences]:
     """The presences of one topic."""
     limits = Limits()
-    context = RelayContext(loop, limits, Reporter(limits), MemoryBudget(1 << 20), memoryview(bytearray(64)))
+    reporter = Reporter(limits)
+    context = RelayContext(
+        loop, limits, reporter, MemoryBudget(1 << 20), memoryview(bytearray(64)), Middle(loop, reporter)
+    )
     presences = Presences(context, TOPIC)
     yield presences
     presences.close()

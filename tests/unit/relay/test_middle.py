@@ -1,0 +1,426 @@
+"""Monitors in the middle, told as transcripts of the whole relay: specifications in, messages through, reports out."""
+
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from appliance.channel.messages import (
+    GrantInstalled,
+    MonitorEvent,
+    MonitorResumed,
+    MonitorsCounted,
+    MonitorsReported,
+    MonitorSwitched,
+    NodePlaced,
+    PublicationPlaced,
+    PublicationRefused,
+    SpecificationsRefused,
+    SpecificationsStated,
+    SpecificationsTaken,
+)
+from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
+from tests.unit.relay.test_engine import ASK, HEADER, LOOPBACK, Peer, World
+
+STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+SET_BOOL_MD5 = "09fb03525b03e7ea1fd3992bafd87e16"
+TYPED = HEADER | {"md5sum": STRING_MD5}
+WANTED = ASK | {"md5sum": STRING_MD5}
+
+GUARD = """
+guard() {
+    int seen = 0;
+    event said(std::string text) /chatter std_msgs/String '{data:text}' {
+        seen = seen + 1;
+        if (text == "bad") { ROS_WARN("no such word"); return; }
+        if (text == "one") text = "two";
+        if (text == "long") text = "a longer text";
+        if (text == "count") text = std::to_string(seen);
+        if (text == "loop") { while (true) { seen = seen; } }
+    }
+}
+"""
+
+
+def string(text: str) -> bytes:
+    """The frame of a std_msgs/String."""
+    data = text.encode()
+    return encode_frame(struct.pack("<I", len(data)) + data)
+
+
+def data_of(peer: Peer) -> bytes:
+    """Everything the peer has been sent."""
+    peer.read()
+    return peer.data
+
+
+class Monitored(World):
+    """A relay whose control states specifications, and keeps what monitors did."""
+
+    def load(self, *texts: str, revision: int = 1, restarted: bool = False, **enabled: bool) -> Any:
+        """State these files; the relay's answer."""
+        files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
+        self.state(SpecificationsStated(revision, files, {}, enabled, restarted))
+        return self.until(
+            lambda: self.taken(SpecificationsTaken, revision) or self.taken(SpecificationsRefused, revision)
+        )
+
+    def taken(self, kind: type[Any], revision: int) -> Any:
+        """The answer of this kind to a statement, once."""
+        for message in self.told:
+            if isinstance(message, kind) and message.revision == revision:
+                self.told.remove(message)
+                return message
+        return None
+
+    def event(self, kind: str, **fields: Any) -> MonitorEvent:
+        """A monitor did this; it is taken out of what was told."""
+
+        def find() -> MonitorEvent | None:
+            for message in self.told:
+                if isinstance(message, MonitorsReported):
+                    for event in message.events:
+                        if event.kind == kind and all(getattr(event, k) == v for k, v in fields.items()):
+                            message.events.remove(event)
+                            return event
+            return None
+
+        found: MonitorEvent = self.until(find)
+        return found
+
+    def typed(self) -> tuple[Peer, Peer]:
+        """A publisher of std_msgs/String and a subscriber that is served."""
+        publisher = self.upstream(TYPED)
+        subscriber = self.connect(encode_header(WANTED))
+        assert self.gets_header(subscriber) == TYPED
+        return publisher, subscriber
+
+
+@pytest.fixture
+def world() -> Iterator[Monitored]:
+    """A relay with one node."""
+    world = Monitored()
+    yield world
+    world.close()
+
+
+def test_a_monitor_drops_and_changes_messages_and_control_is_told_before_and_after(world: Monitored) -> None:
+    """The others pass, in order, whatever the lengths of the changed ones."""
+    assert world.load(GUARD) == SpecificationsTaken(1, ["guard"], [])
+    publisher, subscriber = world.typed()
+    publisher.send(b"".join(map(string, ("a", "bad", "one", "long", "bad", "z"))))
+    world.gets(subscriber, b"".join(map(string, ("a", "two", "a longer text", "z"))))
+    drop = world.event("drop", monitor="guard", count=0)
+    assert (drop.key, drop.resource, drop.before, drop.size) == ("k", "/chatter", string("bad")[4:], 7)
+    assert drop.text == "guard.said dropped it: no such word"
+    change = world.event("change", monitor="guard", count=0)
+    assert (change.before, change.after) == (string("one")[4:], string("two")[4:])
+    assert world.event("log", monitor="guard").text == "no such word"
+    assert world.event("drop", count=1).monitor == "guard"
+    assert world.event("change", count=1).resource == "/chatter"
+
+
+def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:
+    """Not with specifications for other topics, and not while its monitor is disabled; then messages are untouched."""
+    world.load(GUARD.replace("/chatter", "/other"))
+    publisher, subscriber = world.subscribed()
+    relayed, _publisher = world.engine._topics["k", "/chatter"]
+    assert relayed._through is None
+    publisher.send(string("bad"))
+    world.gets(subscriber, string("bad"))
+    world.load(GUARD, revision=2, guard=False)
+    assert relayed._through is None
+    publisher.send(string("bad") + string("one"))
+    world.gets(subscriber, string("bad") + string("one"))
+
+
+def test_a_monitor_is_switched_off_and_on_while_messages_go_on(world: Monitored) -> None:
+    """Its variables stay."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    publisher.send(string("count"))
+    world.gets(subscriber, string("1"))
+    world.state(MonitorSwitched("guard", False))
+    publisher.send(string("count"))
+    world.gets(subscriber, string("count"))
+    world.state(MonitorSwitched("guard", True))
+    publisher.send(string("count"))
+    world.gets(subscriber, string("2"))
+
+
+def test_other_specifications_take_over_between_two_messages_and_the_same_keep_their_state(
+    world: Monitored,
+) -> None:
+    """What is stated again unchanged (a new control) changes nothing at all."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    publisher.send(string("count"))
+    world.gets(subscriber, string("1"))
+    second = GUARD.replace("guard", "other").replace("/chatter", "/elsewhere")
+    assert world.load(GUARD, second, revision=2).began == ["other"]
+    publisher.send(string("count"))
+    world.gets(subscriber, string("2"))
+    assert world.load(GUARD, second, revision=3, restarted=True) == SpecificationsTaken(3, [], [])
+    publisher.send(string("count"))
+    world.gets(subscriber, string("3"))
+    assert world.load(GUARD.replace('"bad"', '"worse"'), revision=4).began == ["guard"]
+    publisher.send(string("bad") + string("count"))
+    world.gets(subscriber, string("bad") + string("2"))
+    world.load(revision=5)
+    publisher.send(string("worse"))
+    world.gets(subscriber, string("worse"))
+
+
+def test_bad_specifications_change_nothing(world: Monitored) -> None:
+    """And control is told what is wrong, with its place."""
+    world.load(GUARD)
+    refused = world.load("nonsense", revision=2)
+    assert isinstance(refused, SpecificationsRefused)
+    assert refused.findings[0].startswith("0.rv:1:")
+    publisher, subscriber = world.typed()
+    publisher.send(string("bad") + string("good"))
+    world.gets(subscriber, string("good"))
+
+
+def test_a_relay_without_specifications_that_it_understands_blocks_everything(world: Monitored) -> None:
+    """Fail closed, until it is given some that it does."""
+    assert isinstance(world.load("nonsense"), SpecificationsRefused)
+    publisher, subscriber = world.subscribed()
+    publisher.send(string("a"))
+    assert "could not be taken" in world.event("drop", count=0).text
+    world.load(revision=2)
+    publisher.send(string("b"))
+    world.gets(subscriber, string("b"))
+
+
+def test_a_monitor_hears_a_topic_that_nobody_subscribes_to(world: Monitored) -> None:
+    """And the connection ends when the monitor is removed."""
+    world.load(GUARD)
+    publisher = world.upstream(TYPED)
+    publisher.send(string("bad"))
+    assert world.event("drop").monitor == "guard"
+    world.load(revision=2)
+    world.ends(publisher)
+
+
+def test_a_late_subscriber_of_a_latched_topic_gets_what_the_monitors_left(world: Monitored) -> None:
+    """The last message that was relayed, as it was changed; a dropped one is not latched."""
+    world.load(GUARD)
+    publisher = world.upstream(TYPED | {"latching": "1"})
+    publisher.send(string("one") + string("bad"))
+    world.event("drop")
+    subscriber = world.connect(encode_header(WANTED))
+    assert world.gets_header(subscriber)["latching"] == "1"
+    world.gets(subscriber, string("two"))
+
+
+def test_a_publisher_with_another_definition_is_refused_on_that_topic(world: Monitored) -> None:
+    """Control is told once; it is carried as soon as the specifications are gone."""
+    world.load(GUARD)
+    subscriber = world.connect(encode_header(ASK))
+    publisher = world.upstream(HEADER)
+    refused = world.hears(PublicationRefused, key="k", resource="/chatter")
+    assert "std_msgs/String" in refused.reason
+    world.ends(publisher)
+    world.load(revision=2)
+    publisher = world.upstream(HEADER)
+    assert world.gets_header(subscriber) == HEADER
+    world.load(GUARD, revision=3)
+    world.hears(PublicationRefused)
+    world.ends(publisher)
+
+
+def test_a_monitor_without_end_faults_and_its_messages_are_dropped(world: Monitored) -> None:
+    """The relay goes on; a flood of them does not hold it up."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    publisher.send(string("loop") + string("after"))
+    world.gets(subscriber, string("after"))
+    fault = world.event("fault", monitor="guard")
+    assert "instructions" in fault.text
+    assert fault.detail["file"] == "0.rv"
+    world.push(publisher, string("loop") * 200)
+    world.event("drop", text="the monitors take too long for their messages")
+    publisher.send(string("later"))
+    world.gets(subscriber, string("later"))
+
+
+def test_bytes_that_are_no_message_of_the_type_are_dropped(world: Monitored) -> None:
+    """With the fault recorded."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    publisher.send(
+        encode_frame(b"\xff\xff\xff\xff") + encode_frame(b"") + encode_frame(b"\x01") + string("a")
+    )
+    world.gets(subscriber, string("a"))
+    assert "not a message of this type" in world.event("fault").text
+
+
+def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(world: Monitored) -> None:
+    """Even one that is ours."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    monitors = world.engine._middle._set
+    assert monitors is not None
+    process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]
+    publisher.send(string("a"))
+    assert "a defect of rosrv" in world.event("fault").text
+    monitors.process = process  # type: ignore[method-assign]
+    publisher.send(string("b"))
+    world.gets(subscriber, string("b"))
+
+
+def test_a_large_message_goes_through_a_monitor(world: Monitored) -> None:
+    """Unchanged, changed and dropped ones alike."""
+    spec = GUARD.replace('text == "bad"', "text.size() == 300000").replace(
+        'text == "one"', "text.size() == 400000"
+    )
+    world.load(spec)
+    publisher, subscriber = world.typed()
+    for size, back in ((300_000, None), (400_000, "two"), (500_000, "x" * 500_000)):
+        world.push(publisher, string("x" * size))
+        if back is not None:
+            world.gets(subscriber, string(back))
+
+
+ALARM = """
+alarm() {
+    std_msgs::String text;
+    event said(std::string t) /chatter std_msgs/String '{data:t}' {
+        if (t == "bad") { text.data = "alarm"; PUBLISH(/alarm, std_msgs/String, text); return; }
+    }
+    event tick() every 50ms { text.data = "tick"; PUBLISH(/alarm, std_msgs/String, text); }
+}
+"""
+
+
+def test_what_monitors_publish_is_served_by_the_appliance_and_given_to_no_monitor(world: Monitored) -> None:
+    """With the header of the specification's definition, to who has a grant; timers go on without messages."""
+    hearer = GUARD.replace("/chatter", "/alarm")
+    world.load(ALARM, hearer)
+    port = world.listen()
+    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), port)
+    world.state(PublicationPlaced("own", "/alarm", "std_msgs/String"))
+    world.state(GrantInstalled("own", "/alarm", LOOPBACK, "/listener"))
+    world.port = port
+    subscriber = world.connect(encode_header(WANTED | {"topic": "/alarm"}))
+    header = world.gets_header(subscriber)
+    assert (header["callerid"], header["md5sum"], header["type"]) == (
+        "/rosrv",
+        STRING_MD5,
+        "std_msgs/String",
+    )
+    assert header["message_definition"].startswith("string data")
+    world.until(lambda: len(data_of(subscriber)) >= 2 * len(string("tick")))
+    assert subscriber.data.startswith(string("tick") * 2)
+    publisher = world.upstream(TYPED)
+    publisher.send(string("bad"))
+    world.until(lambda: string("alarm") in data_of(subscriber))
+    assert world.event("publish", resource="/alarm").monitor == "alarm"
+
+
+def test_a_hold_specification_blocks_its_topics_after_a_restart_until_it_is_resumed(world: Monitored) -> None:
+    """At a first start it does not."""
+    taken = world.load("hold " + GUARD.strip(), restarted=True)
+    assert taken.held == ["guard"]
+    publisher, subscriber = world.typed()
+    publisher.send(string("a"))
+    drop = world.event("drop")
+    assert (drop.monitor, drop.text) == ("guard", "guard holds its topics until it is resumed")
+    world.state(MonitorResumed("guard"))
+    publisher.send(string("b"))
+    world.gets(subscriber, string("b"))
+    other = Monitored()
+    assert other.load("hold " + GUARD.strip()).held == []
+    other.close()
+
+
+LATCH = """
+gate() {
+    bool open = false;
+    event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
+        if (open) { ROS_WARN("it is open"); return; }
+        open = wish;
+    }
+}
+"""
+BUTTON = """
+latch() {
+    event press() /mode std_msgs/String '{}' { }
+    fsm : start [ press -> pressed ] pressed [ press -> pressed ]
+    @pressed { ROS_ERROR("pressed"); }
+}
+"""
+
+
+def test_a_verdict_is_told_with_its_property_logic_and_category(world: Monitored) -> None:
+    """And counted for the state of the monitors."""
+    world.load(BUTTON.replace("/mode", "/chatter"))
+    publisher, subscriber = world.typed()
+    publisher.send(string("a") * 3)
+    world.gets(subscriber, string("a") * 3)
+    verdict = world.event("verdict", monitor="latch", count=0)
+    assert verdict.detail["logic"] == "fsm"
+    assert verdict.detail["category"] == "pressed"
+    assert world.event("verdict", count=2).monitor == "latch"
+
+    def counted() -> Any:
+        rows = [row for one in world.told if isinstance(one, MonitorsCounted) for row in one.rows]
+        return [row for row in rows if (row.events, row.verdicts, row.enabled) == (3, 3, True)]
+
+    world.until(counted)
+
+
+def _called(world: Monitored, persistent: bool = True) -> tuple[Peer, Peer]:
+    """A client and its connection at the service."""
+    fields = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
+    client = world.connect(encode_header(fields | ({"persistent": "1"} if persistent else {})))
+    service = world.accept(world.service)
+    world.gets_header(service)
+    service.send(encode_header({"callerid": "/talker", "type": "std_srvs/SetBool", "md5sum": SET_BOOL_MD5}))
+    assert world.gets_header(client)["md5sum"] == SET_BOOL_MD5
+    return client, service
+
+
+def test_a_request_that_is_refused_never_reaches_the_service(world: Monitored) -> None:
+    """The client reads the reason as an error of the service; the next request is judged anew."""
+    assert isinstance(world.load(LATCH), SpecificationsTaken)
+    client, service = _called(world)
+    client.send(encode_frame(b"\x01"))
+    world.gets(service, encode_frame(b"\x01"))
+    answer = encode_service_reply(b"\x01" + struct.pack("<I", 0))
+    service.send(answer)
+    world.gets(client, answer)
+    client.send(encode_frame(b"\x01"))
+    world.gets(client, encode_service_error("the request is refused by the monitor gate: it is open"))
+    assert world.event("drop", resource="/mode").monitor == "gate"
+    assert not service.data
+    once, _service = _called(world, persistent=False)
+    once.send(encode_frame(b"\x00"))
+    assert b"it is open" in world.ends(once)
+
+
+def test_a_service_with_another_definition_is_refused(world: Monitored) -> None:
+    """The client reads why."""
+    world.load(LATCH)
+    client = world.connect(encode_header({"callerid": "/client", "service": "/mode", "md5sum": "*"}))
+    service = world.accept(world.service)
+    world.gets_header(service)
+    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "0"}))
+    assert "std_srvs/SetBool" in world.gets_header(client)["error"]
+    world.hears(PublicationRefused, resource="/mode")
+
+
+def test_what_happens_without_a_control_is_told_to_the_next_one(world: Monitored) -> None:
+    """Nothing of it is lost."""
+    world.load(GUARD)
+    publisher, subscriber = world.typed()
+    world.engine.attach(None)
+    publisher.send(string("bad") + string("a"))
+    world.gets(subscriber, string("a"))
+    world.link.close()
+    world.control.close()
+    world.connect_control()
+    world.state(SpecificationsStated(1, [("0.rv", GUARD)], {}, {}, True))
+    assert world.event("drop", count=0).monitor == "guard"
