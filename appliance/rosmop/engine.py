@@ -267,6 +267,10 @@ class MonitorSet:
             outcome.reason = f"{monitor.name} holds its topics until it is resumed"
             message.dropped = True
             return True
+        if monitor.broken and self._on_fault == "drop":
+            outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
+            message.dropped = True
+            return True
         monitor.seen = True
         for timer in monitor.timers:
             if not timer.ticked:
@@ -426,6 +430,7 @@ class MonitorSet:
             self._compiled.namespace[monitor.code.start]()
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of `init` and is recorded
             self._fault(error, monitor, monitor.node.position, outcome)
+            monitor.broken = True
 
     def _take_over(self, monitor: Monitor, before: Monitor, compiled: Compiled) -> None:
         for name, code in monitor.code.variables.items():
@@ -435,6 +440,7 @@ class MonitorSet:
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):
             timer.due, timer.ticked = ticking.due, ticking.ticked
         monitor.enabled, monitor.held, monitor.seen = before.enabled, before.held, before.seen
+        monitor.broken = before.broken
         monitor.faults = before.faults
 
     def _index(self) -> None:

@@ -63,6 +63,8 @@ class Monitor:
     timers: tuple[Timer, ...] = ()
     enabled: bool = True
     held: bool = False
+    broken: bool = False
+    """Its first values or `init` faulted, so it has no state to judge by."""
     faults: int = 0
     seen: bool = False
     """A message of one of its events has come."""

@@ -259,7 +259,8 @@ def _vector(
         return f"l_filled({scope.context}, {count}, {codecs.maker(kind.element)}, {width}, {site})"
     value = convert(scope, values[1], kind.element, site)
     copied = codecs.copy(kind.element, scope.context, "e", site)
-    return f"e_fill({scope.context}, {count}, {value}, lambda e: {copied}, {width}, {site})"
+    measure = scope.module.use(codecs.measure(kind.element))
+    return f"e_fill({scope.context}, {count}, {value}, lambda e: {copied}, {measure}, {site})"
 
 
 def _moment(kind: kinds.Type, values: Sequence[Value], site: int) -> str:

@@ -24,15 +24,15 @@ def charge(scope: Scope, node: tree.Node) -> None:
 
 
 def weight(node: tree.Node) -> int:
-    """How many instructions a body is charged: its expressions and statements, however they are nested."""
-    total = 0
-    waiting: list[object] = [node]
+    """How many instructions an iteration (or a call) is charged: one, and one for each statement in the body."""
+    total = 1
+    waiting: list[object] = [getattr(node, name) for name in node.__dataclass_fields__]
     while waiting:
         current = waiting.pop()
         if isinstance(current, tuple):
             waiting += current
-        elif isinstance(current, tree.Node):
-            total += 1
+        elif isinstance(current, tree.Statement | tree.Case):
+            total += not isinstance(current, tree.Block)
             waiting += [getattr(current, name) for name in current.__dataclass_fields__]
     return total
 

@@ -33,6 +33,7 @@ FUNCTIONS = {
     "m_duration": times.duration,
     "l_element": vectors.element,
     "l_append": vectors.append,
+    "l_append_text": vectors.append_text,
     "l_pop": vectors.pop,
     "l_resized": vectors.resized,
     "l_clear": list.clear,
@@ -327,8 +328,9 @@ def _push_back(call: Invocation) -> Value:
     kind = _vector(call)
     value = convert(call.scope, call.arguments[0], kind.element, call.site)
     width = call.scope.codecs.width(kind.element)
+    function = "l_append_text" if isinstance(kind.element, kinds.String) else "l_append"
     return call.changes_in_place(
-        f"l_append({call.scope.context}, {call.base.code}, {value}, {width}, {call.site})"
+        f"{function}({call.scope.context}, {call.base.code}, {value}, {width}, {call.site})"
     )
 
 

@@ -165,7 +165,7 @@ def _joined(operands: Operands, value: Value) -> str:
     if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
         return f"o_bytes(({value.code} & 255,))"
     if kinds.is_number(value.type):
-        raise SpecificationError.at(value.position, f"a {value.type} is no string; write `std::to_string(…)`")
+        raise SpecificationError.at(value.position, f"{value.type} is no string; write `std::to_string(…)`")
     return convert(operands.scope, value, kinds.STRING)
 
 

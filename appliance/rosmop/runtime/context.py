@@ -25,7 +25,7 @@ UNMEASURED = 1 << 20
 MAX_CALLS = 100
 """Calls of recursive helper functions inside each other."""
 
-BYTES_PER_INSTRUCTION = 16
+BYTES_PER_INSTRUCTION = 64
 OUTPUT_COST = 100  # instructions for a line of output or a published message
 FOLDED_NS = 60 * 10**9  # an event that does not happen for an index past the end is told once in this time
 
@@ -141,7 +141,7 @@ class Context:
             frame = frame.f_back
         held += self._held(shared)
         self._allocated = 0
-        self.spend(held // (BYTES_PER_INSTRUCTION * 64), site)
+        self.spend(held // (BYTES_PER_INSTRUCTION * 16), site)
         if held > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
 

@@ -38,6 +38,12 @@ def append(context: Context, values: Values, value: Any, width: int, site: int) 
     values.append(value)
 
 
+def append_text(context: Context, values: Values, value: bytes, width: int, site: int) -> None:
+    """`values.push_back(text)`."""
+    context.allocate(width + len(value), site)
+    values.append(value)
+
+
 def pop(values: Values, site: int) -> None:
     """`values.pop_back()`."""
     if not values:
@@ -81,11 +87,16 @@ def assigned(values: Values, others: Values) -> Values:
     return values
 
 
-def filled_with(  # noqa: PLR0917  the arguments are C++'s
-    context: Context, count: int, value: Any, copy: Callable[[Any], Any], width: int, site: int
-) -> Values:
-    """`std::vector<T>(count, value)`."""
-    context.allocate(count * width, site)
+def filled_with(
+    context: Context,
+    count: int,
+    value: Any,
+    copy: Callable[[Any], Any],
+    measure: Callable[[Any], int],
+    site: int,
+) -> Values:  # noqa: PLR0917  the arguments are C++'s
+    """`std::vector<T>(count, value)`; `measure` says how many bytes a value holds."""
+    context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
     return [copy(value) for _ in range(count)]
 

@@ -79,6 +79,13 @@ case: CASE conditional ":" statement*
     | DEFAULT ":" statement*                      -> default
 declaration: type declarator ("," declarator)*
 shared: type plain_declarator ("," declarator)*   -> declaration
+      | type made ("," declarator)*               -> declaration
+made: NAME "(" literals ")"                       -> constructed
+literals: literal ("," literal)*                  -> arguments
+?literal: NUMBER -> number
+        | MINUS number                            -> prefix
+        | string | character
+number: NUMBER
 ?declarator: plain_declarator
     | NAME "(" arguments ")"                      -> constructed
 plain_declarator: NAME

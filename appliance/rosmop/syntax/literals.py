@@ -8,6 +8,7 @@ _SIMPLE = {"n": 10, "t": 9, "r": 13, "a": 7, "b": 8, "f": 12, "v": 11, "\\": 92,
 _UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "m": 60 * 10**9, "min": 60 * 10**9,
              "h": 3600 * 10**9}  # fmt: skip
 _DURATION = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\Z")
+MIN_PERIOD_NS = 10**6
 MAX_PERIOD_NS = 10**18
 """About 31 years."""
 
@@ -45,8 +46,8 @@ def duration_ns(text: str) -> int:
         raise BadLiteralError(f"`{found[2][:20]}` is no unit of time; write one of {units}")
     number = found[1] if found[1][0] != "." else "0" + found[1]
     result = Fraction(number.rstrip(".") if number.endswith(".") else number) * _UNITS_NS[found[2]]
-    if result.denominator != 1 or not 0 < result <= MAX_PERIOD_NS:
-        raise BadLiteralError("a period is a whole number of nanoseconds, more than 0 and at most 31 years")
+    if result.denominator != 1 or not MIN_PERIOD_NS <= result <= MAX_PERIOD_NS:
+        raise BadLiteralError("a period is from 1 ms to 31 years, and a whole number of nanoseconds")
     return int(result)
 
 

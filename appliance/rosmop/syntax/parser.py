@@ -16,7 +16,7 @@ from appliance.rosmop.syntax.complaints import FORBIDDEN, describe
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.grammar import GRAMMAR
 
-MAX_CHARACTERS = 512 * 1024
+MAX_CHARACTERS = 128 * 1024
 MAX_DEPTH = 100
 """Statements and operators inside each other."""
 

@@ -326,7 +326,7 @@ class Publish(Statement):
 
     topic: str
     type: str
-    type_position: Position
+    type_position: Position = field(compare=False)
     value: Expression
 
 
@@ -348,7 +348,7 @@ class Binding(Node):
     path: tuple[PathStep, ...]
     variable: str | None
     constant: Expression | None
-    value_position: Position
+    value_position: Position = field(compare=False)
 
 
 @dataclass(frozen=True)
@@ -357,7 +357,7 @@ class MessageTrigger(Node):
 
     topic: str
     type: str
-    type_position: Position
+    type_position: Position = field(compare=False)
     part: str | None
     pattern: tuple[Binding, ...]
     when: Expression | None
@@ -412,7 +412,7 @@ class Property(Node):
 
     logic: str
     formula: str
-    formula_position: Position
+    formula_position: Position = field(compare=False)
     handlers: tuple[Handler, ...]
 
 

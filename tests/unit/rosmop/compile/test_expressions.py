@@ -240,7 +240,7 @@ def test_a_fault_stands_where_the_expression_does() -> None:
 REFUSED = [
     ('x = "a";', 3, 5, "std::string cannot become int; write `std::stod(…)` or `std::stoi(…)`"),
     ("std::string s = 5;", 3, 17, "int cannot become std::string; write `std::to_string(…)`"),
-    ('std::string s = "a" + 5;', 3, 23, "a int is no string; write `std::to_string(…)`"),
+    ('std::string s = "a" + 5;', 3, 23, "int is no string; write `std::to_string(…)`"),
     ("y = 1;", 3, 1, "there is no variable `y`"),
     ("counter = 1; int count;", 3, 1, "there is no variable `counter`"),
     ("foo(1);", 3, 1, "there is no function `foo`"),

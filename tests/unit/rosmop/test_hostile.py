@@ -1,0 +1,218 @@
+"""Specifications that mean harm are refused, or fault, in bounded time and memory."""
+
+import builtins
+import time
+import tracemalloc
+
+import pytest
+
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.syntax.errors import SpecificationError
+from tests.unit.rosmop.acting import act, definitions, load, message, refused, refused_action
+
+PATIENCE = 20.0  # seconds; the machine may be busy, an endless loop is endless
+
+BUDGET = "more than 1000000 instructions for one message; is there a loop without end?"
+MEMORY = "the values of a specification may hold 16 MiB together"
+
+BOMBS = [
+    ("while (1);", "", BUDGET),
+    ("for (;;) x++;", "", BUDGET),
+    ("do { continue; } while (1);", "", BUDGET),
+    ("for (int i = 0; i < 100000; i++) for (int j = 0; j < 100000; j++) x++;", "", BUDGET),
+    ("f();", "void f() { f(); }", "`f` calls itself without end"),
+    ("f();", "void f() { g(); } void g() { f(); }", "calls itself without end"),
+    ("f0();", "".join(f"void f{i}() {{ f{i + 1}(); f{i + 1}(); }} " for i in range(40)) + "void f40() { }", BUDGET),
+    ("f(30);", "void f(int n) { if (n > 0) { f(n - 1); f(n - 1); } }", BUDGET),
+    ('std::string s = "x"; while (1) s += s;', "", MEMORY),
+    ("std::string s(100000000, 'x');", "", MEMORY),
+    ("std::string s(1000000, 'x'); for (int i = 0; i < 100000; i++) s[0] = 'y';", "", BUDGET),
+    ("std::vector<double> v; while (1) v.push_back(1);", "", BUDGET),
+    ("std::vector<double> v(1000000000);", "", MEMORY),
+    ("std::vector<double> v; v.resize(4000000000u);", "", MEMORY),
+    ("std::vector<double> v(-1);", "", MEMORY),
+    ("std::vector<std::vector<double>> v(100, std::vector<double>(100000, 1.0));", "", MEMORY),
+    ("std::vector<std::string> v; std::string s(100000, 'x'); while (1) v.push_back(s);", "", MEMORY),
+    ("f(1);", "void f(int n) { std::vector<double> v(100000); f(n + 1); }", MEMORY),
+    ("while (1) g += g;", 'std::string g = "x";', MEMORY),
+    ("while (1) g.push_back(nav_msgs::Odometry());", "std::vector<nav_msgs::Odometry> g;", MEMORY),
+    ("char * c = new char[1000000000];", "", MEMORY),
+    ("double a[16000000];", "", MEMORY),
+    ('while (1) ROS_INFO("aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa");', "", BUDGET),
+    ("std_msgs::Int32 m; while (1) PUBLISH(/o, std_msgs/Int32, m);", "", BUDGET),
+    ("std::vector<int> v{1}; for (int a : v) v.push_back(a);", "", BUDGET),
+    ("std::string s(1000000, 'x'); while (1) s.find(\"y\");", "", BUDGET),
+    ("std::string s(1000000, 'x'); while (1) s.find_first_of(\"y\");", "", BUDGET),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "before", "text"), BOMBS)
+def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
+    """Loops, recursion and growth without end stop at the budget or the limit of memory, and drop the message."""
+    tracemalloc.start()
+    began = time.monotonic()
+    outcome = act(body, before=before, data=3)
+    took = time.monotonic() - began
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert [text in fault.text for fault in outcome.faults] == [True]
+    assert outcome.result == "dropped"
+    assert took < PATIENCE
+    assert peak < 200 << 20
+
+
+def test_memory_is_measured_over_all_variables() -> None:
+    """Many small values count together, and what was freed counts no more."""
+    many = "".join(f"std::string s{i}(1000000, 'x'); " for i in range(20))
+    assert MEMORY in act(many).faults[0].text
+    freed = "std::string s; for (int i = 0; i < 60; i++) { s = std::string(1000000, 'x'); }"
+    assert act(freed).faults == ()
+
+
+def test_a_value_of_less_than_the_limit_is_held() -> None:
+    """The limit is 16 MiB, not less."""
+    assert act("std::string s(16000000, 'x'); ROS_INFO(\"%d\", (int) s.size());").log[0].text == "16000000"
+
+
+REFUSED = [
+    ("x = " + "(" * 300 + "1" + ")" * 300 + ";", "nested more than 100 deep"),
+    ("x = " + "!" * 5000 + "1;", "nested more than 100 deep"),
+    ("if (x) " * 3000 + "x = 1;", "nested more than 100 deep"),
+    ("{" * 3000 + "}" * 3000, "nested more than 100 deep"),
+    ("x = " + "x ? 1 : " * 3000 + "2;", "nested more than 100 deep"),
+    ("while (x) " * 30 + "x = 1;", "more than 15 loops inside each other"),
+    ("x = x + 1; " * 40000, "the file has more than 128 Ki characters"),
+    ('ROS_INFO("%1000000000d", x);', "the width in `%1000000000d` must be a number up to 1000"),
+    ('ROS_INFO("%.1000000000f", 1.0);', "must be a number up to 1000"),
+    ('ROS_INFO("%*d", x, x);', "must be a number up to 1000"),
+    ("int a[1000000000000];", "the size of an array is a number"),
+    ("x = __class__;", "there is no variable `__class__`"),
+    ('__import__("os");', "there is no function `__import__`"),
+    ('eval("1");', "there is no function `eval`"),
+    ('open("/etc/passwd");', "there is no function `open`"),
+    ("x.__class__.__bases__;", "int has no member `__class__`"),
+    ('std::string("").__class__;', "std::string has no member `__class__`"),
+    ("std_msgs::Int32 m; PUBLISH(\"/a'+str(1)+'\", std_msgs/Int32, m);", "is no global name"),
+    ("x = " + "9" * 5000 + ";", "is no number"),
+    ("std::vector<" * 200 + "int" + "> " * 200 + "v;", "nested more than 100 deep"),
+]
+
+
+@pytest.mark.parametrize(("body", "text"), REFUSED)
+def test_what_cannot_be_good_is_refused(body: str, text: str) -> None:
+    """Nesting, sizes and names that ask for more than the language has are errors at load, in bounded time."""
+    began = time.monotonic()
+    findings = refused_action(body)
+    assert any(text in finding.text for finding in findings)
+    assert time.monotonic() - began < PATIENCE
+
+
+DEEP_BUT_RIGHT = [
+    "x = " + "(" * 80 + "1" + ")" * 80 + ";",
+    "if (x) " * 80 + "x = 1;",
+    "x = " + " + ".join(["x"] * 80) + ";",
+    "x = " + "x ? 1 : " * 80 + "2;",
+    "while (x) " * 14 + "x = 0;",
+    "std::vector<int> v(9); x = " + "v[" * 80 + "1" + "]" * 80 + ";",
+    "switch (x) {" + "".join(f"case {i}: x++;" for i in range(1000)) + "}",
+]
+
+
+@pytest.mark.parametrize("body", DEEP_BUT_RIGHT)
+def test_what_is_within_the_limits_runs(body: str) -> None:
+    """What the limits allow, the compiler of Python takes, too."""
+    assert act(body, data=3).faults == ()
+
+
+def test_no_string_of_a_specification_becomes_code() -> None:
+    """Quotes, escapes and braces in strings are printed as they are."""
+    text = r"""'); import os; ("\n\\ {0} %% ' \" \x00 b' + v1"""
+    outcome = act(
+        f"""ROS_INFO("{text.replace('"', chr(92) + '"').replace(chr(92) * 2 + '"', chr(92) + '"')}");"""
+    )
+    assert outcome.log[0].text.startswith("'); import os; (")
+
+
+def test_identifiers_are_not_those_of_the_generated_code() -> None:
+    """Names that Python or the generated code use are ordinary variables."""
+    names = [
+        "None",
+        "lambda",
+        "def",
+        "v1",
+        "c1",
+        "m",
+        "b",
+        "n",
+        "self",
+        "w_len",
+        "__rv__",
+        "exec",
+        "__builtins__",
+    ]
+    declared = "".join(f"int {name} = {index}; " for index, name in enumerate(names))
+    total = " + ".join(names)
+    assert act(f'{declared} ROS_INFO("%d", {total});').log[0].text == str(sum(range(len(names))))
+    shared = (
+        f"a() {{ {declared} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ ROS_INFO(\"%d\", {total}); }} }}"
+    )
+    assert load(shared).process("/t", message("std_msgs/Int32"), 0).log[0].text == str(sum(range(len(names))))
+
+
+def test_the_namespace_of_generated_code_has_no_builtins() -> None:
+    """Nothing that Python offers is in reach: no import, no attribute of a class, no file."""
+    monitors = load("a() { event e(int x) /t std_msgs/Int32 '{data:x}' { x = 1; } }")
+    namespace = monitors._compiled.namespace
+    assert namespace["__builtins__"] == {}
+    dangerous = {
+        builtins.eval,
+        builtins.exec,
+        builtins.open,
+        builtins.getattr,
+        builtins.__import__,
+        builtins.type,
+    }
+    assert not [name for name, value in namespace.items() if callable(value) and value in dangerous]
+
+
+HUGE_COUNTS = [
+    ("std_msgs/String", "std::string x", b"\xff\xff\xff\xff"),
+    ("std_msgs/ByteMultiArray", "int8_t[] x", b"\0\0\0\0\0\0\0\0\xff\xff\xff\xff"),
+    ("sensor_msgs/JointState", "std::string[] x", b"\0" * 12 + b"\0\0\0\0" + b"\xff\xff\xff\xff"),
+    ("nav_msgs/Path", "auto x", b"\0" * 12 + b"\0\0\0\0" + b"\xff\xff\xff\x7f"),
+]
+
+
+@pytest.mark.parametrize(("kind", "parameter", "data"), HUGE_COUNTS)
+def test_a_count_beyond_the_message_is_a_fault(kind: str, parameter: str, data: bytes) -> None:
+    """A length in a message that promises more than there is makes no memory and no loop."""
+    field = {"nav_msgs/Path": "poses", "sensor_msgs/JointState": "name"}.get(kind, "data")
+    text = f"a() {{ event e({parameter}) /t {kind} '{{{field}:x}}' {{ auto y = x; }} }}"
+    outcome = load(text).process("/t", data, 0)
+    assert (outcome.result, len(outcome.faults)) == ("dropped", 1)
+    assert "not a message of this type" in outcome.faults[0].text
+
+
+def test_random_bytes_for_text_are_refused_with_a_position() -> None:
+    """Whatever stands in a file, the answer is an error with a place."""
+    for text in (
+        "\0",
+        "\x1b[31m",
+        "a() { \ud800 }",
+        "'" * 1000,
+        "/*" * 1000,
+        '"' * 999,
+        "@" * 999,
+        "#" * 10,
+        "\ufeff",
+    ):
+        with pytest.raises(SpecificationError) as caught:
+            MonitorSet.load({"x.rv": text}, definitions())
+        assert caught.value.findings[0].position.line >= 1
+        assert all(character.isprintable() for character in caught.value.findings[0].text)
+
+
+def test_shared_arrays_beyond_the_limit_are_refused() -> None:
+    """What does not fit is refused before anything is made."""
+    text = "a() { double v[16000000]; event e() /t std_msgs/Empty '{}' { } }"
+    assert "a specification may hold 16 MiB" in refused(text)[0].text
