@@ -143,11 +143,11 @@ class Faces:
         await self.open(incarnation)
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the outer face and both ports."""
+        """Close the outer face and both ports, once: afterwards the ports may be another incarnation's."""
         server = self._servers.pop(incarnation.key, None)
         if server is not None:
             server.close()
-        self._places.close(incarnation)
+            self._places.close(incarnation)
 
     def close_all(self) -> None:
         """Stop serving; the ports stay open for the next control."""

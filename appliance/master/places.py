@@ -105,7 +105,7 @@ class Places:
                 self._unused.append(port)
 
     def close_unclaimed(self, claimed: set[int]) -> None:
-        """Close kept sockets that belong to no known incarnation."""
+        """Close kept sockets that belong to no known incarnation; the next to be opened come after those claimed."""
         for name, sock in list(self._sockets.items()):
             port = sock.getsockname()[1]
             if port not in claimed:
@@ -113,6 +113,8 @@ class Places:
                 sock.close()
                 self._drop(name)
                 self._unused.append(port)
+        last = max(claimed, default=0)
+        self._unused = deque(sorted(self._unused, key=lambda port: (port <= last, port)))
 
     def _listen(self) -> sockets.socket:
         for _ in range(len(self._unused)):

@@ -1,0 +1,66 @@
+"""The ports of incarnations: kept over a restart, and not given to another while somebody may knock there."""
+
+import ipaddress
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.master.places import Places
+from appliance.master.registry import Incarnation
+from appliance.ros.uris import parse_node_uri
+
+
+@pytest.fixture
+def first() -> Iterator[int]:
+    """The first of eight ports that are free at this moment."""
+    for port in range(40_000, 60_000, 8):
+        probes = [socket.socket() for _ in range(8)]
+        try:
+            for offset, probe in enumerate(probes):
+                probe.bind(("127.0.0.1", port + offset))
+        except OSError:
+            continue
+        finally:
+            for probe in probes:
+                probe.close()
+        yield port
+        return
+    pytest.fail("no eight free ports in a row")
+
+
+def places(first: int) -> Places:
+    """Nobody keeps the sockets."""
+    return Places("127.0.0.1", range(first, first + 8), keep=lambda *_: None, drop=lambda _: None)
+
+
+def incarnation(ports: tuple[int, int]) -> Incarnation:
+    """Somebody with these ports."""
+    uri = "http://127.0.0.1:4000/"
+    host = ipaddress.ip_address("127.0.0.1")
+    return Incarnation("key", "/node", host, parse_node_uri(uri), uri, "127.0.0.1", *ports)
+
+
+def test_closed_ports_come_last(first: int) -> None:
+    """Ports that were given back are given out again only after all others."""
+    here = places(first)
+    closed = here.open()
+    here.close(incarnation(closed))
+    others = [here.open() for _ in range(3)]
+    assert closed not in others
+    assert here.open() == closed
+    here.close_unclaimed(set())
+
+
+def test_after_a_restart_too(first: int) -> None:
+    """A restarted control begins after the ports in use: what was closed before the crash is not given out first."""
+    before = places(first)
+    before.open()
+    kept = before.open()
+    after = places(first)
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    after.close_unclaimed(set(kept))
+    assert after.open() == (first + 4, first + 5)
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
