@@ -3,6 +3,7 @@
 Exit status: 0 right (warnings or not), whatever the verdicts; 1 a specification with errors; 2 usage.
 """
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from appliance.cli.monitor_bag import Recording, definitions_of, open_bag, refus
 from appliance.cli.monitor_input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor_output import lines, record, say_finding
 from appliance.cli.monitor_picture import dot_of, svg_of
-from appliance.cli.policy_output import counted, say, say_json
+from appliance.cli.policy_output import counted, printable, say, say_json
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import CompiledProperty
@@ -77,22 +78,20 @@ def run(
 
     Example: rosrv monitor run monitors/safe_triggering.rv --bag drive.bag
     """
-    reader = open_bag(bag)
-    try:
-        monitors = _load(files, msg or [], definitions_of(reader))
-    except SpecificationError as error:
-        reader.close()
-        for finding in error.findings:
-            typer.echo(str(finding), err=True)
-        raise typer.Exit(1) from None
-    for text in refusals(monitors, reader):
-        typer.echo(f"rosrv monitor: {text}; its messages are dropped", err=True)
-    if output is None:
-        _report(monitors, reader, None, as_json=as_json)
-    else:
-        with Recording(output, monitors.definitions) as recording:
-            _report(monitors, reader, recording, as_json=as_json)
-    reader.close()
+    with closing(open_bag(bag)) as reader:
+        try:
+            monitors = _load(files, msg or [], definitions_of(reader))
+        except SpecificationError as error:
+            for finding in error.findings:
+                typer.echo(printable(str(finding)), err=True)
+            raise typer.Exit(1) from None
+        for text in refusals(monitors, reader):
+            typer.echo(f"rosrv monitor: {printable(text)}; its messages are dropped", err=True)
+        if output is None:
+            _report(monitors, reader, None, as_json=as_json)
+        else:
+            with Recording(output, monitors.definitions) as recording:
+                _report(monitors, reader, recording, as_json=as_json)
 
 
 def _load(files: list[Path], folders: list[Path], recorded: Definitions | None = None) -> MonitorSet:

@@ -87,14 +87,14 @@ def assigned(values: Values, others: Values) -> Values:
     return values
 
 
-def filled_with(
+def filled_with(  # noqa: PLR0917  the arguments are C++'s
     context: Context,
     count: int,
     value: Any,
     copy: Callable[[Any], Any],
     measure: Callable[[Any], int],
     site: int,
-) -> Values:  # noqa: PLR0917  the arguments are C++'s
+) -> Values:
     """`std::vector<T>(count, value)`; `measure` says how many bytes a value holds."""
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)

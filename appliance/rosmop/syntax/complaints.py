@@ -31,6 +31,43 @@ FORBIDDEN = {
 }
 """Words of C++ that are not part of the language, and what to write instead."""
 
+RESERVED = frozenset(
+    [
+        "if",
+        "else",
+        "while",
+        "do",
+        "for",
+        "switch",
+        "case",
+        "default",
+        "break",
+        "continue",
+        "return",
+        "const",
+        "static",
+        "auto",
+        "void",
+        "bool",
+        "char",
+        "short",
+        "int",
+        "long",
+        "float",
+        "double",
+        "signed",
+        "unsigned",
+        "new",
+        "delete",
+        "static_cast",
+        "DROP",
+        "PUBLISH",
+        "__RESET",
+        "using",
+    ]
+)
+"""Words of the language that are never names."""
+
 _FOUND = re.compile(
     r'"(?:\\.|[^"\\\n])*"|[A-Za-z_]\w*|\d[\w.]*|->|::|<<=|>>=|[-+*/%&|^<>=!]=|\+\+|--|&&|\|\||<<|>>|.',
     re.DOTALL,
@@ -102,8 +139,6 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
     else:
         match = _FOUND.match(text, offset)
         piece = match[0] if match else text[offset]
-        if piece == ">" and text[offset - 1 : offset] == "-":
-            piece = "->"
         found = shown(piece)
         hint = FORBIDDEN.get(piece, _HINTS.get(piece, ""))
     container = _CONTAINER.search(text, max(0, offset - 100), offset)

@@ -12,7 +12,7 @@ from lark.exceptions import UnexpectedInput, UnexpectedToken
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.builder import Builder, check
-from appliance.rosmop.syntax.complaints import FORBIDDEN, describe
+from appliance.rosmop.syntax.complaints import FORBIDDEN, RESERVED, describe
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.grammar import GRAMMAR
 
@@ -52,12 +52,14 @@ def _parse(text: str, file: str) -> Tree[Token]:
     except _ForbiddenWordError as error:
         word = error.token
         position = Position(file, word.line or 1, word.column or 1)
-        raise SpecificationError.at(
-            position, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
-        ) from None
+        reason = FORBIDDEN.get(word)
+        text = f"is not part of the language; {reason}" if reason else "cannot stand here, and is no name"
+        raise SpecificationError.at(position, f"`{word}` {text}") from None
     except UnexpectedInput as error:
         at_end = isinstance(error, UnexpectedToken) and error.token.type == "$END"
         offset = len(text) if at_end or error.pos_in_stream is None else error.pos_in_stream
+        if text[offset - 1 : offset + 1] == "->":
+            offset -= 1
         message = describe(text, offset, _accepted(error))
         raise SpecificationError.at(start_of(file, text, offset), message) from None
 
@@ -88,7 +90,7 @@ def _check_depth(parsed: Tree[Token], file: str) -> None:
 
 
 def _allow(token: Token) -> Token:
-    if token in FORBIDDEN:
+    if token in FORBIDDEN or token in RESERVED:
         raise _ForbiddenWordError(token)
     return token
 

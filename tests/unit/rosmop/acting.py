@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Mapping
+from typing import Any
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
@@ -13,7 +14,7 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
 
-STORE = get_typestore(Stores.ROS1_NOETIC)
+STORE: Any = get_typestore(Stores.ROS1_NOETIC)
 PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
 
 
@@ -30,7 +31,7 @@ def message(kind: str, **fields: object) -> bytes:
     return bytes(STORE.serialize_ros1(_value(_long(kind), _tree(fields)), _long(kind)))
 
 
-def fields(kind: str, data: bytes) -> object:
+def fields(kind: str, data: bytes) -> Any:
     """A message by another library's decoder."""
     return STORE.deserialize_ros1(data, _long(kind))
 
@@ -51,7 +52,7 @@ def _long(kind: str) -> str:
     return f"{package}/msg/{name}"
 
 
-def _value(kind: str, given: object) -> object:
+def _value(kind: str, given: object) -> Any:
     """An object of the other library with the given fields, the rest zero."""
     if not isinstance(given, dict):
         return given

@@ -1,5 +1,7 @@
 """The running monitors: order, shared variables, properties and handlers, time, faults, swaps, services."""
 
+# ruff: noqa: E501  the rows of tables
+
 import pytest
 
 from appliance.rosmop.engine import MAX_TICKS, MonitorSet
@@ -200,7 +202,7 @@ def test_a_handler_that_a_timer_can_run_may_not_drop() -> None:
 def test_lint() -> None:
     """Events that no property uses and handlers that never run are warnings with their places."""
     text = "a() {" + on("/t") + on("/u", "f") + "\nere: e e @match { } }"
-    assert ["no property uses the event `f`"] == [finding.text for finding in load(text).warnings]
+    assert [finding.text for finding in load(text).warnings] == ["no property uses the event `f`"]
     never = "a() {" + on("/t") + "\nltl: [] (e or not e) @violation { } }"
     warnings = [(finding.position.line, finding.text) for finding in load(never).warnings]
     assert any("never runs" in text and line == 3 for line, text in warnings)
@@ -432,7 +434,7 @@ def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() ->
     user = "b() {" + on("/u", "e", "n = 1;") + "}"
     monitors = load("a() { int n;" + on("/t") + "}", y=user)
     assert monitors.monitor("b").code.uses == {"a"}
-    with pytest.raises(SpecificationError, match="y.rv:1.*there is no variable `n`"):
+    with pytest.raises(SpecificationError, match=r"y\.rv:1.*there is no variable `n`"):
         monitors.replaced({"y.rv": user}, definitions(), 0)
 
 

@@ -127,13 +127,13 @@ def test_the_robot_stops_before_an_obstacle() -> None:
     assert commanded(monitors, 3).result == "passed"
     monitors.process("/landshark/scan", scan(1.0), 4)
     stopped = commanded(monitors, 5)
-    twist = fields("geometry_msgs/TwistStamped", bytes(stopped.buffer)).twist  # type: ignore[attr-defined]
+    twist = fields("geometry_msgs/TwistStamped", bytes(stopped.buffer)).twist
     assert (stopped.result, twist.linear.x, twist.angular.z) == ("changed", 0.0, 0.5)
     [alarm] = stopped.published
     assert (alarm.topic, alarm.type) == ("/landshark/obstacle_alarm", "std_msgs/String")
     assert fields("std_msgs/String", alarm.data).data.startswith(
         "obstacle at 1.000000 m, 1.233333 m must be free"
-    )  # type: ignore[attr-defined]
+    )
     monitors.process("/landshark/odom", odometry(0, speed=0.2), 6)
     assert commanded(monitors, 7).result == "passed"
 

@@ -1,5 +1,7 @@
 """Expressions have the values that C++ gives them on a 64-bit machine."""
 
+# ruff: noqa: E501  the rows of tables
+
 import pytest
 
 from tests.unit.rosmop.acting import act, refused_action, shown
