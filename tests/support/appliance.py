@@ -76,7 +76,8 @@ class Appliance:
             str(self.state),
         ]
         command += ["--policy", str(self.policy_file), *self.options]
-        command += ["--listen", "127.0.0.1:0" if loopback else f"{self.host.address}:11311"]
+        inside = "0.0.0.0" if self.isolation == "netns" else self.host.address
+        command += ["--listen", "127.0.0.1:0" if loopback else f"{inside}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
         self.process = Process(self.host, command, env=_environment(), label="rosrv up")

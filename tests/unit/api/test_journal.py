@@ -8,7 +8,7 @@ from appliance.channel.messages import RestCalled
 
 def answered(journal: Journal, **changes: Any) -> None:
     """One answer."""
-    fields = {
+    fields: dict[str, Any] = {
         "host": "h",
         "who": "w",
         "method": "GET",

@@ -22,7 +22,7 @@ def test_a_token_proves_itself_and_nothing_else_does() -> None:
 def test_what_is_kept_does_not_have_the_secret() -> None:
     """The row has only a hash, salted: the same name twice gives another."""
     row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
-    assert text.rpartition("_")[2] not in repr(row)
+    assert text.split("_", 2)[2] not in repr(row)
     again, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
     assert (row.salt, row.hash, row.id) != (again.salt, again.hash, again.id)
 

@@ -1,0 +1,102 @@
+"""Who reaches REST over the network: the firewall's rule for its port, in a container's namespace and in its own."""
+
+import http.client
+import ssl
+import subprocess
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.requirements import need_root
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """An Ethernet of our own."""
+    need_root()
+    with Lab("rosrv-rest") as lab:
+        yield lab
+
+
+def status(certificate: str, address: str, port: int) -> str:
+    """What `GET /healthz` says at an address, over TLS with only this certificate trusted."""
+    connection = http.client.HTTPSConnection(
+        address, port, timeout=5, context=ssl.create_default_context(cadata=certificate)
+    )
+    try:
+        connection.request("GET", "/healthz")
+        return str(connection.getresponse().status)
+    except OSError as error:
+        return type(error).__name__
+    finally:
+        connection.close()
+
+
+def certificate_of(appliance: Appliance, host: Host, port: int) -> str:
+    """The certificate that is served, once it is there."""
+    return host.run(partial(ssl.get_server_certificate, ("127.0.0.1", port), timeout=30))
+
+
+def test_only_the_networks_that_were_named_reach_it(lab: Lab, tmp_path: Path) -> None:
+    """Isolation container: a host of `api_networks` and the machine itself are answered, any other is refused."""
+    machine = lab.host("machine", "10.82.0.2/24")
+    manager, stranger = lab.host("manager", "10.82.0.10/24"), lab.host("stranger", "10.82.0.66/24")
+    config = tmp_path / "appliance.yaml"
+    config.write_text("api: 0.0.0.0:8443\napi_networks: [10.82.0.10/32]\n")
+    with Appliance(machine, isolation="container", options=("--config", str(config))) as appliance:
+        certificate = certificate_of(appliance, machine, 8443)
+        assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
+        assert stranger.run(partial(status, certificate, "10.82.0.2", 8443)) == "ConnectionRefusedError"
+        # The certificate is for the machine's own names; the manager reaches it and is told so.
+        assert manager.run(partial(status, certificate, "10.82.0.2", 8443)) == "SSLCertVerificationError"
+
+
+def test_an_address_that_is_given_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None:
+    """`--api ADDRESS:PORT`: who trusts the certificate is answered at that address."""
+    machine, manager = lab.host("machine", "10.82.0.2/24"), lab.host("manager", "10.82.0.10/24")
+    config = tmp_path / "appliance.yaml"
+    config.write_text("api_networks: [10.82.0.0/24]\n")
+    options = ("--config", str(config), "--api", "10.82.0.2:8443")
+    with Appliance(machine, isolation="container", options=options) as appliance:
+        assert appliance.ready["api"] == "https://10.82.0.2:8443"
+        served = manager.run(partial(ssl.get_server_certificate, ("10.82.0.2", 8443), timeout=30))
+        assert manager.run(partial(status, served, "10.82.0.2", 8443)) == "200"
+
+
+def test_in_a_namespace_of_its_own_the_machine_reaches_it(lab: Lab, tmp_path: Path) -> None:
+    """Isolation netns: REST answers on the machine's loopback, as it is printed; a stranger is refused."""
+    machine, stranger = lab.host("machine", "10.82.0.2/24"), lab.host("stranger", "10.82.0.66/24")
+    with Appliance(machine, isolation="netns", options=("--api", "127.0.0.1:8443")) as appliance:
+        assert appliance.ready["api"] == "https://127.0.0.1:8443"
+        certificate = certificate_of(appliance, machine, 8443)
+        assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
+        assert stranger.run(partial(status, certificate, "10.82.0.2", 8443)) in (
+            "ConnectionRefusedError", "TimeoutError",
+        )  # fmt: skip
+
+
+def test_a_port_that_is_taken_is_told(lab: Lab) -> None:
+    """Whoever asks for a port that another program has gets an error with its name, not another port."""
+    machine = lab.host("machine", "10.82.0.2/24")
+    program = (
+        "import socket; s = socket.create_server(('127.0.0.1', 8443)); print('here', flush=True); s.accept()"
+    )
+    other = machine.popen(["python3", "-c", program], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout is not None
+        other.stdout.readline()
+        appliance = Appliance(machine, isolation="container", options=("--api", "127.0.0.1:8443"))
+        try:
+            with pytest.raises(AssertionError, match=r"port 8443 .* is in use"):
+                appliance.start()
+        finally:
+            appliance.close()
+        with Appliance(machine, isolation="container") as elsewhere:
+            assert not elsewhere.ready["api"].endswith(":8443")
+    finally:
+        other.kill()
+        other.communicate()
