@@ -42,14 +42,15 @@ class RestLink:
         self._recorder = recorder
         self._channel: Channel | None = None
         self._waiting: deque[messages.RequestMade] = deque()
-        self._worker: asyncio.Task[None] | None = None
+        self._worker: asyncio.Task[None] | None = None  # of the present link
+        self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
         tokens.changed = self._state_tokens
 
     def attach(self, channel: Channel) -> None:
         """An api is there: serve it, and tell it the tokens."""
         if self._channel is not None:
             self._channel.close()
-        self._channel = channel
+        self._channel, self._worker = channel, None
         self._waiting.clear()
         channel.attach(
             asyncio.get_running_loop(),
@@ -73,6 +74,8 @@ class RestLink:
                 self._waiting.append(message)
                 if self._worker is None or self._worker.done():
                     self._worker = asyncio.get_running_loop().create_task(self._work(channel))
+                    self._workers.add(self._worker)
+                    self._worker.add_done_callback(self._workers.discard)
             case messages.RestCalled():
                 self._record(message)
             case _:

@@ -1,0 +1,249 @@
+"""Tests of `appliance.master.rest` over a real link, with stand-ins for what it administers."""
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from appliance.channel import messages
+from appliance.channel.admin import AdminAnswer, AnyRequest, PolicyLoad, StatusWanted
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import TokenKept
+from appliance.master.rest import RestLink
+
+TOKEN = TokenKept("0123456789ab", "alice", "viewer", b"s", b"h", 1e12)
+
+
+class Everything:
+    """Stands in for administration, tokens and recorder."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[AnyRequest, str]] = []
+        self.recorded: list[dict[str, Any]] = []
+        self.obstacle: str | None = None
+        self.changed: Callable[[], None] = lambda: None
+        self.ends: list[Channel] = []  # closed after the play
+        self.go = asyncio.Event()
+        self.go.set()
+
+    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer:
+        """Answer when told to."""
+        await self.go.wait()
+        self.asked.append((request, who))
+        if isinstance(request, PolicyLoad) and request.text == "defect":
+            raise RuntimeError("secret detail")
+        return AdminAnswer(True, {"number": len(self.asked)})
+
+    def usable(self) -> list[TokenKept]:
+        """One token."""
+        return [TOKEN]
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """Note a record."""
+        self.recorded.append({"event": event, "reason": reason, **fields})
+        return "id"
+
+
+class Api:
+    """The api's end of the link."""
+
+    def __init__(self, world: Everything, link: RestLink) -> None:
+        here, there = socket.socketpair()
+        self.raw = there
+        self.channel = Channel(there, messages.ApiLink)
+        control = Channel(here, messages.ApiLink)
+        world.ends += [self.channel, control]
+        self.heard: list[Any] = []
+        self.closed = asyncio.Event()
+        self._changed = asyncio.Event()
+        link.attach(control)
+        self.channel.attach(asyncio.get_running_loop(), self._received, self.closed.set)
+
+    def _received(self, message: Any, _descriptors: tuple[int, ...]) -> None:
+        self.heard.append(message)
+        self._changed.set()
+
+    async def until(self, count: int) -> list[Any]:
+        """What was heard, once it is so much."""
+        async with asyncio.timeout(20):
+            while len(self.heard) < count:
+                self._changed.clear()
+                await self._changed.wait()
+        return self.heard
+
+
+def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:
+    """Play one conversation."""
+
+    async def whole() -> None:
+        world = Everything()
+        link = RestLink(world, world, world)  # type: ignore[arg-type]  # stands in for all three
+        try:
+            await play(world, link)
+        finally:
+            for end in world.ends:
+                end.close()
+
+    asyncio.run(whole())
+
+
+def test_tokens_are_told_at_once_and_after_every_change() -> None:
+    """A new api knows them first of all; a change is told without being asked."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        assert await api.until(1) == [messages.TokensStated([TOKEN])]
+        world.changed()
+        assert len(await api.until(2)) == 2
+
+    run(play)
+
+
+def test_answers_bear_their_numbers_in_order() -> None:
+    """Requests are carried out one after the other, each on behalf of its token."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        for number in (7, 3, 9):
+            api.channel.send(messages.RequestMade(number, f"who{number}", StatusWanted()))
+        heard = await api.until(4)
+        assert [one.number for one in heard[1:]] == [7, 3, 9]
+        assert [one.answer.body["number"] for one in heard[1:]] == [1, 2, 3]
+        assert [who for _request, who in world.asked] == ["who7", "who3", "who9"]
+
+    run(play)
+
+
+def test_more_than_may_wait_are_told_so_at_once() -> None:
+    """A flood of requests is bounded: what is too much is answered busy while the others are served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.go.clear()
+        api = Api(world, link)
+        for number in range(200):
+            api.channel.send(messages.RequestMade(number, "w", StatusWanted()))
+        heard = await api.until(1 + 200 - 65)
+        assert {one.answer.trouble for one in heard[1:]} == {"busy"}
+        world.go.set()
+        heard = await api.until(201)
+        assert sum(one.answer.ok for one in heard[1:]) == len(world.asked) <= 65
+
+    run(play)
+
+
+def test_a_defect_is_one_answer() -> None:
+    """What fails inside tells nothing of itself, and the next request is served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        api.channel.send(messages.RequestMade(1, "w", PolicyLoad("defect")))
+        api.channel.send(messages.RequestMade(2, "w", StatusWanted()))
+        _tokens, failed, served = await api.until(3)
+        assert (failed.answer.ok, failed.answer.trouble) == (False, "failed")
+        assert "secret" not in failed.answer.error
+        assert served.answer.ok
+
+    run(play)
+
+
+def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
+    """With on_audit_failure deny a change is refused with the reason; looking is still possible."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.obstacle = "the audit log cannot be written: disk full"
+        api = Api(world, link)
+        api.channel.send(messages.RequestMade(1, "w", PolicyLoad("[Nodes]")))
+        api.channel.send(messages.RequestMade(2, "w", StatusWanted()))
+        _tokens, refused, served = await api.until(3)
+        assert (refused.answer.trouble, refused.answer.error) == ("failed", world.obstacle)
+        assert served.answer.ok
+        assert [request for request, _who in world.asked] == [StatusWanted()]
+
+    run(play)
+
+
+def test_what_is_not_of_the_link_ends_it() -> None:
+    """A request that makes a token, a message of another link and nonsense close it; another api is served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        token = {"message": "RequestMade", "number": 1, "who": "w", "request": {"verb": "token list"}}
+        for body in (
+            msgspec.msgpack.encode(token),
+            msgspec.msgpack.encode(messages.Stop()),
+            b"\xc1nonsense",
+            msgspec.msgpack.encode(messages.TokensStated([])),
+        ):
+            api = Api(world, link)
+            await api.until(1)
+            api.raw.sendall(len(body).to_bytes(4, "big") + body)
+            async with asyncio.timeout(20):
+                await api.closed.wait()
+        assert world.asked == []
+        api = Api(world, link)
+        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        assert (await api.until(2))[1].answer.ok
+
+    run(play)
+
+
+def test_the_next_api_does_not_wait_for_the_last_ones_request() -> None:
+    """An api that dies amid a request leaves none of its own behind, and its successor is served at once."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.go.clear()
+        first = Api(world, link)
+        for number in range(3):
+            first.channel.send(messages.RequestMade(number, "first", StatusWanted()))
+        await first.until(1)
+        first.channel.close()
+        second = Api(world, link)
+        second.channel.send(messages.RequestMade(9, "second", StatusWanted()))
+        await second.until(1)
+        world.go.set()
+        assert (await second.until(2))[1].number == 9
+        assert [who for _request, who in world.asked].count("first") <= 1
+
+    run(play)
+
+
+def test_an_api_that_does_not_read_loses_its_link() -> None:
+    """Answers that nobody takes are bounded."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        here, there = socket.socketpair()
+        control = Channel(here, messages.ApiLink, limit=100_000)
+        link.attach(control)
+        for _ in range(5000):
+            world.changed()
+        peer = Channel(there, messages.ApiLink)
+        world.ends += [control, peer]
+        heard = 0
+        async with asyncio.timeout(20):
+            while True:
+                try:
+                    heard += len(peer.receive())
+                except ChannelClosedError:
+                    break
+                await asyncio.sleep(0)
+        assert 0 < heard < 5000
+
+    run(play)
+
+
+def test_calls_are_recorded_with_their_outcome() -> None:
+    """Who was refused is a denial and a warning; who is nobody has no name; long texts are cut."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        api.channel.send(messages.RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
+        api.channel.send(messages.RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
+        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        await api.until(2)
+        served, refused = world.recorded
+        assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
+        assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
+        assert len(refused["resource"]) <= 300
+
+    run(play)
