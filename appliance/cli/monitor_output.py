@@ -32,8 +32,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
         {"index": index, "topic": topic} if topic is not None else {"timer": outcome.timer}
     )
     head["time"] = outcome.time / BILLION
-    if topic is not None:
-        head["outcome"] = outcome.result
+    head["outcome"] = outcome.result
     return head | {
         "events": list(outcome.events),
         "verdicts": [

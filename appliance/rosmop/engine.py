@@ -160,11 +160,17 @@ class MonitorSet:
         return following, outcome
 
     def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
-        """Let the events of a monitor happen, or not; raises KeyError."""
+        """Let the events of a monitor happen, or not; raises KeyError.
+
+        Time that passed meanwhile does not count: timers and properties with time bounds begin anew.
+        """
         monitor = self.monitor(name)
         if enabled and not monitor.enabled:
             for timer in monitor.timers:
                 timer.due = time_ns + timer.period
+            for running in monitor.properties:
+                if running.code.property.timed:
+                    running.run = running.code.property.start(time_ns)
         monitor.enabled = enabled
         self._index()
         self._schedule()

@@ -186,7 +186,7 @@ def test_a_recording_goes_through_the_monitors(tmp_path: Path) -> None:
          "log": [{"level": "INFO", "text": "1", "monitor": "counter"}]},
         {"index": 1, "topic": "/t", "time": 100.5, "outcome": "dropped", "events": ["counter.e"], **empty},
         {"index": 2, "topic": "/other", "time": 100.75, "outcome": "passed", "events": [], **empty},
-        {"timer": "counter.tick", "time": 101.25, "events": ["counter.tick"], **empty,
+        {"timer": "counter.tick", "time": 101.25, "outcome": "passed", "events": ["counter.tick"], **empty,
          "verdicts": [{"monitor": "counter", "property": 0, "logic": "ere", "category": "match"}],
          "log": [{"level": "WARN", "text": "tick", "monitor": "counter"}]},
         {"index": 3, "topic": "/t", "time": 101.5, "outcome": "changed", "events": ["counter.e"], **empty,

@@ -518,3 +518,13 @@ BAD_NAMES = [
 def test_a_name_that_cannot_be(text: str, reason: str) -> None:
     """Names that clash or are unknown are refused."""
     assert any(reason in finding.text for finding in refused(text))
+
+
+def test_time_does_not_pass_for_a_disabled_monitor() -> None:
+    """A deadline that passed while it was disabled is not told; time bounds begin anew."""
+    monitors = load("a() {" + on("/t") + TIMED + "}")
+    monitors.process("/t", number(0), SECOND)
+    monitors.set_enabled("a", False, 2 * SECOND)
+    assert monitors.advance(10 * SECOND) == []
+    monitors.set_enabled("a", True, 10 * SECOND)
+    assert monitors.process("/t", number(0), 11 * SECOND).before == ()

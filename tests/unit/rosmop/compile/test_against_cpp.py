@@ -1,0 +1,84 @@
+"""Random expressions and assignments give what a C++ compiler makes of the same text.
+
+The compiler is told that integers wrap. What C++ leaves undefined besides is kept out of the examples: shifts by
+more than the width, conversions out of range, division by zero.
+"""
+
+import subprocess
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.support.requirements import need_program
+from tests.unit.rosmop.acting import act
+
+TYPES = (
+    "int8_t", "uint8_t", "int16_t", "uint16_t", "int", "unsigned int", "long", "unsigned long", "float", "double",
+    "bool", "char",
+)  # fmt: skip
+NAMES = tuple(f"a{index}" for index in range(len(TYPES)))
+LITERALS = (
+    "0", "1", "2", "7", "-1", "100", "255", "32767", "65536", "2147483647", "-2147483647", "3000000000", "1u",
+    "4294967295u", "5L", "1.5", "-2.25", "0.5f", "1e3", "'a'", "true", "false",
+)  # fmt: skip
+FUNCTIONS = """
+int ii(double d) { return d > 2e9 ? 5 : d < -2e9 ? -5 : d != d ? 0 : (int) d; }
+unsigned int uu(double d) { return d > 4e9 || !(d > 0) ? 9u : (unsigned int) d; }
+"""
+HEADERS = (
+    "#include <algorithm>\n#include <cmath>\n#include <cstdint>\n#include <cstdio>\nusing std::printf;\n"
+)
+
+
+def expression(random: Random, depth: int) -> str:
+    """A random expression over the variables."""
+    if depth == 0 or random.random() < 0.15:
+        return random.choice((random.choice(NAMES), random.choice(LITERALS)))
+    a, b, c = (expression(random, depth - 1) for _ in range(3))
+    sign = random.choice
+    forms = (
+        f"({a} {sign('+-*')} {b})",
+        f"({a} {sign('+-*')} {b})",
+        f"({a} {sign(('<', '>', '<=', '>=', '==', '!='))} {b})",
+        f"({a} {sign(('&&', '||'))} {b})",
+        f"({a} ? {b} : {c})",
+        f"(ii({a}) {sign('&|^')} uu({b}))",
+        f"(ii({a}) {sign(('<<', '>>'))} (ii({b}) & 31))",
+        f"(ii({a}) {sign('/%')} (ii({b}) | 1))",
+        f"({a} / (double) ((ii({b}) & 7) + 1))",
+        f"{sign('-!+')}({a})",
+        f"~ii({a})",
+        f"std::{sign(('min', 'max'))}((double) {a}, (double) {b})",
+    )
+    return random.choice(forms)
+
+
+def program(random: Random) -> str:
+    """Declarations, expressions that are printed, and assignments after which the variable is printed."""
+    first = ("3", "-5", "120", "0", "1", "77", "-128", "1000000")
+    lines = [f"{kind} {name} = {random.choice(first)};" for kind, name in zip(TYPES, NAMES, strict=True)]
+    lines += [f'printf("%.9g\\n", (double) ({expression(random, 4)}));' for _ in range(60)]
+    for _ in range(40):
+        name, value = random.choice(NAMES), expression(random, 2)
+        exact = TYPES[NAMES.index(name)] in ("float", "double", "bool")
+        operator = random.choice(("=", "+=", "-=", "*="))
+        lines.append(f"{name} {operator} {value if exact else f'ii({value})'};")
+        lines.append(f'printf("%.9g\\n", (double) {name});')
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_language_agrees_with_a_compiler(seed: int, tmp_path: Path) -> None:
+    """A hundred values of each random program are the compiler's."""
+    compiler = need_program("g++", "g++")
+    body = program(Random(seed))  # noqa: S311  draws examples, not keys
+    source = tmp_path / "program.cpp"
+    source.write_text(f"{HEADERS}{FUNCTIONS}int main() {{\n{body}\n}}\n")
+    subprocess.run(
+        [compiler, "-w", "-fwrapv", "-O0", "-o", str(tmp_path / "program"), str(source)], check=True
+    )
+    expected = subprocess.run([str(tmp_path / "program")], check=True, capture_output=True, text=True).stdout
+    outcome = act(body, before=FUNCTIONS)
+    assert not outcome.faults
+    assert [line.text for line in outcome.log] == expected.replace("-nan", "nan").split()
