@@ -1,0 +1,35 @@
+"""An actionlib client of actionlib/Test: one goal that is reached, one that is cancelled."""
+
+import sys
+import threading
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
+
+import actionlib
+import rospy
+from actionlib.msg import TestAction, TestGoal
+from report import report
+
+
+def main():
+    """Ask, report, end."""
+    rospy.init_node("action_client")
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    client = actionlib.SimpleActionClient("count", TestAction)
+    client.wait_for_server()
+    feedback = []
+    client.send_goal_and_wait(TestGoal(goal=5))
+    report("reached", result=client.get_result().result, state=client.get_state())
+    begun = threading.Event()
+    client.send_goal(
+        TestGoal(goal=100000), feedback_cb=lambda given: (feedback.append(given.feedback), begun.set())
+    )
+    begun.wait(30)
+    client.cancel_goal()
+    client.wait_for_result()
+    report("cancelled", state=client.get_state(), feedback=len(feedback))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""An actionlib server of actionlib/Test: counts to the goal with feedback, and can be cancelled in between."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
+
+import actionlib
+import rospy
+from actionlib.msg import TestAction, TestFeedback, TestResult
+from report import report
+
+
+def main():
+    """Serve until told to end; a goal over 100 goes on until it is cancelled."""
+    rospy.init_node("action_server")
+
+    def work(goal):
+        for number in range(goal.goal):
+            if server.is_preempt_requested() or rospy.is_shutdown():
+                server.set_preempted(TestResult(result=number))
+                return
+            server.publish_feedback(TestFeedback(feedback=number))
+            rospy.sleep(0.02)
+        server.set_succeeded(TestResult(result=goal.goal))
+
+    server = actionlib.SimpleActionServer("count", TestAction, work, auto_start=False)
+    server.start()
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    rospy.spin()
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()

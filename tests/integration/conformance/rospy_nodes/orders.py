@@ -1,0 +1,76 @@
+"""A rospy node that works with topics as told on standard input, one JSON object per line.
+
+{"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish", "topic": T, "text": X, "latch": B},
+{"do": "now"} (the time it believes), {"do": "log", "text": X} (to rosout); events `done`, `received`, `connected`.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
+
+import rospy
+from report import report
+from std_msgs.msg import String
+
+
+class Orders:
+    """What it subscribed to and publishes."""
+
+    def __init__(self):
+        self.subscribers, self.publishers = {}, {}
+
+    def subscribe(self, told):
+        """Report every message with the node it is from."""
+
+        def heard(message):
+            report(
+                "received",
+                topic=told["topic"],
+                data=message.data,
+                publisher=message._connection_header["callerid"],
+            )
+
+        self.subscribers[told["topic"]] = rospy.Subscriber(told["topic"], String, heard)
+
+    def unsubscribe(self, told):
+        """Stop listening."""
+        self.subscribers.pop(told["topic"]).unregister()
+
+    def advertise(self, told):
+        """Become a publisher."""
+        self.publishers[told["topic"]] = rospy.Publisher(
+            told["topic"], String, queue_size=100, latch=told.get("latch", False)
+        )
+
+    def unadvertise(self, told):
+        """Stop publishing."""
+        self.publishers.pop(told["topic"]).unregister()
+
+    def publish(self, told):
+        """Send one message."""
+        self.publishers[told["topic"]].publish(told["text"])
+
+    def log(self, told):
+        """Tell rosout."""
+        rospy.logwarn(told["text"])
+
+
+def main():
+    """Do what each line says."""
+    rospy.init_node("orders")
+    orders = Orders()
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    for line in sys.stdin:
+        told = json.loads(line)
+        if told["do"] == "now":
+            report("done", do="now", seconds=rospy.Time.now().to_sec())
+            continue
+        getattr(orders, told["do"])(told)
+        report("done", do=told["do"], topic=told.get("topic"))
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()

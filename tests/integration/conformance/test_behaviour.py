@@ -1,0 +1,280 @@
+"""What robots do beyond talking and listening works behind the appliance as behind a plain master."""
+
+import itertools
+import signal
+import time
+from pathlib import Path
+from typing import Any
+from xmlrpc.client import ServerProxy
+
+import pytest
+import yaml
+
+from tests.integration.conformance.conftest import LocalSite
+from tests.integration.conformance.fake_nodes import FakeNodes
+from tests.integration.conformance.nodes import order, roscpp_node, rospy_node
+from tests.support.nodes import HERE, PYTHON, Client, RosSession, roscpp_program
+from tests.support.processes import Process
+
+CLIENTS: list[Client] = ["rospy", "roscpp"]
+TOPIC_TOOLS = "/usr/lib/topic_tools"
+
+
+def texts(node: Process) -> list[str]:
+    """The messages a node received, in order."""
+    return [event["data"] for event in node.seen(event="received")]
+
+
+@pytest.mark.parametrize("other", CLIENTS)
+def test_own_topic_rospy(ros: RosSession, other: Client) -> None:
+    """A rospy node that publishes and subscribes one topic hears itself once, the other, and is heard."""
+    node = rospy_node(ros, "orders", "loop")
+    order(node, "subscribe", topic="/loop")
+    order(node, "advertise", topic="/loop")
+    ros.talker(other, "/loop", "--text", "other", name="other")
+    ear = ros.listener(other, "/loop")
+    node.wait_for(event="received", publisher="/other")
+    order(node, "publish", topic="/loop", text="first")  # its connection to itself may still be made
+    for number in itertools.count():
+        order(node, "publish", topic="/loop", text=f"mine {number}")
+        if "/loop" in {event["publisher"] for event in ear.seen(event="received")} & {
+            event["publisher"] for event in node.seen(event="received")
+        }:
+            break
+        ear.wait_for(event="received", since=ear.mark())
+    order(node, "publish", topic="/loop", text="last")
+    for heard in (node, ear):
+        heard.wait_for(event="received", data="last", publisher="/loop")
+    own = [event["data"] for event in node.seen(event="received", publisher="/loop")]
+    assert len(own) == len(set(own)), "its own messages come once each"
+
+
+@pytest.mark.parametrize("other", CLIENTS)
+def test_own_topic_roscpp(ros: RosSession, other: Client) -> None:
+    """The same of a roscpp node, which hears itself inside its process."""
+    node = roscpp_node(ros, "loop", "loop", "/loop")
+    ros.talker(other, "/loop", "--text", "other", name="other")
+    ear = ros.listener(other, "/loop")
+    ear.wait_for(event="received", publisher="/loop")
+    node.wait_for(event="received", publisher="/other")
+    node.wait_for_count(5, event="received", publisher="/loop")
+    own = [event["data"] for event in node.seen(event="received", publisher="/loop")]
+    assert len(own) == len(set(own)), "its own messages come once each"
+
+
+def test_dynamic_subscriptions(ros: RosSession) -> None:
+    """A node that subscribes, unsubscribes and subscribes again, or stops publishing and begins again, is served."""
+    node, talker = rospy_node(ros, "orders", "dynamic"), rospy_node(ros, "orders", "source")
+    order(talker, "advertise", topic="/d", latch=True)
+    for number in range(5):
+        order(talker, "publish", topic="/d", text=f"round {number}")
+        order(node, "subscribe", topic="/d")
+        node.wait_for(event="received", data=f"round {number}")
+        order(node, "unsubscribe", topic="/d")
+    order(node, "subscribe", topic="/d")
+    for number in range(5):
+        order(talker, "unadvertise", topic="/d")
+        order(talker, "advertise", topic="/d", latch=True)
+        order(talker, "publish", topic="/d", text=f"again {number}")
+        node.wait_for(event="received", data=f"again {number}")
+
+
+@pytest.mark.parametrize("by", CLIENTS)
+def test_publisher_restarted_again_and_again(ros: RosSession, by: Client) -> None:
+    """Subscribers that stay hear a publisher that is killed or stopped, and started under its name, each time."""
+    ears = [ros.listener(to, "/chatter") for to in CLIENTS]
+    for number in range(20 if by == "roscpp" else 6):  # a rospy node takes a second to end
+        voice = ros.talker(by, "/chatter", "--text", f"life {number}", name="voice")
+        for ear in ears:
+            ear.wait_for(lambda event, number=number: event.get("data", "").startswith(f"life {number} "))  # type: ignore[misc]
+        if number % 2:
+            voice.kill()
+        else:
+            voice.stop()
+
+
+def test_killed_node_is_replaced(ros: RosSession) -> None:
+    """A node killed without a word can be started again under its name at once; its service answers again."""
+    ros.service_server("roscpp", "/negate", name="server").kill()
+    ros.service_server("rospy", "/negate", name="server")
+    asker = ros.service_client("roscpp", "/negate")
+    asker.send("true")
+    assert asker.wait_for(event="answered")["success"] is False
+    ros.listener("rospy", "/chatter", name="ear").kill()
+    ear = ros.listener("roscpp", "/chatter", name="ear")
+    ros.talker("rospy", "/chatter")
+    ear.wait_for(event="received")
+
+
+def test_actions(ros: RosSession) -> None:
+    """actionlib: a goal is reached, another cancelled."""
+    rospy_node(ros, "action_server", "counter")
+    client = rospy_node(ros, "action_client", "asker")
+    assert client.wait_for(event="reached")["result"] == 5
+    cancelled = client.wait_for(event="cancelled")
+    assert (cancelled["state"], cancelled["feedback"] > 0) == (2, True)  # PREEMPTED
+    assert client.wait() == 0
+
+
+def test_simulated_time(ros: RosSession) -> None:
+    """With /use_sim_time a node's clock is what comes on /clock."""
+    ros.run("rosparam", "set", "/use_sim_time", "true")
+    try:
+        node = rospy_node(ros, "orders", "dreamer")
+        assert order(node, "now")["seconds"] == 0
+        ros.start(["rostopic", "pub", "-r", "20", "/clock", "rosgraph_msgs/Clock", "clock: {secs: 1234}"])
+        deadline = time.monotonic() + 30
+        while order(node, "now")["seconds"] != 1234:
+            assert time.monotonic() < deadline, ros.story()
+    finally:
+        ros.run("rosparam", "delete", "/use_sim_time")
+
+
+def test_rosout_is_aggregated(ros: RosSession) -> None:
+    """What nodes log comes on /rosout_agg."""
+    agg = ros.start(["rostopic", "echo", "/rosout_agg/msg"])
+    nodes = [rospy_node(ros, "orders", f"logger_{number}") for number in range(3)]
+    deadline = time.monotonic() + 30
+    for number, node in enumerate(nodes):
+        # The aggregator, and its echo, may only just be connecting.
+        while not any(f"word of {number}" in event.get("text", "") for event in agg.seen()):
+            order(node, "log", text=f"word of {number}")
+            assert time.monotonic() < deadline, ros.story()
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_topic_tools(ros: RosSession, client: Client) -> None:
+    """relay, throttle and mux, which publish and subscribe whatever type comes, work on one input together."""
+    ros.start([f"{TOPIC_TOOLS}/relay", "/in_a", "/out"])
+    ros.start([f"{TOPIC_TOOLS}/throttle", "messages", "/in_a", "2", "/slow"])
+    ros.start([f"{TOPIC_TOOLS}/mux", "/sel", "/in_a", "/in_b", "mux:=the_mux"])
+    out, slow, sel = (ros.listener(client, topic) for topic in ("/out", "/slow", "/sel"))
+    ros.talker(client, "/in_a", "--text", "a", name="a")
+    ros.talker(client, "/in_b", "--text", "b", name="b")
+    out.wait_for(event="received")
+    slow.wait_for_count(2, event="received")
+    sel.wait_for(lambda event: event.get("data", "").startswith("a "))
+    assert not any(text.startswith("b ") for text in texts(sel))
+    assert ros.run("rosservice", "type", "/the_mux/select").stdout.strip() == "topic_tools/MuxSelect"
+    assert len(texts(slow)) < len(texts(out))
+
+
+def test_anonymous_and_remapped_names(ros: RosSession) -> None:
+    """Two anonymous publishers live side by side; a private name is the node's own."""
+    ear = rospy_node(ros, "orders", "ear")
+    order(ear, "subscribe", topic="~inbox")
+    pubs = [
+        ros.start(["rostopic", "pub", "-r", "10", "/ear/inbox", "std_msgs/String", f"data: from {number}"])
+        for number in range(2)
+    ]
+    for number in range(2):
+        ear.wait_for(event="received", data=f"from {number}")
+    assert len({event["publisher"] for event in ear.seen(event="received")}) == 2
+    pubs[0].stop()
+    ear.wait_for(event="received", data="from 1", since=ear.mark())
+
+
+def test_wrong_type_is_not_connected(ros: RosSession) -> None:
+    """A subscriber of another type gets nothing and lives; one of the right type is served beside it."""
+    ros.talker("roscpp", "/typed")
+    wrong = ros.start(["rostopic", "pub", "-r", "10", "/typed", "std_msgs/Bool", "true"])
+    ear = ros.listener("rospy", "/typed")
+    ear.wait_for_count(3, event="received")
+    assert wrong.running
+
+
+LAUNCH = """\
+<launch>
+  <arg name="text" default="from the launch file"/>
+  <param name="/configured/by" value="roslaunch"/>
+  <rosparam ns="configured">{{limits: {{left: 1.5, right: [1, 2]}}, names: [a, b]}}</rosparam>
+  <group ns="left">
+    <node pkg="robot" type="rospy_talker" name="voice" args="chatter --text '$(arg text)'" respawn="true"/>
+    <remap from="chatter" to="/left/chatter"/>
+    <node pkg="robot" type="roscpp_listener" name="ear" args="chatter" output="screen"/>
+  </group>
+  <node pkg="robot" type="roscpp_talker" name="voice" args="chatter --text outside"/>
+  <node pkg="robot" type="rospy_listener" name="$(anon ear)" args="heard" output="screen">
+    <remap from="heard" to="chatter"/>
+  </node>
+</launch>
+"""
+
+
+def robot_package(workspace: Path) -> Path:
+    """A package `robot` with talkers and listeners of both client libraries, and a launch file: its path."""
+    package = workspace / "robot"
+    package.mkdir(parents=True)
+    (package / "package.xml").write_text(
+        '<package format="2"><name>robot</name><version>1.0.0</version><description>Nodes</description>'
+        '<maintainer email="nobody@example.org">Nobody</maintainer><license>Apache-2.0</license></package>'
+    )
+    for program in ("talker", "listener"):
+        (package / f"roscpp_{program}").symlink_to(roscpp_program(program))
+        script = package / f"rospy_{program}"
+        script.write_text(f'#!/bin/sh\nexec {PYTHON} {HERE}/rospy_nodes/{program}.py "$@"\n')
+        script.chmod(0o755)
+    launch = package / "robot.launch"
+    launch.write_text(LAUNCH.replace("{{", "{").replace("}}", "}"))
+    return launch
+
+
+def test_launch_file(ros: RosSession, tmp_path: Path) -> None:
+    """roslaunch: arguments, parameters, namespaces, remappings, anonymous names, respawn, and an orderly end."""
+    file = robot_package(tmp_path / "workspace")
+    launch = ros.start(
+        ["roslaunch", "--wait", str(file), "text:=told"], ROS_PACKAGE_PATH=str(tmp_path / "workspace")
+    )
+    launch.wait_for(lambda event: event.get("data", "").startswith("told "), publisher="/left/voice")
+    launch.wait_for(lambda event: event.get("data", "").startswith("outside "), publisher="/voice")
+    assert yaml.safe_load(ros.run("rosparam", "get", "/configured").stdout) == {
+        "by": "roslaunch",
+        "limits": {"left": 1.5, "right": [1, 2]},
+        "names": ["a", "b"],
+    }
+    nodes = ros.run("rosnode", "list").stdout.split()
+    assert {"/left/voice", "/left/ear", "/voice", "/rosout"} <= set(nodes)
+    assert any(name.startswith("/ear_") for name in nodes)
+    assert "killed" in ros.run("rosnode", "kill", "/left/voice").stdout
+    launch.wait_for(publisher="/left/voice", event="received", since=launch.mark())
+    launch.stop(with_signal=signal.SIGINT, timeout=30)
+    assert ros.run("rosnode", "list").stdout.split() == ["/rosout"]
+    ros.run("rosparam", "delete", "/configured")
+
+
+def test_hundred_nodes_of_ten_topics(local: LocalSite) -> None:
+    """100 nodes that publish and subscribe 10 topics each, as fast as they can: all are there, in order."""
+    with FakeNodes() as nodes, ServerProxy(local.master_uri) as server:
+        master: Any = server
+        start = time.monotonic()
+        for node in range(100):
+            uri = nodes.uri(f"n{node}")
+            for topic in range(10):
+                for method, name in (
+                    ("registerPublisher", f"/n{node}/t{topic}"),
+                    ("registerSubscriber", f"/n{(node + 1) % 100}/t{topic}"),
+                ):
+                    answer = getattr(master, method)(f"/n{node}", name, "std_msgs/String", uri)
+                    assert answer[0] == 1, answer
+        print(f"{local.mode}: 2000 registrations in {time.monotonic() - start:.2f} s")  # noqa: T201
+        publishers, subscribers, _services = master.getSystemState("/test")[2]
+        wanted = [f"/n{node}/t{topic}" for node in range(100) for topic in range(10)]
+        assert [name for name, _nodes in publishers if name.startswith("/n")] == wanted
+        assert sorted(name for name, _nodes in subscribers if name.startswith("/n")) == sorted(wanted)
+        assert nodes.wait_until(lambda: len(_told(nodes)) == 1000), "every subscriber is told its publisher"
+        parts = [
+            {
+                "methodName": method,
+                "params": [f"/n{node}", f"/n{(node + one) % 100}/t{topic}", nodes.uri(f"n{node}")],
+            }
+            for node in range(100)
+            for topic in range(10)
+            for method, one in (("unregisterPublisher", 0), ("unregisterSubscriber", 1))
+        ]
+        assert all(answer[0][0] == 1 for answer in master.system.multicall(parts))
+
+
+def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
+    """Which subscriber has, at some time, been told a publisher of which topic (or learnt it when it registered)."""
+    told = {(call.node, call.params[1]) for call in nodes.all_calls() if call.method == "publisherUpdate"}
+    return told | {("n99", f"/n0/t{topic}") for topic in range(10)}
