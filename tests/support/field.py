@@ -133,9 +133,9 @@ class Field:
             assert rule in answer[1], answer
         return record
 
-    def recorded(self, **fields: Any) -> Event:
-        """The first record with these fields, once it is there."""
-        return self.trail.wait_for(**fields)
+    def recorded(self, reason: str = "", **fields: Any) -> Event:
+        """The first record with these fields, and this in its reason, once it is there."""
+        return self.trail.wait_for(lambda event: reason in (event.get("reason") or ""), **fields)
 
     def unharmed(self, messages: int = 3) -> None:
         """Talker and listener go on: every message arrives, once, in order, and from the talker."""

@@ -1,0 +1,280 @@
+"""Floods from another host: connections, calls, registrations, names, grants, values. The others hardly notice.
+
+The rogue may do everything the policy can grant, so what protects the others is the appliance, not a rule.
+"""
+
+import contextlib
+import socket
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tests.support.field import Field, Impostor, answering, whole
+from tests.support.processes import LIMIT
+
+POLICY = """\
+[Nodes]
+default = *
+[Publishers]
+default = *
+[Subscribers]
+default = *
+[Commands]
+default = *
+"""
+HOST = "10.77.0.66"
+SLOW = 2.0  # seconds for one call of the victim's in a flood, on a machine with two busy cores
+GROWTH = 160 << 20  # bytes that control may grow by under attack: buffers within their limits
+
+
+def request(method: str, *parameters: object) -> bytes:
+    """A call as bytes."""
+    body = xmlrpc.client.dumps(parameters, method).encode()
+    return b"POST / HTTP/1.1\r\nHost: m\r\nContent-Length: %d\r\n\r\n" % len(body) + body
+
+
+class Flood:
+    """Threads that do something over and over until the block ends."""
+
+    def __init__(self, field: Field, threads: int, act: Callable[[int, int], None]) -> None:
+        self._over = threading.Event()
+        self.count = 0
+        self._threads = [
+            threading.Thread(target=field.attacker.run, args=(lambda number=number: self._run(act, number),))
+            for number in range(threads)
+        ]
+
+    def _run(self, act: Callable[[int, int], None], number: int) -> None:
+        turn = 0
+        while not self._over.is_set():
+            with contextlib.suppress(OSError, xmlrpc.client.Error):
+                act(number, turn)
+            self.count += 1
+            turn += 1
+
+    def __enter__(self) -> "Flood":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join(LIMIT)
+
+
+def bystander(field: Field, calls: int = 30) -> float:
+    """The slowest of some calls of a victim's: to RVMaster, on a connection each, and to a node's face."""
+    slowest = 0.0
+    face = field.call(field.robot, "lookupNode", "/looker", "/voice")[2]
+    for number in range(calls):
+        begun = time.monotonic()
+        if number % 2:
+            assert field.call(field.robot, "getParam", "/looker", "/rosdistro")[0] == 1
+        else:
+            assert field.call(field.robot, "getName", "/looker", uri=face)[2] == "/voice"
+        slowest = max(slowest, time.monotonic() - begun)
+    return slowest
+
+
+@pytest.fixture
+def calm(field: Field) -> Iterator[Field]:
+    """Memory of control and relay stays where it was, and nodes can still come."""
+    before = {role: field.memory(role) for role in ("control", "relay")}
+    pids = {role: field.appliance.pids(role) for role in ("control", "relay", "rosmaster")}
+    yield field
+    assert {role: field.appliance.pids(role) for role in pids} == pids, "a process was restarted"
+    for role, size in before.items():
+        assert field.memory(role) < size + GROWTH, f"{role} grew by {(field.memory(role) - size) >> 20} MiB"
+    field.ros.on(field.ocu).listener("rospy", "/chatter").wait_for(event="received")
+
+
+def test_connections(calm: Field) -> None:
+    """A host has its share of connections; more are cut, and another host gets in at once."""
+    held: list[socket.socket] = []
+    with contextlib.suppress(OSError):
+        for _ in range(700):
+            held.append(calm.attacker.run(lambda: socket.create_connection(("10.77.0.2", 11311), 1)))
+    record = calm.recorded(event="limit exceeded", host=HOST)
+    assert "connections open, the limit for one host" in record["reason"]
+    assert bystander(calm) < SLOW
+    for one in held:
+        one.close()
+
+
+def test_calls(calm: Field) -> None:
+    """Calls as fast as a host can make them, on connections that stay."""
+    data = request("getSystemState", "/flooder")
+
+    def act(_number: int, _turn: int) -> None:
+        with calm.connect() as sock:
+            for _ in range(100):
+                sock.sendall(data)
+                received = b""
+                while not whole(received):
+                    received += sock.recv(65536)
+
+    with Flood(calm, 16, act) as flood:
+        assert bystander(calm) < SLOW
+        calm.unharmed(50)
+    assert flood.count > 0
+
+
+def test_calls_that_are_not_awaited(calm: Field) -> None:
+    """Requests without reading the answers, on many connections: bounded, and cut off in the end."""
+    data = request("getParam", "/flooder", "/") * 200
+    held = [calm.connect() for _ in range(100)]
+    for one in held:
+        one.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                one.send(data)
+    assert bystander(calm) < SLOW
+    for one in held:
+        one.close()
+
+
+def test_connections_that_come_and_go(calm: Field) -> None:
+    """A request, and gone before it is answered, again and again."""
+    data = request("getSystemState", "/flooder")
+
+    def act(_number: int, _turn: int) -> None:
+        with calm.connect() as sock:
+            sock.sendall(data)
+
+    with Flood(calm, 8, act):
+        assert bystander(calm) < SLOW
+        calm.unharmed(50)
+
+
+def test_bodies_that_never_end(calm: Field) -> None:
+    """Many large bodies, each almost whole: bounded per host, whatever their number."""
+    beginning = b"POST / HTTP/1.1\r\nContent-Length: 16000000\r\n\r\n" + b"x" * 15_000_000
+    held = []
+    for _ in range(20):
+        sock = calm.connect()
+        held.append(sock)
+        sock.settimeout(2)
+        with contextlib.suppress(OSError):
+            sock.sendall(beginning)
+    record = calm.recorded("bytes in requests and answers", host=HOST)
+    assert record["decision"] == "deny"
+    assert bystander(calm) < SLOW
+    for one in held:
+        one.close()
+
+
+def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
+    """Requests that each take seconds, because the rogue's own node is asked, do not take everybody's slots."""
+    silence = threading.Event()
+    with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
+        answer = calm.rogue("registerPublisher", "/black_hole", "/hole", "std_msgs/String", node.uri)
+        assert answer[0] == 1
+        face = calm.rogue("lookupNode", "/looker", "/black_hole")[2]
+        port = int(face.rsplit(":", 1)[1].rstrip("/"))
+        data = request("getPid", "/asker")
+        held = [calm.connect(port=port) for _ in range(200)]
+        for one in held:
+            one.sendall(data)
+        assert node.called.wait(LIMIT)
+        assert bystander(calm) < SLOW
+        calm.unharmed(50)
+        for one in held:
+            one.close()
+        silence.set()
+
+
+def test_values_for_a_node_that_never_answers(calm: Field) -> None:
+    """Updates of a large parameter for a node that takes none do not pile up in memory."""
+    silence = threading.Event()
+    with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
+        assert calm.rogue("subscribeParam", "/hoarder", node.uri, "/hoard")[0] == 1
+        for number in range(60):
+            assert calm.rogue("setParam", "/setter", "/hoard", {"k": "x" * 7_000_000, "n": number})[0] == 1
+        assert bystander(calm) < SLOW
+        silence.set()
+    assert calm.rogue("deleteParam", "/setter", "/hoard")[0] == 1
+
+
+def test_registrations(calm: Field) -> None:
+    """Nodes and topics of one host have a limit (the rogue is at it from here on); others still get ports and names."""
+    refused = []
+
+    def act(number: int, turn: int) -> None:
+        name = f"/many_{number}_{turn}"
+        with xmlrpc.client.ServerProxy(calm.master) as server:
+            answer = server.registerPublisher(
+                name, f"/t{name[1:]}", "std_msgs/String", f"http://{HOST}:{40000 + turn}/"
+            )
+        if answer[0] != 1:
+            refused.append(answer)  # type: ignore[arg-type]  # the stubs do not know lists
+
+    with Flood(calm, 4, act):
+        deadline = time.monotonic() + LIMIT
+        while not refused and time.monotonic() < deadline:
+            bystander(calm, 4)
+    assert refused, "no limit was reached"
+    calm.denied(refused[0], "500 nodes, the limit for one host")
+    calm.ros.talker("rospy", "/new_topic", name="newcomer")
+    calm.ros.on(calm.ocu).listener("rospy", "/new_topic", name="new_ear").wait_for(event="received")
+
+
+def test_registrations_of_one_node(calm: Field) -> None:
+    """Topics of one node count as well."""
+    answer = [1]
+    with Impostor(calm.stranger, answering([1, "", 0])) as node:
+        for number in range(60):
+            parts = [
+                {
+                    "methodName": "registerPublisher",
+                    "params": ["/one", f"/topics/t{number}_{inner}", "std_msgs/String", node.uri],
+                }
+                for inner in range(100)
+            ]
+            answer = calm.call(calm.stranger, "system.multicall", parts)[-1][0]
+            if answer[0] != 1:
+                break
+    assert "5000 registrations, the limit for one host" in answer[1]
+
+
+def test_names_asked_for(calm: Field) -> None:
+    """Ever new names in reading calls and requests for topics leave nothing behind that grows."""
+    face = calm.rogue("lookupNode", "/looker", "/voice")[2]
+
+    def act(number: int, turn: int) -> None:
+        with xmlrpc.client.ServerProxy(face) as node:
+            for inner in range(50):
+                node.requestTopic(f"/asker_{number}_{turn}_{inner}", "/chatter", [["TCPROS"]])
+        with xmlrpc.client.ServerProxy(calm.master) as server:
+            for inner in range(50):
+                server.lookupNode(f"/asker_{number}_{turn}_{inner}", f"/nobody_{number}_{turn}_{inner}")
+
+    with Flood(calm, 4, act):
+        calm.unharmed(200)
+        assert bystander(calm) < SLOW
+
+
+def test_denials(calm: Field) -> None:
+    """Thousands of refusals are a few records with counts, not thousands of records."""
+    parts = [{"methodName": f"noSuch{number}", "params": ["/denied"]} for number in range(5000)]
+    calm.rogue("system.multicall", parts)
+    calm.recorded(event="denials folded", host=HOST)
+    written = [event for event in calm.trail.seen(host=HOST, decision="deny") if "noSuch" in event["reason"]]
+    assert len(written) < 1000
+    assert bystander(calm) < SLOW
+
+
+def test_relay_ports(calm: Field) -> None:
+    """Connections to a relay port that never say what they want do not keep subscribers away."""
+    face = calm.rogue("lookupNode", "/looker", "/voice")[2]
+    port = calm.rogue("requestTopic", "/knocker", "/chatter", [["TCPROS"]], uri=face)[2][2]
+    held = []
+    with contextlib.suppress(OSError):
+        for _ in range(600):
+            held.append(calm.attacker.run(lambda: socket.create_connection(("10.77.0.2", port), 1)))
+    calm.ros.on(calm.ocu).listener("roscpp", "/chatter").wait_for(event="received")
+    for one in held:
+        one.close()
