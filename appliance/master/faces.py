@@ -10,9 +10,10 @@ from collections.abc import Awaitable, Callable
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Caller
-from appliance.master.http import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Turns, Visitors
+from appliance.master.http import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Visitors
 from appliance.master.places import NoPortError, Places
 from appliance.master.registry import Incarnation, Life, Registry, new_key
+from appliance.master.turns import Turns
 from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
 from appliance.store.state import StateStore

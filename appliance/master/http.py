@@ -7,9 +7,7 @@ httptools (llhttp) parses; this module bounds. Invariants:
    served before it is sent). What all connections of a host hold together is bounded, too.
 2. A connection that makes no progress is closed by the sweep, whatever state it is in.
 3. An address that no rule names is answered before its body is read.
-4. Hosts are served in turn: one host has at most `slots_per_host` requests being served; when all slots are busy,
-   the next slot goes to the host that waited longest since its last turn. So one host's flood, even of requests
-   that take long, costs the others little.
+4. Hosts are served in turn (`turns`): one host has at most `slots_per_host` requests being served.
 5. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
 """
 
@@ -17,7 +15,7 @@ import asyncio
 import ipaddress
 import socket
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import cast
@@ -25,6 +23,7 @@ from typing import cast
 import httptools
 import structlog
 
+from appliance.master.turns import Turns
 from appliance.policy.model import Address
 
 _log = structlog.get_logger()
@@ -132,61 +131,6 @@ class Visitors:
             now = time.monotonic()
             for connection in [one for one in self.connections if one.deadline < now]:
                 connection.expire()
-
-
-class Turns:
-    """Slots for requests being served, at most `per_host` of them for one host; who gets none waits in turn.
-
-    Whenever a slot is free, everybody who waits does so because of his own host's share.
-    """
-
-    def __init__(self, slots: int, per_host: int) -> None:
-        self._free = slots
-        self._per_host = per_host
-        self._taken: Counter[Address] = Counter()
-        self._waiting: OrderedDict[Address, deque[asyncio.Future[None]]] = OrderedDict()
-
-    async def enter(self, host: Address) -> None:
-        """Take a slot, waiting for this host's turn when there is none."""
-        if self._free and self._taken[host] < self._per_host:
-            self._take(host)
-            return
-        turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(host, deque()).append(turn)
-        try:
-            await turn
-        except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
-                self.leave(host)
-            else:
-                self._give_up(host, turn)
-            raise
-
-    def leave(self, host: Address) -> None:
-        """Give the slot back: the host that waited longest and is within its share gets it."""
-        self._free += 1
-        self._taken[host] -= 1
-        if not self._taken[host]:
-            del self._taken[host]
-        following = next((one for one in self._waiting if self._taken[one] < self._per_host), None)
-        if following is None:
-            return
-        queue = self._waiting.pop(following)
-        turn = queue.popleft()
-        if queue:
-            self._waiting[following] = queue  # to the end of the line: its next request waits a round
-        self._take(following)
-        turn.set_result(None)
-
-    def _take(self, host: Address) -> None:
-        self._free -= 1
-        self._taken[host] += 1
-
-    def _give_up(self, host: Address, turn: asyncio.Future[None]) -> None:
-        queue = self._waiting[host]
-        queue.remove(turn)
-        if not queue:
-            del self._waiting[host]
 
 
 class HttpServer:

@@ -29,7 +29,7 @@ from appliance.master.delivery import Delivery
 from appliance.master.faces import Faces
 from appliance.master.gate import Gate, HostLimits
 from appliance.master.graph import Graph
-from appliance.master.http import Handler, HttpLimits, HttpServer, Peer, Turns, Visitors, listen
+from appliance.master.http import Handler, HttpLimits, HttpServer, Peer, Visitors, listen
 from appliance.master.inner import InnerFace
 from appliance.master.journal import StoreJournal, restore
 from appliance.master.lifeline import ControlLifeline
@@ -51,6 +51,7 @@ from appliance.master.revocation import Revocation
 from appliance.master.robot import own_address, robot_addresses
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.master.tokens import Tokens
+from appliance.master.turns import Turns
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.store.database import StoreError

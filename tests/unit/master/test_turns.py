@@ -1,0 +1,79 @@
+"""Hosts take turns, and no slot is lost."""
+
+import asyncio
+import ipaddress
+from typing import Any
+
+from appliance.master.turns import Turns
+
+HOST = ipaddress.ip_address("10.0.0.1")
+OTHER = ipaddress.ip_address("10.0.0.2")
+WAIT = 20.0
+
+
+def test_turns_go_round() -> None:
+    """When all slots are taken, hosts get the next ones in turn, however many requests one of them has waiting."""
+
+    async def test() -> None:
+        turns, order = Turns(1, 1), []
+
+        async def request(host: Any) -> None:
+            await turns.enter(host)
+            order.append(host)
+            await asyncio.sleep(0)
+            turns.leave(host)
+
+        await turns.enter(HOST)
+        tasks = [asyncio.create_task(request(HOST)) for _ in range(5)]
+        await asyncio.sleep(0)
+        tasks += [asyncio.create_task(request(OTHER)) for _ in range(2)]
+        await asyncio.sleep(0)
+        turns.leave(HOST)
+        await asyncio.gather(*tasks)
+        assert order == [HOST, OTHER, HOST, OTHER, HOST, HOST, HOST]
+
+    asyncio.run(test())
+
+
+def test_one_host_never_has_all_slots() -> None:
+    """A host whose requests take for ever leaves slots for everybody else."""
+
+    async def test() -> None:
+        turns = Turns(4, 2)
+        stuck = [asyncio.create_task(turns.enter(HOST)) for _ in range(10)]
+        await asyncio.sleep(0)
+        for _ in range(100):
+            async with asyncio.timeout(WAIT):
+                await turns.enter(OTHER)
+            turns.leave(OTHER)
+        for task in stuck:
+            task.cancel()
+        await asyncio.gather(*stuck, return_exceptions=True)
+        assert sum(not task.cancelled() for task in stuck) == 2
+        assert not turns._waiting
+
+    asyncio.run(test())
+
+
+def test_turns_balance() -> None:
+    """Whatever is entered, left and given up: no slot is lost and none is made."""
+
+    async def test() -> None:
+        turns = Turns(3, 2)
+
+        async def request(host: Any, number: int) -> None:
+            await turns.enter(host)
+            try:
+                for _ in range(number % 4):
+                    await asyncio.sleep(0)
+            finally:
+                turns.leave(host)
+
+        tasks = [asyncio.create_task(request((HOST, OTHER)[i % 3 == 0], i)) for i in range(200)]
+        for i in range(0, 200, 7):
+            await asyncio.sleep(0)
+            tasks[i].cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        assert (turns._free, dict(turns._taken), dict(turns._waiting)) == (3, {}, {})
+
+    asyncio.run(test())
