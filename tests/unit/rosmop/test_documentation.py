@@ -1,0 +1,66 @@
+"""The page on the language is right: its examples load, its functions and limits are those of the code."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from appliance.rosmop.compile.library import LIBRARY
+from appliance.rosmop.compile.loops import MAX_NESTED
+from appliance.rosmop.compile.members import MOMENT_METHODS, TEXT_METHODS, VECTOR_METHODS
+from appliance.rosmop.runtime.context import BUDGET, MAX_BYTES, MAX_CALLS
+from appliance.rosmop.runtime.numbers import MATH
+from appliance.rosmop.syntax.parser import MAX_CHARACTERS, MAX_DEPTH
+from tests.unit.rosmop.acting import load
+
+PAGE = (Path(__file__).parents[3] / "docs" / "rv-language.md").read_text()
+CODE = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_example_loads() -> None:
+    """What the page shows as a file is one."""
+    assert [monitor.name for monitor in load(CODE[0]).monitors] == ["safeTrigger"]
+
+
+def test_the_example_of_a_property_loads() -> None:
+    """What the page shows as a property is one."""
+    events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
+    text = CODE[1]
+    assert load(f"s() {{ {events} {text} }}").monitors[0].properties
+
+
+def row(head: str) -> str:
+    """A row of the tables."""
+    return next(line for line in PAGE.splitlines() if line.startswith(f"| {head} "))
+
+
+@pytest.mark.parametrize(
+    ("head", "names"),
+    [
+        ("`<math.h>`", MATH),
+        ("strings", TEXT_METHODS),
+        ("vectors", VECTOR_METHODS),
+        ("`ros::Time`, `ros::Duration`", MOMENT_METHODS),
+    ],
+)
+def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> None:
+    """What can be called is written down."""
+    words = set(re.findall(r"\w+", row(head)))
+    assert set(names) - words - {"data", "nearbyint", "fromNSec"} == set()
+
+
+def test_every_function_of_the_library_is_on_the_page() -> None:
+    """Also those that come from several headers."""
+    words = set(re.findall(r"\w+", PAGE))
+    assert (
+        set(LIBRARY) - words - {"labs", "llabs", "stoll", "stoull", "atol", "strcmp", "strlen", "nearbyint"}
+        == set()
+    )
+
+
+def test_the_limits_are_those_of_the_code() -> None:
+    """Numbers on the page are the numbers in force."""
+    assert f"{BUDGET:,};" in row("instructions for one message and specification")
+    assert f"| {MAX_BYTES >> 20} MiB |" in PAGE
+    assert f"| {MAX_CALLS} deep |" in PAGE
+    assert f"{MAX_CHARACTERS // 1024} Ki characters; {MAX_DEPTH}; {MAX_NESTED} |" in PAGE
