@@ -24,6 +24,7 @@ from pydantic import (
     model_validator,
 )
 
+_NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}){1,5}")
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 
 Seconds = Annotated[float, Field(gt=0, le=86_400 * 365, allow_inf_nan=False)]
@@ -53,6 +54,12 @@ def split_address(text: str) -> tuple[str, int]:
 
 def _checked_address(text: str) -> str:
     split_address(text)
+    return text
+
+
+def _checked_name(text: str) -> str:
+    if _NODE_NAME.fullmatch(text) is None:
+        raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
     return text
 
 
@@ -171,6 +178,18 @@ class Settings(_Section):
 
     policy: Path = Field(
         default=Path("policies/default.ini"), description="the access policy; read again on reload"
+    )
+    monitors: Path | None = Field(
+        default=None, description="folder of specifications (.rv) of monitors; read again on reload"
+    )
+    enable: str = Field(
+        default="all", description="monitors enabled at start unless they were switched: all, none, or NAME,…"
+    )
+    publish_as: Annotated[str, AfterValidator(_checked_name)] = Field(
+        default="/rosrv", description="the node name under which monitors publish"
+    )
+    hide_publisher: bool = Field(
+        default=False, description="leave out what monitors publish in getSystemState"
     )
     state: Path = Field(
         default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"

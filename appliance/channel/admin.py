@@ -72,6 +72,49 @@ class MetricsWanted(AdminRequest, frozen=True, tag="metrics"):
     """The status, and everything that control counts."""
 
 
+class MonitorsWanted(AdminRequest, frozen=True, tag="monitors"):
+    """The monitors with their state and counters; with `texts`, also the specifications themselves."""
+
+    texts: bool = False
+
+
+class MonitorLoad(AdminRequest, frozen=True, tag="monitor load"):
+    """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`)."""
+
+    files: dict[str, str]
+    definitions: dict[str, str] = {}
+    note: str = ""
+    expected: int | None = None
+
+
+class MonitorReload(AdminRequest, frozen=True, tag="monitor reload"):
+    """Take what the folder of specifications has now, in the place of what is in force."""
+
+    expected: int | None = None
+
+
+class MonitorRemove(AdminRequest, frozen=True, tag="monitor remove"):
+    """Remove specifications, by the names of their files or monitors."""
+
+    names: list[str]
+    expected: int | None = None
+
+
+class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
+    """Let the events of these monitors happen, or not."""
+
+    names: list[str]
+    enabled: bool
+
+
+class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
+    """Let the topics that these monitors hold go on."""
+
+    names: list[str]
+
+
+MonitorChange = MonitorLoad | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume
+
 TokenRole = Literal["viewer", "operator", "admin"]
 
 
@@ -95,7 +138,7 @@ class TokenRevoke(AdminRequest, frozen=True, tag="token revoke"):
 
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
-    | RegistrationsWanted | GraphWanted | MetricsWanted
+    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange
 )  # fmt: skip
 AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke
 

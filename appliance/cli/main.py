@@ -5,7 +5,19 @@ import traceback
 
 import typer
 
-from appliance.cli import audit, config, demo, monitor, policy, policy_running, protect, status, token, up
+from appliance.cli import (
+    audit,
+    config,
+    demo,
+    monitor,
+    monitor_running,
+    policy,
+    policy_running,
+    protect,
+    status,
+    token,
+    up,
+)
 from appliance.config_sources import ConfigError
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
@@ -29,6 +41,17 @@ for verb in (
 ):
     policy.app.command()(verb)
 app.add_typer(policy.app, name="policy")
+monitor.app.command(name="list")(monitor_running.list_monitors)
+for order in (
+    monitor_running.enable,
+    monitor_running.disable,
+    monitor_running.load,
+    monitor_running.remove,
+    monitor_running.reload,
+    monitor_running.resume,
+):
+    monitor.app.command()(order)
+monitor.app.command(name="rvstate", hidden=True)(monitor_running.rv_state)
 app.add_typer(monitor.app, name="monitor")
 app.add_typer(config.app, name="config")
 app.add_typer(token.app, name="token")
@@ -36,6 +59,7 @@ app.add_typer(token.app, name="token")
 
 def main() -> None:
     """Entry point of the command: errors are words, never a traceback."""
+    sys.argv[1:] = _without_old_flags(sys.argv[1:])
     try:
         app()
     except (ConfigError, StartError, NetworkError) as error:
@@ -48,6 +72,16 @@ def main() -> None:
             f"rosrv: a defect of rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
         )
         sys.exit(70)
+
+
+_OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-disable": "disable"}
+"""ROSRV's own flags, and the verbs of `rosrv monitor` that took their place."""
+
+
+def _without_old_flags(arguments: list[str]) -> list[str]:
+    """`rosrv -enable M…` is `rosrv monitor enable M…`."""
+    verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
+    return arguments if verb is None else ["monitor", verb, *arguments[1:]]
 
 
 if __name__ == "__main__":

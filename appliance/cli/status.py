@@ -50,6 +50,13 @@ def _troubles(body: dict[str, Any]) -> list[str]:
         found.append(f"the audit log is behind: {body['audit']['degraded']}")
     if body["probe"] not in ("", "passed"):
         found.append(f"the ROS Master is not hidden: {body['probe']}")
+    monitors = body["monitors"]
+    if monitors["refused"]:
+        found.append(f"the relay does not take the specifications: {monitors['refused'][0]}")
+    if monitors["held"]:
+        found.append(f"topics are held: rosrv monitor resume {' '.join(monitors['held'])}")
+    if monitors["failing"]:
+        found.append(f"monitors fail: {', '.join(monitors['failing'])}; their messages are dropped")
     if body["relay"] != "connected":
         found.append("no relay process: topics and services carry nothing")
     if body["rosmaster"] != "reachable":
@@ -78,6 +85,12 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         differs += ": rosrv policy reload takes the file"
     warnings = f", {counted(policy['warnings'], 'warning')}" if policy["warnings"] else ""
     grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
+    monitors = body["monitors"]
+    loaded = counted(monitors["loaded"], "monitor")
+    shown = f"revision {monitors['revision']}, {monitors['enabled']} of {loaded} enabled"
+    if monitors["differs_from_folder"]:
+        shown += f"; loaded by {monitors['who']}, not what the folder has: rosrv monitor reload takes it"
+    grid.add_row("monitors", shown)
     shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""
     grid.add_row(
         "graph",

@@ -31,6 +31,12 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     policy: Annotated[
         Path | None, typer.Option(help="Access policy; read again by `rosrv policy reload`")
     ] = None,
+    monitors: Annotated[
+        Path | None, typer.Option(help="Folder of specifications (.rv); read again by `rosrv monitor reload`")
+    ] = None,
+    enable: Annotated[
+        str | None, typer.Option(help="Monitors enabled at start: all, none, or NAME,…")
+    ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of everything that survives a restart")
     ] = None,
@@ -39,7 +45,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     ] = None,
     rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROSMaster; 0: any")] = None,
     isolation: Annotated[str | None, typer.Option(help="container, netns or none")] = None,
-    relay: Annotated[str | None, typer.Option(help="all, or monitored: only what [Monitor] names")] = None,
+    relay: Annotated[
+        str | None, typer.Option(help="all, or monitored: only what [Monitor] or a specification names")
+    ] = None,
     mediation: Annotated[
         str | None, typer.Option(help="full, or monitored: nodes are told real URIs (with --relay monitored)")
     ] = None,
@@ -55,6 +63,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     """
     flags = {
         "policy": policy,
+        "monitors": monitors,
+        "enable": enable,
         "state": state,
         "listen": listen,
         "rosmaster_port": rosmaster_port,

@@ -15,9 +15,12 @@ import appliance
 from appliance.channel import admin
 from appliance.master.core import Master
 from appliance.master.measures import measures_of
+from appliance.master.monitor_orders import change_monitors, monitors_body, monitors_status
+from appliance.master.monitors import MonitorsChangedError, UnknownMonitorError
 from appliance.master.overview import graph_of
 from appliance.master.policies import Loaded, Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.registry import Kind, Life
+from appliance.master.specifications import SpecificationsRefusedError
 from appliance.master.surroundings import Surroundings
 from appliance.master.tokens import TokenRefusedError, Tokens
 from appliance.store.state import RevisionRow, StateStore
@@ -30,6 +33,7 @@ _View = (
     | admin.RegistrationsWanted
     | admin.GraphWanted
     | admin.MetricsWanted
+    | admin.MonitorsWanted
 )
 _TokenRequest = admin.TokenAdd | admin.TokenList | admin.TokenRevoke
 _PolicyChange = admin.PolicyReload | admin.PolicyRollback | admin.PolicyConfirm | admin.PolicyLoad
@@ -74,11 +78,14 @@ class Administration:
         except PolicyRefusedError as error:
             text = f"the policy was refused; revision {self._policies.revision} stays in force"
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
-        except RevisionChangedError as error:
+        except SpecificationsRefusedError as error:
+            text = f"refused; revision {self._master.monitors.revision} of the specifications stays in force"
+            return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
+        except (RevisionChangedError, MonitorsChangedError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="conflict")
         except TokenRefusedError as error:
             return admin.AdminAnswer(False, error=str(error), trouble="refused")
-        except UnknownThingError as error:
+        except (UnknownThingError, UnknownMonitorError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="unknown")
 
     async def _carry_out(self, request: admin.AnyRequest, who: str) -> dict[str, Any]:
@@ -90,6 +97,14 @@ class Administration:
                     return body
             case admin.TokenAdd() | admin.TokenList() | admin.TokenRevoke():
                 return await self._manage_tokens(request)
+            case (
+                admin.MonitorLoad()
+                | admin.MonitorReload()
+                | admin.MonitorRemove()
+                | admin.MonitorSwitch()
+                | admin.MonitorResume()
+            ):
+                return await change_monitors(self._master.monitors, request, who)
             case admin.PolicyWanted(revision):
                 return await asyncio.to_thread(self._policy, revision)
             case _:
@@ -105,6 +120,8 @@ class Administration:
                 return {"registrations": self._registrations()}
             case admin.GraphWanted():
                 return graph_of(self._master)
+            case admin.MonitorsWanted(texts):
+                return monitors_body(self._master, texts=texts)
             case admin.MetricsWanted():
                 return {
                     "status": self._status(),
@@ -200,6 +217,7 @@ class Administration:
                 "warnings": len(self._policies.current.warnings),
                 "confirm_by": self._policies.confirm_by,
             },
+            "monitors": monitors_status(self._master.monitors),
             "rosmaster": "reachable" if self._master.rosmaster.reachable else "being rebuilt",
             "relay": "connected" if relay.connected else "away",
             "nodes": lives.count(Life.LIVE),

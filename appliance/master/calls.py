@@ -4,16 +4,18 @@ The columns are explained at `Call`. To add a call, write its function beside it
 `parameters`) and its row here; the policy knows it by `policy/commands.py`.
 """
 
-from appliance.master import lookups, parameters, registration
+from appliance.master import lookups, monitor_calls, parameters, registration
 from appliance.master.arguments import (
     CALLER_API,
     KEY,
     MESSAGE,
     METHOD,
+    MONITORS,
     NODE,
     SEARCH_KEY,
     SERVICE,
     SERVICE_API,
+    STATE,
     SUBGRAPH,
     TOPIC,
     TOPIC_TYPE,
@@ -126,6 +128,13 @@ _PARAMETERS = (
 )
 
 
+_MONITORS = (
+    Call("getMonitors", monitor_calls.get_monitors, denial=[], reads=True),
+    Call("monitorControl", monitor_calls.monitor_control, (STATE, MONITORS), denial=[]),
+    Call("getRVState", monitor_calls.get_rv_state, denial=[], reads=True),
+)
+
+
 async def list_methods(_master: object, _caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`system.listMethods()`."""
     return [*sorted(MASTER_CALLS), "system.multicall"]
@@ -158,5 +167,5 @@ _INTROSPECTION = (
 )
 
 MASTER_CALLS: dict[str, Call] = {
-    call.name: call for call in (*_REGISTRATION, *_LOOKUPS, *_PARAMETERS, *_INTROSPECTION)
+    call.name: call for call in (*_REGISTRATION, *_LOOKUPS, *_PARAMETERS, *_MONITORS, *_INTROSPECTION)
 }

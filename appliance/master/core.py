@@ -9,6 +9,7 @@ from appliance.master.gate import Gate
 from appliance.master.graph import Graph
 from appliance.master.liveness import Liveness
 from appliance.master.mediation import Mediation
+from appliance.master.monitors import Monitors
 from appliance.master.parameters import ParameterMirror
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Registry
@@ -19,7 +20,10 @@ from appliance.policy import Policy
 
 @dataclass(slots=True)
 class Master:
-    """The parts of RVMaster; `port` is its own, `stop(reason)` ends the appliance."""
+    """The parts of RVMaster; `port` is its own, `stop(reason)` ends the appliance.
+
+    `publish_as` is the node that publishes what monitors publish.
+    """
 
     port: int
     registry: Registry
@@ -32,6 +36,9 @@ class Master:
     liveness: Liveness
     parameters: ParameterMirror
     mediation: Mediation
+    monitors: Monitors
+    publish_as: str
+    hide_publisher: bool
     addresses: Addresses
     policy: Callable[[], Policy]
     stop: Callable[[str], None]

@@ -10,7 +10,7 @@ import structlog
 from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.faces import key_of
 from appliance.master.http import HttpRequest
-from appliance.master.registry import Incarnation, Registry
+from appliance.master.registry import PUBLISHER_PATH, Incarnation, Registry
 from appliance.ros.errors import PeerError
 from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 
@@ -27,6 +27,8 @@ class InnerFace:
 
     async def handle(self, request: HttpRequest) -> bytes:
         """Answer one call of ROSMaster."""
+        if request.path == PUBLISHER_PATH:
+            return build_response([1, "", 0])
         incarnation = self._registry.by_key(key_of(request))
         if incarnation is None:
             return build_fault(1, "nobody is here")

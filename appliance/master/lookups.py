@@ -1,12 +1,13 @@
 """The calls that ask about the graph, and RVMaster's own."""
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from appliance.master.call import Answer, Caller
 from appliance.master.registration import key_of_stand_in
 from appliance.master.registry import Kind
 from appliance.ros.uris import node_uri, service_uri
+from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
@@ -44,7 +45,16 @@ async def lookup_service(master: "Master", caller: Caller, arguments: tuple[obje
 
 async def get_system_state(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`getSystemState(caller_id)` → `[publishers, subscribers, services]`."""
-    return await master.rosmaster.call("getSystemState", caller.caller_id)
+    answer = await master.rosmaster.call("getSystemState", caller.caller_id)
+    if master.hide_publisher and answer[0] == 1:
+        publishers, subscribers, services = cast(list[list[list[Value]]], answer[2])
+        shown = [[topic, _others(master, cast(list[Value], names))] for topic, names in publishers]
+        answer[2] = cast(Value, [[one for one in shown if one[1]], subscribers, services])
+    return answer
+
+
+def _others(master: "Master", names: list[Value]) -> list[Value]:
+    return [name for name in names if name != master.publish_as]
 
 
 async def get_published_topics(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:

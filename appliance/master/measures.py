@@ -21,5 +21,6 @@ def measures_of(master: Master) -> dict[str, Any]:
         "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         "registrations": dict(kinds),
         "relayed": relayed,
+        "monitors": [[kind, name, count] for (kind, name), count in master.monitors.records.counts.items()],
         "connections": dict(Counter(one.kind for one in master.relay.connections.values())),
     }

@@ -35,11 +35,13 @@ from appliance.master.journal import StoreJournal, restore
 from appliance.master.lifeline import ControlLifeline
 from appliance.master.liveness import Liveness, LivenessSettings
 from appliance.master.mediation import Mediation
+from appliance.master.monitors import Monitors
 from appliance.master.node_calls import NODE_CALLS
 from appliance.master.parameters import ParameterMirror, Tree
 from appliance.master.pipeline import Pipeline
 from appliance.master.places import NoPortError, Places
 from appliance.master.policies import Policies, PolicyRefusedError
+from appliance.master.publisher import OwnPublisher
 from appliance.master.reconcile import Reconciler
 from appliance.master.recorder import Recorder
 from appliance.master.registration import withdraw
@@ -50,6 +52,7 @@ from appliance.master.rest import RestLink
 from appliance.master.revocation import Revocation
 from appliance.master.robot import own_address, robot_addresses
 from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.master.specifications import SpecificationsRefusedError
 from appliance.master.tokens import Tokens
 from appliance.master.turns import Turns
 from appliance.ros.uris import node_uri
@@ -106,7 +109,7 @@ class _Control:
         self._lifeline.attach()
         try:
             await self._start()
-        except (PolicyRefusedError, StoreError, NoPortError, OSError) as error:
+        except (PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, OSError) as error:
             self._lifeline.say(messages.Failed(str(error)))
             await self._stopping.wait()
             return
@@ -124,6 +127,13 @@ class _Control:
             self._settings.policy, self._store, self._recorder, robot=robot_addresses(self._settings)
         )
         self._policies.start(restarted=restarted)
+        self._monitors = Monitors(
+            self._settings.monitors,
+            self._settings.enable,
+            self._store,
+            self._recorder,
+        )
+        self._monitors.start(restarted=restarted)
         self._make_parts(self._take_sockets())
         await self._restore()
         await self._serve()
@@ -137,7 +147,8 @@ class _Control:
         self._lifeline.reload_requested = self._reload_on_signal
         self._lifeline.open_links()
         for work in (
-            self._reconciler.run(), self._liveness.run(), self._visitors.sweep(), self._save_parameters()
+            self._reconciler.run(), self._liveness.run(), self._visitors.sweep(), self._save_parameters(),
+            self._publisher.run(self._reconciler.ready),
         ):  # fmt: skip
             self._tasks.append(self._loop.create_task(work))
         await self._reconciler.ready.wait()
@@ -206,6 +217,7 @@ class _Control:
         )
         mediation = Mediation(
             lambda: self._policies.current,
+            lambda: self._monitors.checked,
             relay_all=settings.relaying == "all",
             stand_ins=settings.mediation == "full",
         )
@@ -284,10 +296,19 @@ class _Control:
             liveness=self._liveness,
             parameters=parameters,
             mediation=mediation,
+            monitors=self._monitors,
+            publish_as=settings.publish_as,
+            hide_publisher=settings.hide_publisher,
             addresses=addresses,
             policy=lambda: self._policies.current,
             stop=lambda reason: self._lifeline.say(messages.ApplianceStopRequested(reason)),
         )
+        self._monitors.send = relay.send
+        relay.statement, relay.heard = self._monitors.statement, self._monitors.received
+        self._publisher = OwnPublisher(
+            self._master, settings.publish_as, inner_port, lambda: self._monitors.checked.publications
+        )
+        self._monitors.published = self._publisher.wake
         self._pipeline = Pipeline(
             self._master, limits=self._limits, offload=int(settings.limits.offload_bytes)
         )

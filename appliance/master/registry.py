@@ -24,6 +24,9 @@ from typing import Protocol
 from appliance.policy.model import Address
 from appliance.ros.uris import NodeUri, node_uri
 
+PUBLISHER_PATH = "/publisher/"
+"""The path of the API of the appliance's own publisher, on the listener of the inner faces."""
+
 
 class Kind(enum.StrEnum):
     """What can be registered."""
@@ -74,6 +77,11 @@ class Incarnation:
     touched: float = 0.0  # monotonic seconds of its last registering call
     registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def of_monitors(self) -> bool:
+        """Whether this is the appliance's own publisher of what monitors publish."""
+        return self.own and self.api.path == PUBLISHER_PATH
 
     @property
     def real_uri(self) -> str:

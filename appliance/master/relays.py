@@ -89,6 +89,10 @@ class RelayControl:
         self._placed: set[str] = set()  # incarnations whose port this relay has
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
         self._asking: set[asyncio.Task[None]] = set()
+        self.statement: Callable[[], messages.Message | None] = lambda: (
+            None
+        )  # set by control when it is wired
+        self.heard: Callable[[messages.Message], None] = lambda message: None  # noqa: ARG005 - the same
         self.connections: dict[int, Connection] = {}
         self.traffic: dict[tuple[str, str], Traffic] = {}
 
@@ -126,6 +130,9 @@ class RelayControl:
         self.connections.clear()
         channel.attach(asyncio.get_running_loop(), self._received, lambda: self._lost(channel))
         self._epoch += 1
+        specifications = self.statement()  # before anything is placed: nothing goes past the monitors
+        if specifications is not None:
+            self._send(specifications)
         self._send(messages.StateBegan(self._epoch))
         for incarnation in self._registry.live():
             self._place(incarnation)
@@ -143,6 +150,11 @@ class RelayControl:
             self._channel.send(message, descriptors)
         except ChannelClosedError:
             self._channel = None
+
+    def send(self, message: messages.Message) -> bool:
+        """Tell the relay; False when there is none."""
+        self._send(message)
+        return self._channel is not None
 
     # --- what is wanted ---
 
@@ -165,7 +177,9 @@ class RelayControl:
             return
         self._placed.add(incarnation.key)
         listening = self._places.socket(incarnation.relay_port)
-        message = messages.NodePlaced(incarnation.key, incarnation.name, str(incarnation.host))
+        message = messages.NodePlaced(
+            incarnation.key, incarnation.name, str(incarnation.host), incarnation.of_monitors
+        )
         self._send(message, (listening.fileno(),))
 
     def _place_service(self, incarnation: Incarnation, service: str, port: str) -> None:
@@ -306,6 +320,10 @@ class RelayControl:
                 self._closed(message)
             case messages.ConnectionRefused():
                 self._refused(message)
+            case messages.PublicationRefused():
+                self._publication_refused(message)
+            case _:
+                self.heard(message)
 
     async def _find_upstream(self, key: str, topic: str) -> None:
         incarnation = self._registry.by_key(key)
@@ -363,6 +381,17 @@ class RelayControl:
             resource=message.resource,
             node=self._name(message.key),
             count=message.count,
+        )
+
+    def _publication_refused(self, message: messages.PublicationRefused) -> None:
+        self._recorder.happened(
+            "publication refused",
+            message.reason,
+            severity=Severity.ALARM,
+            decision="deny",
+            caller_id=self._name(message.key),
+            category="monitor",
+            resource=message.resource,
         )
 
     def _name(self, key: str) -> str:

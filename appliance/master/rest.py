@@ -17,6 +17,7 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
+    MonitorChange,
     PolicyConfirm,
     PolicyLoad,
     PolicyReload,
@@ -30,7 +31,7 @@ from appliance.master.tokens import Tokens
 _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
-_CHANGES = (PolicyReload, PolicyRollback, PolicyConfirm, PolicyLoad)
+_CHANGES = PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange
 
 
 class RestLink:

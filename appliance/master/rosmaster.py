@@ -40,6 +40,7 @@ class RosMaster:
         timeout: float = 10.0,
         hold: float = 15.0,
     ) -> None:
+        self.port = port
         self._lost = lost
         self._hold = hold
         self._client = XmlRpcClient(

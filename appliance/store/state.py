@@ -29,6 +29,9 @@ CREATE TABLE IF NOT EXISTS policy_revision (
     revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS monitor_revision (
+    revision INTEGER PRIMARY KEY, sources TEXT NOT NULL, loaded REAL NOT NULL, who TEXT NOT NULL, note TEXT NOT NULL
+);
 CREATE TABLE IF NOT EXISTS token (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
     created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
@@ -82,6 +85,17 @@ class RevisionRow:
     revision: int
     text: str
     file: str
+    loaded: float
+    who: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorRevisionRow:
+    """Specifications that were in force (`sources` is JSON); `loaded` is seconds since the epoch."""
+
+    revision: int
+    sources: str
     loaded: float
     who: str
     note: str
@@ -194,6 +208,20 @@ class StateStore:
             RevisionRow(*row)
             for row in self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
         ]
+
+    # --- revisions of the specifications ---
+
+    def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
+        """Keep specifications that come into force."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO monitor_revision VALUES (?, ?, ?, ?, ?)",
+            (row.revision, row.sources, row.loaded, row.who, row.note),
+        )
+
+    def monitor_revision(self) -> MonitorRevisionRow | None:
+        """The last that came into force; None when there never was one."""
+        rows = self._database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")
+        return MonitorRevisionRow(*rows[0]) if rows else None
 
     # --- tokens ---
 

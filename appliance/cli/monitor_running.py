@@ -1,0 +1,183 @@
+"""`rosrv monitor list|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from appliance.channel.admin import (
+    AdminRequest,
+    MonitorLoad,
+    MonitorReload,
+    MonitorRemove,
+    MonitorResume,
+    MonitorsWanted,
+    MonitorSwitch,
+)
+from appliance.cli.policy_output import counted, say
+from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+
+_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
+_Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
+
+
+def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Show every monitor: enabled or not, what it listens to, what it did.
+
+    Example: rosrv monitor list --json
+    """
+    body = _ask(state, MonitorsWanted(), as_json=as_json)
+    if as_json:
+        for row in body["monitors"]:
+            sys.stdout.write(json.dumps(row) + "\n")
+        return
+    if body["refused"]:
+        say(f"the relay does not take them: {body['refused'][0]}", "red")
+    table = Table(
+        "monitor", "state", "listens to", "events", "verdicts", "drops", "changes", "faults",
+        box=None, padding=(0, 2, 0, 0), header_style="dim",
+    )  # fmt: skip
+    for row in body["monitors"]:
+        counts = [str(row[name]) for name in ("events", "verdicts", "drops", "changes", "faults")]
+        table.add_row(row["name"], _state(row), " ".join(row["topics"] + row["services"]), *counts)
+    Console(highlight=False).print(table)
+    source = f" ({body['folder']})" if body["folder"] else ""
+    differs = (
+        "; not what the folder has: rosrv monitor reload takes it" if body["differs_from_folder"] else ""
+    )
+    say(f"revision {body['revision']} of the specifications{source}, by {body['who']}{differs}")
+
+
+def enable(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Let the events of these monitors happen again.
+
+    Example: rosrv monitor enable safeTrigger
+    """
+    _switch(names, True, state, as_json=as_json)
+
+
+def disable(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Let messages pass these monitors untouched; their variables stay.
+
+    Example: rosrv monitor disable safeTrigger
+    """
+    _switch(names, False, state, as_json=as_json)
+
+
+def load(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
+    state: State = DEFAULT_STATE,
+    msg: Annotated[
+        list[Path] | None,
+        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+    ] = None,
+    note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
+    as_json: _Json = False,
+) -> None:
+    """Load specifications while the robot runs; a file of the same name is replaced.
+
+    They are compiled first: with an error nothing changes and the exit status is 1. Definitions of messages are
+    taken from `msg/` beside the files and from --msg.
+
+    Example: rosrv monitor load safe_zone.rv
+    """
+    texts = {file.name: _text(file) for file in files}
+    folders = [*dict.fromkeys(file.parent / "msg" for file in files), *(msg or [])]
+    definitions: dict[str, str] = {}
+    for folder in folders:
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in {".msg", ".srv"} and path.is_file():
+                package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
+                definitions[f"{package.name}/{path.name}"] = _text(path)
+    _say_replaced(_ask(state, MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json)
+
+
+def remove(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Remove specifications, by the names of their monitors or files.
+
+    Example: rosrv monitor remove safeTrigger
+    """
+    _say_replaced(_ask(state, MonitorRemove(names), as_json=as_json), as_json=as_json)
+
+
+def reload(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Take what the folder of specifications has now, in the place of what is in force.
+
+    Example: rosrv monitor reload
+    """
+    _say_replaced(_ask(state, MonitorReload(), as_json=as_json), as_json=as_json)
+
+
+def resume(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
+
+    Example: rosrv monitor resume safeTrigger
+    """
+    body = _ask(state, MonitorResume(names), as_json=as_json)
+    if as_json:
+        sys.stdout.write(json.dumps(body) + "\n")
+    else:
+        say(f"resumed: {', '.join(body['names']) or 'none was held'}")
+
+
+def rv_state(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+    """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
+    body = _ask(state, MonitorsWanted(), as_json=as_json)
+    real, port, rows = body["rv_state"]
+    if as_json:
+        sys.stdout.write(json.dumps(body["rv_state"]) + "\n")
+        return
+    say(f"ROSMaster port {real}, RVMaster port {port}")
+    for name, topic, xmlrpc, tcp in rows:
+        say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
+
+
+def _switch(names: list[str], enabled: bool, state: Path, *, as_json: bool) -> None:
+    body = _ask(state, MonitorSwitch(names, enabled), as_json=as_json)
+    if as_json:
+        sys.stdout.write(json.dumps(body) + "\n")
+        return
+    word = "enabled" if enabled else "disabled"
+    say(f"{word}: {', '.join(body['names']) or 'nothing, it was so already'}")
+
+
+def _state(row: dict[str, Any]) -> str:
+    if row["held"]:
+        return "holds its topics"
+    if row["failing"]:
+        return "failing"
+    return "enabled" if row["enabled"] else "disabled"
+
+
+def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(body) + "\n")
+        return
+    for warning in body["warnings"]:
+        say(warning, "yellow")
+    parts = [f"{word} {', '.join(body[word])}" for word in ("added", "changed", "removed") if body[word]]
+    what = "; ".join(parts) or "nothing is different"
+    say(f"revision {body['revision']} of the specifications is in force (was {body['replaced']}): {what}")
+    if body["warnings"]:
+        say(counted(len(body["warnings"]), "warning"), "yellow")
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else f"it is not UTF-8: {error.reason}"
+        typer.echo(f"rosrv monitor: cannot read {file}: {reason}", err=True)
+        raise typer.Exit(2) from None
+
+
+def _ask(state: Path, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+    try:
+        return body_or_exit(ask(state, request), as_json=as_json)
+    except NotRunningError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(2) from None

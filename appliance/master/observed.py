@@ -1,0 +1,55 @@
+"""What monitors did, as the relay reports it: audit records, and counts for the metrics."""
+
+import datetime
+from collections import Counter
+from typing import Any
+
+from appliance.audit.record import Severity
+from appliance.channel.messages import MonitorEvent
+from appliance.master.recorder import Recorder
+
+_EVENTS = {
+    "verdict": ("monitor verdict", Severity.NOTICE),
+    "drop": ("message dropped", Severity.WARNING),
+    "change": ("message changed", Severity.NOTICE),
+    "fault": ("monitor fault", Severity.ALARM),
+    "log": ("monitor log", Severity.INFO),
+    "publish": ("monitor published", Severity.INFO),
+}
+_LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
+
+
+class MonitorRecords:
+    """Makes records of reports; `counts` has how often each kind happened, by monitor."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.counts: Counter[tuple[str, str]] = Counter()
+
+    def reported(self, events: list[MonitorEvent], lost: int) -> None:
+        """A batch of the relay."""
+        for event in events:
+            self.counts[event.kind, event.monitor] += event.count or 1
+            self._record(event)
+        if lost:
+            text = f"{lost} reports of monitors were lost while the relay had no control"
+            self._recorder.happened("records lost", text, severity=Severity.ALARM, lost=lost)
+
+    def _record(self, event: MonitorEvent) -> None:
+        name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
+        detail: dict[str, Any] = {"monitor": event.monitor, **event.detail}
+        detail["happened"] = datetime.datetime.fromtimestamp(event.time / 1e9, datetime.UTC).isoformat()
+        if event.kind == "log":
+            severity = _LEVELS.get(str(event.detail.get("level")), severity)
+        for word, data in (("before", event.before), ("after", event.after)):
+            if data:
+                detail[word] = data.hex()
+        if event.size:
+            detail["size"] = event.size
+        text = event.text
+        if event.count:
+            detail["count"] = event.count
+            text = f"{event.count} more in the same second" + (f": {text}" if text else "")
+        self._recorder.happened(
+            name, text, severity=severity, category="monitor", resource=event.resource, **detail
+        )

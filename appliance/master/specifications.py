@@ -1,0 +1,139 @@
+"""Files of specifications: read from the folder, checked as a whole, named by what is in them.
+
+What is checked here is compiled again in the relay; nothing comes into force that either refuses.
+"""
+
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from appliance.ros.definitions import Definitions
+from appliance.ros.errors import DefinitionError
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_MOST_FILES = 1000
+_LONGEST_FILE = 1 << 20
+
+
+class SpecificationsRefusedError(Exception):
+    """Specifications were not taken; `findings` has every reason, as `file:line:column: error: text`."""
+
+    def __init__(self, findings: list[str]) -> None:
+        super().__init__("\n".join(findings))
+        self.findings = findings
+
+
+class Sources(msgspec.Struct, frozen=True):
+    """Texts of specifications by file name, and of message definitions by `package/Type.msg` (or `.srv`)."""
+
+    files: dict[str, str] = {}
+    definitions: dict[str, str] = {}
+
+    def with_files(self, files: dict[str, str], definitions: dict[str, str]) -> "Sources":
+        """These, with others added or in the place of those of the same name; in the order of names."""
+        return Sources(
+            dict(sorted((self.files | files).items())), dict(sorted((self.definitions | definitions).items()))
+        )
+
+    def without(self, files: set[str]) -> "Sources":
+        """These without some files; definitions stay."""
+        return Sources(
+            {name: text for name, text in self.files.items() if name not in files}, self.definitions
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Specifications without errors: their monitors (name to file), what they listen to and publish."""
+
+    monitors: dict[str, str] = field(default_factory=dict)
+    topics: dict[str, frozenset[str]] = field(default_factory=dict)
+    services: dict[str, frozenset[str]] = field(default_factory=dict)
+    publications: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def of_topic(self, topic: str) -> bool:
+        """Whether a monitor has an event on a topic."""
+        return any(topic in topics for topics in self.topics.values())
+
+    def of_service(self, service: str) -> bool:
+        """Whether a monitor has an event on a service."""
+        return any(service in services for services in self.services.values())
+
+
+def check(sources: Sources) -> Checked:
+    """Compile everything. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment."""
+    if not sources.files:
+        return Checked()
+    if len(sources.files) > _MOST_FILES:
+        raise SpecificationsRefusedError(
+            [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
+        )
+    for name, text in sources.files.items():
+        if len(text) > _LONGEST_FILE:
+            raise SpecificationsRefusedError([f"{name}: longer than {_LONGEST_FILE} characters"])
+    try:
+        definitions = _standard().extended(Definitions.from_files(sources.definitions))
+        monitors = MonitorSet.load(sources.files, definitions)
+    except SpecificationError as error:
+        raise SpecificationsRefusedError([str(one) for one in error.findings]) from error
+    except DefinitionError as error:
+        raise SpecificationsRefusedError([f"msg/{error}"]) from error
+    return Checked(
+        {one.name: one.code.file for one in monitors.monitors},
+        {
+            one.name: frozenset(e.topic for e in one.code.events if e.topic is not None and e.part is None)
+            for one in monitors.monitors
+        },
+        {
+            one.name: frozenset(
+                e.topic for e in one.code.events if e.topic is not None and e.part is not None
+            )
+            for one in monitors.monitors
+        },
+        dict(monitors.publications),
+        tuple(str(one) for one in monitors.warnings),
+    )
+
+
+def read_folder(folder: Path) -> Sources:
+    """The `.rv` files of a folder and the definitions in its `msg/`. Raises `SpecificationsRefusedError`."""
+    try:
+        return _read_folder(folder)
+    except OSError as error:
+        place = error.filename or folder
+        text = f"{place}: the specifications cannot be read: {error.strerror}"
+        raise SpecificationsRefusedError([text]) from error
+
+
+def _read_folder(folder: Path) -> Sources:
+    if not folder.is_dir():
+        raise SpecificationsRefusedError([f"{folder}: there is no such folder of specifications"])
+    files = {path.name: _read(path) for path in sorted(folder.glob("*.rv"))}
+    definitions: dict[str, str] = {}
+    for path in sorted((folder / "msg").rglob("*")):
+        if path.suffix in {".msg", ".srv"} and path.is_file():
+            package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
+            if package in {folder, folder / "msg"}:
+                place = f"{folder}/msg/package/{path.name}"
+                raise SpecificationsRefusedError(
+                    [f"{path}: a definition belongs into the folder of its package: {place}"]
+                )
+            definitions[f"{package.name}/{path.name}"] = _read(path)
+    return Sources(files, definitions)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error
+
+
+@cache
+def _standard() -> Definitions:
+    return standard_definitions()

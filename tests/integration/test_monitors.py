@@ -1,0 +1,190 @@
+"""Monitors in the middle of real rospy and roscpp nodes: drop, change, publish, verdict; loaded while they talk."""
+
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.requirements import needs
+
+CLIENTS: list[Client] = ["rospy", "roscpp"]
+WORDS = """
+words() {
+    int heard = 0;
+    std_msgs::String report;
+    event said(std::string text) /chatter std_msgs/String '{data:text}' {
+        heard = heard + 1;
+        if (text.find("bad") != std::string::npos) { ROS_WARN("a bad word"); return; }
+        text = "checked " + text;
+        if (heard == 3) { report.data = "three words"; PUBLISH(/alarm, std_msgs/String, report); }
+    }
+}
+"""
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder of specifications with one file, which the appliance's users may read."""
+    with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
+        path = Path(name)
+        path.chmod(0o755)
+        (path / "words.rv").write_text(WORDS)
+        yield path
+
+
+@pytest.fixture
+def appliance(folder: Path) -> Iterator[Appliance]:
+    """An appliance with the monitor `words` on /chatter."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    policy = OPEN_POLICY + "getRVState = *\n"
+    with Appliance(policy=policy, options=("--monitors", str(folder), "--api", "off")) as appliance:
+        yield appliance
+
+
+@pytest.fixture
+def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
+    """Nodes of one test."""
+    with RosSession(appliance.master_uri, tmp_path) as session:
+        yield session
+
+
+def monitor(appliance: Appliance, name: str) -> dict[str, object]:
+    """The row of one monitor in `rosrv monitor list`."""
+    lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
+    rows: list[dict[str, object]] = [json.loads(line) for line in lines]
+    return next(row for row in rows if row["name"] == name)
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
+    appliance: Appliance, ros: RosSession, by: Client, to: Client
+) -> None:
+    """With the publisher's own header; what a monitor publishes comes from the appliance."""
+    alarm = ros.listener(to, "/alarm")
+    listener = ros.listener(to, "/chatter")
+    ros.talker(by, "/chatter", "--text", "good", name="voice")
+    heard = listener.wait_for_count(3, event="received")
+    assert all(event["data"].startswith("checked good") for event in heard)
+    assert {event["publisher"] for event in heard} == {"/voice"}
+    told = alarm.wait_for(event="received")
+    assert (told["data"], told["publisher"]) == ("three words", "/rosrv")
+    bad = ros.talker(by, "/chatter", "--text", "bad", name="rude")
+    bad.wait_for(event="ready")
+    listener.wait_for_count(20, event="received")
+    assert not [event for event in listener.seen(event="received") if "bad" in event["data"]]
+    assert appliance.audit(event="message dropped", resource="/chatter")
+    changed = appliance.audit(event="message changed", resource="/chatter")[0]
+    assert bytes.fromhex(changed["detail"]["before"])[4:].startswith(b"good")
+    assert bytes.fromhex(changed["detail"]["after"])[4:].startswith(b"checked good")
+    assert appliance.audit(event="monitor log")[0]["reason"] == "a bad word"
+
+
+def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """No message is lost, the order is kept, and each change is a record that says who."""
+    listener = ros.listener("roscpp", "/chatter")
+    ros.talker("roscpp", "/chatter", name="voice")
+    listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
+    appliance.rosrv("monitor", "disable", "words")
+    listener.wait_for(lambda event: event.get("data", "").startswith("hello"))
+    appliance.rosrv("-enable", "words")
+    spec = tmp_path / "words.rv"
+    spec.write_text(WORDS.replace("checked ", "seen "))
+    appliance.rosrv("monitor", "load", str(spec))
+    listener.wait_for(lambda event: event.get("data", "").startswith("seen hello"))
+    assert appliance.status()["monitors"]["differs_from_folder"] is True
+    appliance.rosrv("monitor", "remove", "words")
+    assert not appliance.rosrv("monitor", "list", "--json").stdout
+    last = len(listener.seen(event="received"))
+    listener.wait_for_count(last + 3, event="received")
+    numbers = [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert listener.seen(event="received")[-1]["data"].startswith("hello")
+    appliance.rosrv("monitor", "reload")
+    assert monitor(appliance, "words")["enabled"] is True
+    for event in ("monitor disabled", "monitor enabled"):
+        assert appliance.audit(event=event, resource="words")[0]["detail"]["who"] == "operator"
+    loaded = [record["detail"] for record in appliance.audit(event="specifications loaded")]
+    assert ["words.rv"] in [detail["removed"] for detail in loaded]
+    assert ["words.rv"] in [detail["changed"] for detail in loaded]
+
+
+def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """Exit status 1, as `monitor check`."""
+    spec = tmp_path / "words.rv"
+    spec.write_text(WORDS.replace("heard + 1", "herd + 1"))
+    done = appliance.rosrv("monitor", "load", str(spec), check=False)
+    assert done.returncode == 1
+    assert "words.rv:6:" in done.stderr
+    assert "herd" in done.stderr
+    assert monitor(appliance, "words")["enabled"] is True
+    assert appliance.rosrv("monitor", "disable", "nobody", check=False).returncode == 1
+    listener = ros.listener("rospy", "/chatter")
+    ros.talker("rospy", "/chatter")
+    listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
+
+
+def test_a_new_relay_begins_in_the_initial_state_and_says_so(appliance: Appliance, ros: RosSession) -> None:
+    """As an alarm; the switches and what was loaded stay, and `hold` blocks until resumed."""
+    held = "hold " + WORDS.strip().replace("words()", "gate()").replace("/chatter", "/held")
+    path = Path(appliance.directory) / "gate.rv"
+    path.write_text(held)
+    appliance.rosrv("monitor", "load", str(path))
+    appliance.rosrv("monitor", "disable", "words")
+    listener, plain = ros.listener("roscpp", "/held"), ros.listener("roscpp", "/chatter")
+    ros.talker("roscpp", "/held")
+    ros.talker("roscpp", "/chatter")
+    listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
+    appliance.kill("relay")
+    before = len(plain.seen(event="received"))
+    plain.wait_for_count(before + 5, event="received")
+    assert plain.seen(event="received")[-1]["data"].startswith("hello")
+    assert monitor(appliance, "gate")["held"] is True
+    alarm = appliance.audit(event="monitors restarted")[0]
+    assert (alarm["severity"], alarm["detail"]["held"]) == ("alarm", ["gate"])
+    before = len(listener.seen(event="received"))
+    appliance.rosrv("monitor", "resume", "gate")
+    listener.wait_for_count(before + 3, event="received")
+
+
+def test_what_was_loaded_and_switched_survives_a_restart(appliance: Appliance, tmp_path: Path) -> None:
+    """Of the whole appliance and of control; ROSRV's calls and flags tell the same."""
+    spec = tmp_path / "more.rv"
+    spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
+    appliance.rosrv("monitor", "load", str(spec))
+    appliance.rosrv("-disable", "words")
+    appliance.kill("control")
+    appliance.stop()
+    appliance.start()
+    assert monitor(appliance, "words")["enabled"] is False
+    assert monitor(appliance, "more")["enabled"] is True
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        ask = "import rosgraph; m = rosgraph.Master('/tool'); h = m.handle; "
+        said = ros.run(
+            "/usr/bin/python3",
+            "-c",
+            ask + "print(h.getMonitors('/tool')); print(h.monitorControl('/tool', 'enable', ['words']));"
+            "print(h.getRVState('/tool')[:2]); print(h.monitorControl('/tool', 'enable', ['nobody'])[0])",
+        ).stdout.splitlines()
+    assert said[0] == "[1, 'Monitors', [['more', True], ['words', False]]]"
+    assert said[1].endswith("['words']]")
+    assert said[2] == "[1, 'RV State']"
+    assert said[3] == "-1"
+
+
+def test_a_start_with_a_bad_file_is_an_error_that_says_where(folder: Path) -> None:
+    """The appliance does not serve without its monitors."""
+    (folder / "broken.rv").write_text("broken() { event }")
+    appliance = Appliance(options=("--monitors", str(folder), "--api", "off"))
+    with pytest.raises(AssertionError):
+        appliance.start()
+    assert "broken.rv:1:" in appliance.story()
+    appliance.close()
