@@ -61,9 +61,13 @@ class Caller:
 class Call:
     """One row of a table of calls.
 
-    The category and the resource (the parameter at `resource`, or the call's own name as a command) say what the
-    policy is asked; `command` and `extension` are asked as well. `denial` is the value of a denied answer: of the
-    type the call returns, so that no client library stumbles over it.
+    parameters  what follows the caller_id; the last `optional` of them may be left out
+    denial      the value of a denied answer: of the type the call returns, so that no client library stumbles over it
+    identity    what is checked of the caller_id; `reads`: the call only reads, an empty one will do
+    category    what the policy is asked about, with the parameter at `resource`, or the call's own name as a command
+    command     asked of `[Commands]` as well, or under this name
+    touches     how it touches a parameter: asked of `[Parameters]` as well, when the policy has it
+    api         which parameter is the node's API URI
     """
 
     name: str
@@ -75,7 +79,6 @@ class Call:
     category: Category = Category.COMMAND
     resource: int | None = None
     command: str | None = None
-    extension: tuple[Category, int] | None = None
     touches: Touch | None = None
     api: int | None = None
     reads: bool = False

@@ -99,12 +99,6 @@ class Gate:
             decision = _both(
                 decision, policy.decide(Request(host, caller_id, Category.COMMAND, call.command))
             )
-        if decision.allowed and call.extension is not None:
-            extension, index = call.extension
-            if policy.has_section(extension):
-                decision = _both(
-                    decision, policy.decide(Request(host, caller_id, extension, str(arguments[index])))
-                )
         if decision.allowed and call.touches is not None and policy.has_section(Category.READ):
             decision = _both(decision, self._parameter(policy, caller, call.touches, arguments))
         if decision.allowed and call.identity is Identity.NODE:
