@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from appliance.rosmop.compile import members
+from appliance.rosmop.compile import cursors, members
 from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.library import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.output import Stream, formatted
@@ -56,20 +56,31 @@ def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
         return _macro(scope, node, macro, value_of)
     if parts in (("printf",), ("std", "printf"), ("puts",)):
         return _log(scope, node, "INFO", node.arguments, value_of)
-    if parts[-2:] == ("Time", "now"):
-        if node.arguments:
-            raise SpecificationError.at(node.position, "`now` takes no argument")
-        return Value(kinds.TIME, f"{scope.context}.turn.now", node.position)
-    library = find_function(parts)
-    if library is not None:
-        values = [value_of(scope, argument) for argument in node.arguments]
-        return library(Arguments(scope, parts, values, node.position, scope.site(node)))
+    known = _known(scope, node, parts, value_of)
+    if known is not None:
+        return known
     kind = named_type(parts)
     if kind is None and len(parts) == 2 and parts[0] not in ("std", "ros"):
         kind = record(node.position, "/".join(parts), scope.messages)
     if kind is None:
         raise _unknown(scope, node, parts)
     return construct(scope, node.position, kind, node.arguments, value_of)
+
+
+def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: ValueOf) -> Value | None:
+    """A function that every specification has, None if this is none."""
+    if parts[-2:] == ("Time", "now"):
+        if node.arguments:
+            raise SpecificationError.at(node.position, "`now` takes no argument")
+        return Value(kinds.TIME, f"{scope.context}.turn.now", node.position)
+    if parts[0] == "std" and parts[-1] in cursors.ALGORITHMS:
+        values = [value_of(scope, argument) for argument in node.arguments]
+        return cursors.algorithm(scope, parts[-1], values, (node.position, scope.site(node)))
+    library = find_function(parts)
+    if library is not None:
+        values = [value_of(scope, argument) for argument in node.arguments]
+        return library(Arguments(scope, parts, values, node.position, scope.site(node)))
+    return None
 
 
 def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> SpecificationError:

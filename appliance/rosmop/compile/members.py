@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
+from appliance.rosmop.compile import cursors
 from appliance.rosmop.compile.conversion import check_convertible, convert, number
 from appliance.rosmop.compile.places import PartPlace, SlotPlace, Value
 from appliance.rosmop.compile.scope import Scope
@@ -353,6 +354,28 @@ def _vector_resize(call: Invocation) -> Value:
     return call.changes_in_place(f"l_resized({call.scope.context}, {arguments})")
 
 
+def _cursor(call: Invocation) -> Value:
+    call.count(0)
+    return cursors.begin_or_end(call.base, call.name, call.position)
+
+
+def _vector_erase(call: Invocation) -> Value:
+    call.count(1, 2)
+    _refuse_fixed(call)
+    return cursors.erase(call.scope, call.base, call.arguments, (call.position, call.site))
+
+
+def _vector_insert(call: Invocation) -> Value:
+    call.count(2)
+    _refuse_fixed(call)
+    return cursors.insert(call.scope, call.base, call.arguments, (call.position, call.site))
+
+
+def _refuse_fixed(call: Invocation) -> None:
+    if _vector(call).length is not None:
+        raise SpecificationError.at(call.position, f"`{call.name}`: an array of fixed length stays so long")
+
+
 def _nothing(call: Invocation) -> Value:
     call.count(1)
     return Value(kinds.VOID, "None", call.position)
@@ -370,6 +393,10 @@ VECTOR_METHODS: Mapping[str, Method] = MappingProxyType(
         "clear": _vector_clear,
         "resize": _vector_resize,
         "reserve": _nothing,
+        "begin": _cursor,
+        "end": _cursor,
+        "erase": _vector_erase,
+        "insert": _vector_insert,
     }
 )
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from appliance.rosmop.compile import cursors
 from appliance.rosmop.compile.conversion import (
     condition,
     constant_value,
@@ -68,7 +69,10 @@ def binary(operator: str, operands: Operands) -> Value:
         return _texts(operator, operands)
     if isinstance(left, _MOMENTS) or isinstance(right, _MOMENTS):
         return _moments(operator, operands)
-    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | kinds.Stream):
+    cursor = cursors.moved(operator, operands.left, operands.right, operands.position)
+    if cursor is not None:
+        return cursor
+    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | cursors.Cursor):
         return operands.value(kinds.BOOL, f"({operands.left.code} {operator} {operands.right.code})")
     raise operands.refused(operator, _hint(left, right))
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compile import conversion, library, members, operators, output, storing
+from appliance.rosmop.compile import conversion, cursors, library, members, operators, output, storing
 from appliance.rosmop.compile.events import EventCode, compile_event
 from appliance.rosmop.compile.functions import (
     compile_function,
@@ -115,6 +115,7 @@ def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None
         members.FUNCTIONS,
         library.FUNCTIONS,
         output.FUNCTIONS,
+        cursors.FUNCTIONS,
     ):
         module.namespace |= functions
     module.namespace |= {

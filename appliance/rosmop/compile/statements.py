@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
 from appliance.rosmop.compile.conversion import condition, convert
+from appliance.rosmop.compile.cursors import Cursor
 from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.compile.storing import store_lines
@@ -84,8 +85,10 @@ def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, str
     if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = value_of(scope, declarator.value)
-    if isinstance(value.type, kinds.Void | kinds.Stream):
-        raise SpecificationError.at(declarator.position, f"`auto` of {value.type}; this has no value")
+    if isinstance(value.type, kinds.Void | Cursor):
+        raise SpecificationError.at(
+            declarator.position, f"a variable cannot hold {value.type}; use the expression itself"
+        )
     kind = kinds.STRING if isinstance(value.type, kinds.Characters) else value.type
     return kind, convert(scope, value, kind)
 

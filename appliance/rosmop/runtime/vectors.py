@@ -106,3 +106,54 @@ def fixed(values: Values, count: int, site: int) -> Values:
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values
+
+
+def _check_span(values: Values, first: int, last: int, site: int) -> None:
+    if not 0 <= first <= last <= len(values):
+        raise FaultError(site, f"from {first} to {last} is not within a vector of {len(values)}")
+
+
+def erase(values: Values, first: int, last: int | None, site: int) -> None:
+    """`values.erase(first)`, `values.erase(first, last)`."""
+    last = first + 1 if last is None else last
+    _check_span(values, first, last, site)
+    del values[first:last]
+
+
+def insert(context: Context, values: Values, at: int, value: Any, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
+    """`values.insert(at, value)`."""
+    _check_span(values, at, len(values), site)
+    context.allocate(width, site)
+    context.spend(len(values) // 64, site)
+    values.insert(at, value)
+
+
+def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
+    """`std::sort`: ascending."""
+    _check_span(values, first, last, site)
+    context.spend((last - first) * (last - first).bit_length(), site)
+    values[first:last] = sorted(values[first:last])
+
+
+def reverse(context: Context, values: Values, first: int, last: int, site: int) -> None:
+    """`std::reverse`."""
+    _check_span(values, first, last, site)
+    context.spend((last - first) // 4, site)
+    values[first:last] = values[first:last][::-1]
+
+
+def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
+    context: Context,
+    values: Values,
+    first: int,
+    last: int,
+    site: int,
+    start: Any,
+    add: Callable[[Any, Any], Any],
+) -> Any:
+    """`std::accumulate`."""
+    _check_span(values, first, last, site)
+    context.spend(last - first, site)
+    for value in values[first:last]:
+        start = add(start, value)
+    return start

@@ -124,16 +124,8 @@ class Record(Type):
         return self.name.replace("/", "::")
 
 
-@dataclass(frozen=True, slots=True)
-class Stream(Type):
-    """`std::cout` and the left side of `<<` in the `_STREAM` macros; never the type of a variable."""
-
-    def __str__(self) -> str:
-        return "std::ostream"
-
-
-VOID, BOOL, STRING, CHARACTERS, TIME, DURATION, STREAM = (
-    Void(), Bool(), String(), Characters(), Time(), Duration(), Stream()
+VOID, BOOL, STRING, CHARACTERS, TIME, DURATION = (
+    Void(), Bool(), String(), Characters(), Time(), Duration()
 )  # fmt: skip
 CHAR = Integer(8, True, "char")
 INT8 = Integer(8, True, "int8_t")

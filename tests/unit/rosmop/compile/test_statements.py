@@ -231,3 +231,36 @@ def test_assigning_a_converted_parameter_twice_keeps_the_last() -> None:
     outcome = act("x = 5; x = x + 1;", data=1)
     assert outcome.result == "changed"
     assert bytes(outcome.buffer) == b"\x06\0\0\0"
+
+
+CURSORS = [
+    ("v.erase(v.begin());", "2 3 1"),
+    ("v.erase(v.begin() + 1, v.end());", "3"),
+    ("v.erase(v.end() - 1);", "3 2 3"),
+    ("v.insert(v.begin() + 1, 9);", "3 9 2 3 1"),
+    ("v.insert(v.end(), 9);", "3 2 3 1 9"),
+    ("std::sort(v.begin(), v.end());", "1 2 3 3"),
+    ("std::sort(v.begin(), v.begin() + 2);", "2 3 3 1"),
+    ("std::reverse(v.begin(), v.end());", "1 3 2 3"),
+    ("v.resize(v.end() - v.begin() - 2);", "3 2"),
+    ("v = {(int) std::accumulate(v.begin(), v.end(), 0.5)};", "9"),
+    ("v = {std::accumulate(v.begin(), v.end(), 0)};", "9"),
+    ("v.erase(v.end());", "fault: from 4 to 5 is not within a vector of 4"),
+    ("v.erase(v.begin() - 1);", "fault: from -1 to 0 is not within a vector of 4"),
+]
+
+
+@pytest.mark.parametrize(("body", "values"), CURSORS)
+def test_a_place_in_a_vector(body: str, values: str) -> None:
+    """`begin` and `end` say where to erase, insert, sort, reverse and add up."""
+    assert printed(f'std::vector<int> v{{3, 2, 3, 1}}; {body} for (int e : v) ROS_INFO("%d", e);') == values
+
+
+def test_an_iterator_is_no_value() -> None:
+    """It cannot be kept, printed, or used with another vector."""
+    declared = "std::vector<int> v, w; "
+    assert "a variable cannot hold an iterator" in refused_action(declared + "auto i = v.begin();")[0].text
+    assert "of the same vector" in refused_action(declared + "v.erase(w.begin());")[0].text
+    assert "of the same vector" in refused_action(declared + "v.erase(0);")[0].text
+    assert "an array of fixed length stays so long" in refused_action("int a[3]; a.erase(a.begin());")[0].text
+    assert refused_action(declared + "std::cout << v.begin();")
