@@ -143,7 +143,8 @@ class _Gathered:
             raise ConfigError(self._mistakes) from error
         if self._mistakes:
             raise ConfigError(self._mistakes)
-        return settings.model_copy(update={key: getattr(settings, key).absolute() for key in _PATH_KEYS})
+        chosen = {key: value for key in _PATH_KEYS if (value := getattr(settings, key)) is not None}
+        return settings.model_copy(update={key: path.absolute() for key, path in chosen.items()})
 
     def _set(self, path: KeyPath, value: Any, place: str) -> None:
         table: Any = self._values
