@@ -1,8 +1,9 @@
 """Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
 
-Invariants: the host is a host name, an IPv4 address or an IPv6 address in brackets and nothing else; the port
-is there and between 1 and 65535; there is no user info, query or fragment. What two parsers could read in two
-ways is refused.
+Invariants: the host is a host name, an IPv4 address or an IPv6 address and nothing else; the port is there and
+between 1 and 65535; there is no user info, query or fragment. What two parsers could read in two ways is refused.
+rospy writes an IPv6 address without brackets (`http://::1:4000/`): as the port is always there, it is what follows
+the last colon.
 """
 
 import ipaddress
@@ -16,7 +17,7 @@ MAX_URI_LENGTH = 1024
 
 _URI = re.compile(
     r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://"
-    r"(?P<host>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_.-]{1,253})"
+    r"(?P<host>\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}(?=:[0-9]{1,5}(?:/|\Z))|[A-Za-z0-9_.-]{1,253})"
     r"(?P<port>:[0-9]{1,5})?"
     r"(?P<path>/[A-Za-z0-9_.~!$&'()*+,;=:@%/-]*)?\Z"
 )
@@ -77,12 +78,12 @@ def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
 
 
 def _host(host: str, text: str, what: str) -> str:
-    if not host.startswith("["):
+    if ":" not in host and not host.startswith("["):
         return host
     try:
-        return str(ipaddress.IPv6Address(host[1:-1]))
+        return str(ipaddress.IPv6Address(host.strip("[]")))
     except ValueError:
-        raise InvalidUriError(f"{what} URI {_show(text)} has no valid IPv6 address in its brackets") from None
+        raise InvalidUriError(f"{what} URI {_show(text)} has no valid IPv6 address as its host") from None
 
 
 def _complaint(text: str) -> str:

@@ -17,11 +17,13 @@ from appliance.ros.uris import NodeUri, node_uri, parse_node_uri, parse_service_
         ("http://my_robot-1.local.:65535/", NodeUri("http", "my_robot-1.local.", 65535, "/")),
         ("http://[::1]:8080/", NodeUri("http", "::1", 8080, "/")),
         ("http://[FE80:0:0::1]:8080/", NodeUri("http", "fe80::1", 8080, "/")),
+        ("http://::1:8080/", NodeUri("http", "::1", 8080, "/")),
+        ("http://fe80::a:1:8080", NodeUri("http", "fe80::a:1", 8080, "/")),
         ("HTTP://robot:1/", NodeUri("http", "robot", 1, "/")),
     ],
 )
 def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
-    """Host names, IPv4 and bracketed IPv6 addresses with a port are node API URIs."""
+    """Host names, IPv4 and IPv6 addresses (bracketed, or as rospy writes them) with a port are node API URIs."""
     assert parse_node_uri(text) == expected
 
 
@@ -50,7 +52,10 @@ def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
         ("http://r\u00f6bot:1/", "outside ASCII"),
         ("http://[::1:1/", "host, port"),
         ("http://[:::1]:1/", "IPv6"),
-        ("http://::1:1/", "host, port"),
+        ("http://::1/", "host, port"),
+        ("http://1::2/", "IPv6"),
+        ("http://1:2:3:4:5:6:7:8/", "IPv6"),
+        ("http://10.0.0.1:80:90/", "IPv6"),
         ("http://[1.2.3.4]:1/", "IPv6"),
         ("http://robot:1/" + "a" * 2000, "2015 characters"),
         ("http://robot:\u0661/", "outside ASCII"),
