@@ -107,6 +107,11 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         lines = json.dumps(event)
     else:
         lines = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
+        if settings.isolation == "netns":
+            port = settings.listen_address[1]
+            lines += (
+                f"\nNodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}"
+            )
         if rest is not None:
             lines += f"\nREST: {rest}"
         if said.token is not None:
