@@ -56,13 +56,18 @@ def definitions_of(reader: Reader) -> Definitions:
     return found
 
 
+_Header = tuple[
+    str, str, str, str, str | None, int | None
+]  # topic, type, definition, md5sum, caller, latching
+
+
 class Recording:
     """The bag that is written: what subscribers would have received."""
 
     def __init__(self, path: Path, definitions: Definitions) -> None:
         self._path = path
         self._definitions = definitions
-        self._connections: dict[object, Connection] = {}
+        self._connections: dict[_Header, Connection] = {}
         try:
             self._writer = Writer(path)
             self._writer.open()
@@ -79,31 +84,35 @@ class Recording:
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         """Write a message of a recorded publisher."""
-        if connection.id not in self._connections:
-            self._connections[connection.id] = self._writer.add_connection(
-                connection.topic,
-                connection.msgtype,
-                msgdef=connection.msgdef.data,
-                md5sum=connection.digest,
-                callerid=getattr(connection.ext, "callerid", None),
-                latching=getattr(connection.ext, "latching", None),
-            )
-        self._writer.write(self._connections[connection.id], time_ns, data)
+        caller, latching = (
+            getattr(connection.ext, "callerid", None),
+            getattr(connection.ext, "latching", None),
+        )
+        header = (
+            connection.topic,
+            connection.msgtype,
+            connection.msgdef.data,
+            connection.digest,
+            caller,
+            latching,
+        )
+        self._write(header, time_ns, data)
 
     def publish(self, outcome: Outcome) -> None:
         """Write what monitors published."""
         for message in outcome.published:
-            key = (message.topic, message.type)
-            if key not in self._connections:
-                package, _, kind = message.type.partition("/")
-                self._connections[key] = self._writer.add_connection(
-                    message.topic,
-                    f"{package}/msg/{kind}",
-                    msgdef=self._definitions.full_text(message.type),
-                    md5sum=self._definitions.md5sum(message.type),
-                    callerid="/rosrv",
-                )
-            self._writer.write(self._connections[key], outcome.time, message.data)
+            package, _, kind = message.type.partition("/")
+            text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
+            header = (message.topic, f"{package}/msg/{kind}", text, digest, "/rosrv", None)
+            self._write(header, outcome.time, message.data)
+
+    def _write(self, header: _Header, time_ns: int, data: bytes) -> None:
+        if header not in self._connections:
+            topic, kind, text, digest, caller, latching = header
+            self._connections[header] = self._writer.add_connection(
+                topic, kind, msgdef=text, md5sum=digest, callerid=caller, latching=latching
+            )
+        self._writer.write(self._connections[header], time_ns, data)
 
 
 def replay(monitors: MonitorSet, reader: Reader, output: Recording | None) -> Iterator[Replayed]:

@@ -36,9 +36,6 @@ OnFault = Literal["drop", "pass"]
 MAX_TICKS = 100_000
 """Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
 
-FAILING_AFTER = 10
-"""Faults after which a monitor is shown as failing."""
-
 
 class MonitorSet:
     """Specifications in force together."""
@@ -132,9 +129,14 @@ class MonitorSet:
         on one of them starts its timers with its first message. With `restarted`, specifications with the
         modifier `hold` block their topics until `resume`.
         """
+        return self._start(self._monitors, time_ns, expected, restarted=restarted)
+
+    def _start(
+        self, monitors: Sequence[Monitor], time_ns: int, expected: frozenset[str] | None, *, restarted: bool
+    ) -> Outcome:
         outcome = Outcome(time=time_ns)
         self._turn.now = time_ns
-        for monitor in self._monitors:
+        for monitor in monitors:
             self._begin(monitor, time_ns, outcome)
             monitor.held = restarted and monitor.code.hold
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
@@ -147,17 +149,27 @@ class MonitorSet:
     def replaced(
         self, sources: Mapping[str, str], definitions: Definitions, time_ns: int
     ) -> tuple["MonitorSet", Outcome]:
-        """The set that takes this one's place, started; specifications with the same text keep their state."""
+        """The set that takes this one's place, started.
+
+        Specifications with the same text keep their state, `init` included; but if a message type that is in
+        both sets of definitions has changed, all begin anew. Raises `SpecificationError`, and nothing changed.
+        """
         following = MonitorSet.load(sources, definitions, self._on_fault)
-        outcome = following.start(time_ns)
-        known = {monitor.name: monitor for monitor in self._monitors}
+        known = {monitor.name: monitor for monitor in self._monitors} if self._same_types(definitions) else {}
+        fresh = []
         for monitor in following.monitors:
             before = known.get(monitor.name)
             if before is not None and before.node == monitor.node:
                 following._take_over(monitor, before, self._compiled)
+            else:
+                fresh.append(monitor)
         following._index()
-        following._schedule()
-        return following, outcome
+        return following, following._start(fresh, time_ns, None, restarted=False)
+
+    def _same_types(self, definitions: Definitions) -> bool:
+        mine = self.definitions
+        both = set(mine.message_types) & set(definitions.message_types)
+        return mine is definitions or all(mine.message(name) == definitions.message(name) for name in both)
 
     def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
         """Let the events of a monitor happen, or not; raises KeyError.

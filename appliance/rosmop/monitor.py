@@ -10,6 +10,9 @@ from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.syntax import tree
 
+FAILING_AFTER = 10
+"""Faults after which a monitor is shown as failing."""
+
 Handler = Callable[[Message | None], None]
 
 
@@ -73,6 +76,11 @@ class Monitor:
     def name(self) -> str:
         """The name of the specification."""
         return self.code.name
+
+    @property
+    def failing(self) -> bool:
+        """Whether it has faulted so often, or could not even begin, that somebody should look."""
+        return self.broken or self.faults >= FAILING_AFTER
 
 
 def monitors_of(compiled: Compiled, nodes: list[tree.Specification], time_ns: int) -> tuple[Monitor, ...]:

@@ -4,6 +4,7 @@
 
 import pytest
 
+from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MAX_TICKS, MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -361,9 +362,12 @@ def test_a_property_does_not_step_on_an_event_that_faults() -> None:
 def test_faults_are_counted() -> None:
     """So that a monitor can be shown as failing."""
     monitors = load("a() {" + on("/t", "e", "x = 1 / x;") + "}")
-    for i in range(3):
+    seen = []
+    for i in range(12):
+        seen.append(monitors.monitor("a").failing)
         monitors.process("/t", number(0), i)
-    assert monitors.monitor("a").faults == 3
+    assert monitors.monitor("a").faults == 12
+    assert seen == [False] * 10 + [True] * 2
 
 
 def test_a_fault_leaves_the_budget_of_the_next_message_whole() -> None:
@@ -528,3 +532,28 @@ def test_time_does_not_pass_for_a_disabled_monitor() -> None:
     assert monitors.advance(10 * SECOND) == []
     monitors.set_enabled("a", True, 10 * SECOND)
     assert monitors.process("/t", number(0), 11 * SECOND).before == ()
+
+
+def test_init_of_an_unchanged_specification_does_not_run_again() -> None:
+    """A swap is nothing to what stays: no `init`, no output; a new one may read its variables in `init`."""
+    kept = 'a() { int n = 1; init() { ROS_INFO("again"); }' + on("/t", "e", "n++;") + "}"
+    monitors = load(kept)
+    monitors.process("/t", number(0), 1)
+    new = 'b() { int m; init() { m = n; ROS_INFO("%d", m); }' + on("/u") + "}"
+    _, outcome = monitors.replaced({"a.rv": kept, "b.rv": new}, definitions(), 2)
+    assert printed(outcome) == ["2"]
+
+
+def test_a_changed_message_type_begins_anew() -> None:
+    """Values of a type that is another now are not kept."""
+    text = "a() { own::T v; int n; event e(int x) /t own/T '{x:x}' { n++; ROS_INFO(\"%d\", n); } }"
+    first = Definitions.from_files({"own/T.msg": "int32 x\n"})
+    monitors = MonitorSet.load({"x.rv": text}, first)
+    monitors.start(0)
+    monitors.process("/t", b"\1\0\0\0", 1)
+    same, _ = monitors.replaced({"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 x\n"}), 2)
+    assert printed(same.process("/t", b"\1\0\0\0", 3)) == ["2"]
+    other, _ = monitors.replaced(
+        {"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 y\nint32 x\n"}), 2
+    )
+    assert printed(other.process("/t", b"\1\0\0\0" * 2, 3)) == ["1"]
