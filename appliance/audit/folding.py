@@ -7,6 +7,8 @@ Invariants:
 3. A kind is forgotten when it did not repeat for `seconds`; its next denial is recorded in full again.
 4. An allow for the same host, caller, category and resource ends the kinds it contradicts: their summaries
    come before it.
+5. What passed is never folded, also when it passed only because a policy is on trial (`would deny`): a policy
+   is learned from all of it.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,6 +20,7 @@ from appliance.audit.record import Record, RuleReference, Severity
 
 Key = tuple[str | int | None, ...]
 _SAMPLES = 8
+_ABOUT = ("call", "key", "node", "subgraph")  # fields of `detail` that say what a call was about
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class Folder:
         """The records to write for this one: itself, nothing (counted), or summaries and itself."""
         if not self._settings.seconds:
             yield record
-        elif record.decision in ("deny", "would deny") or record.event in self._settings.events:
+        elif record.decision == "deny" or record.event in self._settings.events:
             if self._count(record, now):
                 yield record
         else:
@@ -120,7 +123,10 @@ class Folder:
     def _key(self, record: Record) -> tuple[Key, str]:
         rule = record.rule
         where: Key = () if rule is None else (rule.section, rule.key, rule.file, rule.line)
-        key: Key = (*_subject(record), record.event, record.decision, record.reason, record.revision, *where)
+        about = tuple(str(record.detail.get(name)) for name in _ABOUT)
+        key: Key = (
+            *_subject(record), record.event, record.decision, record.reason, record.revision, *about, *where,
+        )  # fmt: skip
         if key in self._states:
             return key, "kind"
         if len(self._states) >= self._settings.keys:

@@ -1,4 +1,4 @@
-"""`rosrv policy check|explain|test|diff`: judge a policy before it is in force; no appliance needs to run.
+"""`rosrv policy check|explain|test|diff|learn`: judge a policy before it is in force; no appliance needs to run.
 
 Exit status: 0 allowed, right, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
 """
@@ -19,6 +19,7 @@ from appliance.cli.policy_input import (
     requests_of_file,
     usage_error,
 )
+from appliance.cli.policy_learn import learn_policy
 from appliance.cli.policy_output import (
     counted,
     decision_fields,
@@ -44,7 +45,8 @@ from appliance.policy.explain import Explanation, render
 from appliance.policy.findings import Severity
 from appliance.policy.policy import needs_node_rule
 
-app = typer.Typer(help="Check, explain, test and compare access policies.", no_args_is_help=True)
+app = typer.Typer(help="Check, explain, test, compare and learn access policies.", no_args_is_help=True)
+app.command("learn")(learn_policy)
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]

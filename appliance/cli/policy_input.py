@@ -40,9 +40,14 @@ def read_text(file: Path) -> str:
 
 def compile_file(file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
     """The policy in a file; raises `PolicyError`."""
-    networks = [_network(text) for text in robot or ()]
+    networks = networks_of(robot)
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return compile_policy(read_text(file), file=str(file), hosts=hosts, robot=networks)
+
+
+def networks_of(robot: list[str] | None) -> list[Network]:
+    """What `--robot` says."""
+    return [_network(text) for text in robot or ()]
 
 
 def _network(text: str) -> Network:

@@ -115,3 +115,23 @@ def test_zero_seconds_records_everything() -> None:
     folder = make_folder(seconds=0)
     same = [denial() for _ in range(10)]
     assert offer(folder, *same) == same
+
+
+def test_what_passed_on_trial_is_never_folded() -> None:
+    """Every `would deny` is a record of its own, like every allow: a policy can be learned from them."""
+    folder = Folder(FoldSettings(), lambda: "0" * 20, lambda: 0)
+    record = denial(decision="would deny")
+    assert [list(folder.offer(record, 0.0)) for _ in range(3)] == [[record]] * 3
+    assert len(folder) == 0
+
+
+def test_denials_of_different_parameters_are_different() -> None:
+    """The same call on another key, or another call, is recorded in full; the same again is counted."""
+    folder = Folder(FoldSettings(), lambda: "0" * 20, lambda: 0)
+    kinds = [
+        denial(resource="getParam", detail={"call": "getParam", "key": "/a"}),
+        denial(resource="getParam", detail={"call": "getParam", "key": "/b"}),
+        denial(resource="getParam", detail={"call": "hasParam", "key": "/b"}),
+    ]
+    assert [list(folder.offer(one, 0.0)) for one in kinds] == [[one] for one in kinds]
+    assert [list(folder.offer(one, 0.0)) for one in kinds] == [[], [], []]

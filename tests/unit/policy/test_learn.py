@@ -1,0 +1,145 @@
+"""Tests of `appliance.policy.learn`."""
+
+import ipaddress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.policy import Category, Policy, Request, compile_policy
+from appliance.policy.commands import COMMANDS
+from appliance.policy.learn import Learned, Observation, learn, rights_of
+
+ROBOT = ipaddress.ip_address("192.0.2.10")
+HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]
+NAMES = ["/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000", "/tool_99_1700000000001/x"]
+
+
+def seen(
+    host: str, category: Category, resource: str, *, node: str = "/n", call: str = "", key: str = ""
+) -> Observation:
+    """One request that passed."""
+    return Observation(Request(ipaddress.ip_address(host), node, category, resource), call, key)
+
+
+def compiled(learned: Learned) -> Policy:
+    """What was learned, as a policy."""
+    return compile_policy(learned.text, file="learned", robot=[ROBOT])
+
+
+def test_what_was_done_is_granted_and_nothing_else() -> None:
+    """The topic, the node name that goes with it, to the host that used it; not the other direction, name or host."""
+    policy = compiled(learn([seen("10.0.0.1", Category.PUBLISH, "/cmd_vel", node="/joy")]))
+    host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
+    assert policy.decide_with_node(Request(host, "/joy", Category.PUBLISH, "/cmd_vel")).allowed
+    for request in (
+        Request(other, "/joy", Category.PUBLISH, "/cmd_vel"),
+        Request(host, "/joy2", Category.PUBLISH, "/cmd_vel"),
+        Request(host, "/joy", Category.SUBSCRIBE, "/cmd_vel"),
+        Request(host, "/joy", Category.PUBLISH, "/cmd_vel/x"),
+        Request(host, "/joy", Category.COMMAND, "shutdown"),
+        Request(host, "/joy", Category.OFFER, "/s"),
+        Request(host, "/joy", Category.CALL, "/s"),
+        Request(host, "/joy", Category.READ, "/p"),
+        Request(host, "/joy", Category.WRITE, "/p"),
+    ):
+        assert not policy.decide_with_node(request).allowed, request
+
+
+def test_anonymous_names_become_patterns() -> None:
+    """The next run of a tool has another number, and is let in; a name that only looks alike is not."""
+    listener = "/listener_1700000000123456789"
+    learned = learn([
+        seen("10.0.0.1", Category.SUBSCRIBE, "/chatter", node="/rostopic_4711_1700000000000"),
+        seen("10.0.0.1", Category.OFFER, f"{listener}/get_loggers", node=listener),
+    ])  # fmt: skip
+    policy = compiled(learned)
+    host = ipaddress.ip_address("10.0.0.1")
+    for node in ("/rostopic_1_1800000000000", "/listener_1800000000123456789"):
+        assert policy.decide(Request(host, node, Category.NODE, node)).allowed
+    assert policy.decide(
+        Request(host, "", Category.OFFER, "/listener_1800000000123456789/get_loggers")
+    ).allowed
+    assert not policy.decide(Request(host, "", Category.NODE, "/rostopic")).allowed
+    assert "/a_1 " in learn([seen("10.0.0.1", Category.PUBLISH, "/a_1")]).text
+
+
+def test_a_parameter_call_needs_the_call_and_the_key() -> None:
+    """Who read a namespace may read what is below it, also where another host used a narrower key."""
+    policy = compiled(learn([
+        seen("10.0.0.1", Category.COMMAND, "getParam", call="getParam", key="/arm"),
+        seen("10.0.0.2", Category.COMMAND, "getParam", call="getParam", key="/arm/max"),
+        seen("10.0.0.2", Category.COMMAND, "setParam", call="setParam", key="/arm/max"),
+    ]))  # fmt: skip
+    one, two = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
+    for host, category, key, allowed in (
+        (one, Category.READ, "/arm", True), (one, Category.READ, "/arm/max", True),
+        (two, Category.READ, "/arm/max", True), (two, Category.READ, "/arm", False),
+        (two, Category.WRITE, "/arm/max", True), (one, Category.WRITE, "/arm/max", False),
+    ):  # fmt: skip
+        request = Request(host, "/n", category, key)
+        assert policy.decide_parameter(request, namespace=True).allowed is allowed, request
+    assert policy.decide(Request(one, "/n", Category.COMMAND, "getParam")).allowed
+    assert not policy.decide(Request(one, "/n", Category.COMMAND, "setParam")).allowed
+
+
+def test_the_robot_is_called_robot() -> None:
+    """Its address stands as the group, so that the policy holds where the robot has another."""
+    learned = learn(
+        [seen("192.0.2.10", Category.PUBLISH, "/a"), seen("10.0.0.1", Category.PUBLISH, "/a")], [ROBOT]
+    )
+    assert "/a = robot 10.0.0.1" in learned.text
+    assert "192.0.2.10" not in learned.text
+
+
+@pytest.mark.parametrize(
+    ("category", "resource"),
+    [(Category.COMMAND, "noSuchCall"), (Category.COMMAND, "registerPublisher"), (Category.PUBLISH, "no slash"),
+     (Category.PUBLISH, "/a\n[Commands]\ndefault = *"), (Category.PUBLISH, "/a = *  #"), (Category.NODE, "/é")],
+)  # fmt: skip
+def test_a_strangers_text_is_no_rule(category: Category, resource: str) -> None:
+    """What cannot be granted is left out and counted; nothing that was sent is written into the policy as it is."""
+    learned = learn([seen("10.0.0.1", category, resource), seen("10.0.0.1", Category.PUBLISH, "/ok")])
+    assert (learned.requests, learned.left_out) == (1, 1)
+    assert resource not in learned.text
+    evil = learn([seen("10.0.0.1", Category.COMMAND, "getPid", node="/x\ndefault = *")])
+    assert "default" not in evil.text
+
+
+_observations = st.builds(
+    lambda host, node, what: Observation(Request(host, node, what[0], what[1]), what[2], what[3]),
+    st.sampled_from(HOSTS),
+    st.sampled_from(NAMES),
+    st.one_of(
+        st.tuples(
+            st.sampled_from([Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER, Category.NODE]),
+            st.sampled_from(NAMES), st.just(""), st.just(""),
+        ),
+        st.tuples(st.just(Category.CALL), st.sampled_from(NAMES), st.just("lookupService"), st.just("")),
+        st.tuples(st.just(Category.COMMAND), st.sampled_from(sorted(COMMANDS)), st.just(""), st.just("")),
+        st.sampled_from(["getParam", "hasParam", "subscribeParam", "setParam", "deleteParam"]).flatmap(
+            lambda call: st.tuples(
+                st.just(Category.COMMAND), st.just(call), st.just(call), st.sampled_from([*NAMES, "/"])
+            )
+        ),
+    ),
+)  # fmt: skip
+
+
+@given(st.lists(_observations, min_size=1, max_size=40))
+def test_the_same_run_passes_under_what_was_learned(observations: list[Observation]) -> None:
+    """Whatever was observed, the learned policy is right and grants every right that was used."""
+    policy = compiled(learn(observations, [ROBOT]))
+    for observation in observations:
+        for request in rights_of(observation):
+            assert policy.decide_with_node(request).allowed, (request, policy.text)
+
+
+@given(st.lists(_observations, min_size=1, max_size=20), _observations)
+def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation], other: Observation) -> None:
+    """Rights go to hosts that were seen only."""
+    policy = compiled(learn(observations, [ROBOT]))
+    stranger = Request(
+        ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource
+    )
+    assert not policy.decide_with_node(stranger).allowed
