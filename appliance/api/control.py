@@ -4,10 +4,12 @@ Invariants:
 
 1. At most `_MOST_OPEN` questions are open; one more is refused here and costs control nothing.
 2. A question ends: with its answer, with the link, or after `seconds`.
-3. What is told (`tell`) never waits: when control does not read, it is dropped and counted.
+3. What is told (`tell`) never waits. While there is no control it is kept, the last `_MOST_KEPT` of it, and told to the
+   next one; what is lost is counted and logged.
 """
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +21,7 @@ from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullEr
 
 _log = structlog.get_logger()
 _MOST_OPEN = 48
+_MOST_KEPT = 1000
 ANSWER_SECONDS = 15.0
 
 
@@ -34,6 +37,7 @@ class ControlLink:
         self._channel: Channel | None = None
         self._open: dict[int, asyncio.Future[AdminAnswer]] = {}
         self._number = 0
+        self._kept: deque[messages.RestCalled] = deque()
         self._dropped = 0
         self.known = False  # whether the tokens were told on this link
         self.lost: Callable[[], None] = lambda: None
@@ -79,15 +83,19 @@ class ControlLink:
 
     def tell(self, call: messages.RestCalled) -> None:
         """Have a call recorded."""
-        if self._channel is None:
-            self._dropped += call.count
-            return
-        try:
-            self._channel.send(call)
-        except (ChannelFullError, ChannelClosedError):
-            self._dropped += call.count
-            return
-        if self._dropped:
+        self._kept.append(call)
+        if len(self._kept) > _MOST_KEPT:
+            self._dropped += self._kept.popleft().count
+        self._tell_kept()
+
+    def _tell_kept(self) -> None:
+        while self._kept and self._channel is not None:
+            try:
+                self._channel.send(self._kept[0])
+            except (ChannelFullError, ChannelClosedError):
+                return
+            self._kept.popleft()
+        if self._dropped and self._channel is not None:
             _log.warning("REST calls were not recorded while control was away", calls=self._dropped)
             self._dropped = 0
 
@@ -105,6 +113,7 @@ class ControlLink:
                     waiting.set_result(answer)
             case messages.TokensStated(tokens):
                 self.known = True
+                self._tell_kept()
                 self._tokens_stated(tokens)
             case _:
                 _log.error("control said something that is not for the api", message=type(message).__name__)

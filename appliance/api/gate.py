@@ -31,6 +31,7 @@ PUBLIC = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/ope
 BEARER = "rosrv.bearer"  # the key of a request's scope that has who asks
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
 _BODY_SECONDS = 30.0
+_NOBODYS_BODY = 1024  # bytes of a body that somebody without a token may send
 _SEND_SECONDS = 30.0
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -93,7 +94,8 @@ class Gate:
         bearer = None
         if scope["path"] not in PUBLIC:
             bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
-        return bearer, await self._read(headers, receive)
+        limit = int(self._limits.body_bytes) if bearer is not None else _NOBODYS_BODY
+        return bearer, await _read(headers, receive, limit)
 
     def _check_host(self, headers: Headers) -> None:
         given = headers.getlist("host")
@@ -104,34 +106,6 @@ class Gate:
                 "wrong-host",
                 "the appliance is not called by this name: use its address, or add the name to api_names",
             )
-
-    async def _read(self, headers: Headers, receive: Receive) -> bytes:
-        limit = int(self._limits.body_bytes)
-        too_large = ProblemError(
-            413, "too-large", f"the body is larger than {limit} bytes", headers={"Connection": "close"}
-        )
-        length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > limit:
-            raise too_large
-        body = bytearray()
-        try:
-            async with asyncio.timeout(_BODY_SECONDS):
-                while True:
-                    message = await receive()
-                    if message["type"] == "http.disconnect":
-                        raise ConnectionResetError("the client went away")
-                    body += message.get("body", b"")
-                    if len(body) > limit:
-                        raise too_large
-                    if not message.get("more_body", False):
-                        return bytes(body)
-        except TimeoutError:
-            raise ProblemError(
-                408,
-                "too-slow",
-                f"the body was not there within {_BODY_SECONDS:g} s",
-                headers={"Connection": "close"},
-            ) from None
 
 
 class _Answer:
@@ -211,3 +185,31 @@ def _check_origin(scope: Scope, headers: Headers) -> None:
     origin = headers.get("origin")
     if origin is not None and origin.lower() != f"{scope['scheme']}://{headers['host']}".lower():
         raise ProblemError(403, "foreign-origin", "requests that pages of other sites make are not served")
+
+
+async def _read(headers: Headers, receive: Receive, limit: int) -> bytes:
+    too_large = ProblemError(
+        413, "too-large", f"the body is larger than {limit} bytes", headers={"Connection": "close"}
+    )
+    length = headers.get("content-length", "0")
+    if not length.isdigit() or int(length) > limit:
+        raise too_large
+    body = bytearray()
+    try:
+        async with asyncio.timeout(_BODY_SECONDS):
+            while True:
+                message = await receive()
+                if message["type"] == "http.disconnect":
+                    raise ConnectionResetError("the client went away")
+                body += message.get("body", b"")
+                if len(body) > limit:
+                    raise too_large
+                if not message.get("more_body", False):
+                    return bytes(body)
+    except TimeoutError:
+        raise ProblemError(
+            408,
+            "too-slow",
+            f"the body was not there within {_BODY_SECONDS:g} s",
+            headers={"Connection": "close"},
+        ) from None

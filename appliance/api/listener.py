@@ -3,7 +3,8 @@
 Invariants:
 
 1. At most `connections` are open, and `connections_per_host` of one peer; one more is closed at once.
-2. A connection whose TLS handshake, or whose next request's headers, take longer than `header_seconds` is closed.
+2. A connection whose TLS handshake, or whose next request's headers, take longer than `header_seconds` is closed;
+   so is one whose headers are longer than `_HEAD_BYTES` (uvicorn would keep all of them).
 """
 
 import asyncio
@@ -21,6 +22,7 @@ from appliance.api.rates import peer_key
 from appliance.config import ApiLimits
 
 _KEEP_ALIVE_SECONDS = 30
+_HEAD_BYTES = 64 << 10
 _END_SECONDS = 1.0
 
 
@@ -56,6 +58,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._header_seconds = header_seconds
         self._visitor: str | None = None
         self._deadline: asyncio.TimerHandle | None = None
+        self._head = 0  # bytes that came since headers are expected
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         """Serve a new connection, unless there are too many."""
@@ -78,8 +81,13 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse what came."""
-        if self._visitor is not None:
-            super().data_received(data)
+        if self._visitor is None:
+            return
+        if self._deadline is not None:
+            self._head += len(data)
+        super().data_received(data)
+        if self._deadline is not None and self._head > _HEAD_BYTES:
+            self.transport.abort()
 
     def on_message_begin(self) -> None:
         """A request begins."""
@@ -99,6 +107,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
+            self._head = 0
 
 
 class Listener:

@@ -9,6 +9,7 @@ import asyncio
 import datetime
 import os
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from appliance.config import Settings, load_resolved
 
 _log = structlog.get_logger()
 _WITHOUT_CONTROL_SECONDS = 30.0
+_THREADS = 40
 
 
 def main(lifeline_fd: int, config: Path) -> None:
@@ -53,7 +55,10 @@ class _Api:
 
     async def run(self) -> None:
         """Serve from start to end."""
-        self._lifeline.attach(asyncio.get_running_loop(), self._received, self._end)
+        loop = asyncio.get_running_loop()
+        # More than all that is done in threads at once: no verification of the log keeps a token from being checked.
+        loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
+        self._lifeline.attach(loop, self._received, self._end)
         services = Services(self._settings, self._control, self._doorkeeper, self._journal, self._stopping)
         app = build_app(services)
         gate = Gate(

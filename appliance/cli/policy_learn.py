@@ -1,5 +1,6 @@
 """`rosrv policy learn`: a least-privilege policy out of the audit log."""
 
+import json
 import os
 import sys
 import time
@@ -30,6 +31,9 @@ def learn_policy(
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     robot: Robot = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object: the text, and what it stands on")
+    ] = False,
 ) -> None:
     """Write the policy that grants what was done according to the audit log, and nothing else.
 
@@ -42,10 +46,14 @@ def learn_policy(
         typer.echo("rosrv: no request that passed is in the audit log (since then)", err=True)
         raise typer.Exit(1)
     _check(learned, robot)
+    if output is not None:
+        _write(output, learned.text)
+    if as_json:
+        fields = {"requests": learned.requests, "left_out": learned.left_out, "text": learned.text}
+        sys.stdout.write(json.dumps(fields) + "\n")
+        return
     if output is None:
         sys.stdout.write(learned.text)
-    else:
-        _write(output, learned.text)
     left_out = (
         f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
         if learned.left_out

@@ -1,0 +1,128 @@
+"""Tests of `appliance.api.control` over a real link."""
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from appliance.api.control import ControlAwayError, ControlLink
+from appliance.channel import messages
+from appliance.channel.admin import AdminAnswer, StatusWanted
+from appliance.channel.channel import Channel
+from appliance.channel.messages import RestCalled, TokenKept
+
+
+class Control:
+    """Control's end: hears, and answers when told to."""
+
+    def __init__(self, link: ControlLink, ends: list[Channel]) -> None:
+        here, there = socket.socketpair()
+        api, self.channel = Channel(here, messages.ApiLink), Channel(there, messages.ApiLink)
+        ends += [api, self.channel]
+        self.heard: list[Any] = []
+        self._changed = asyncio.Event()
+        link.attach(api)
+        self.channel.attach(asyncio.get_running_loop(), self._received, lambda: None)
+
+    def _received(self, message: Any, _descriptors: tuple[int, ...]) -> None:
+        self.heard.append(message)
+        self._changed.set()
+
+    async def until(self, count: int) -> list[Any]:
+        """What was heard, once it is so much."""
+        async with asyncio.timeout(20):
+            while len(self.heard) < count:
+                self._changed.clear()
+                await self._changed.wait()
+        return self.heard
+
+
+def run(play: Callable[[ControlLink, Callable[[], Control], list[TokenKept]], Awaitable[None]]) -> None:
+    """Play one conversation; `play` gets the link, a way to make a control, and the tokens that were heard."""
+
+    async def whole() -> None:
+        ends: list[Channel] = []
+        tokens: list[TokenKept] = []
+        link = ControlLink(tokens.extend)
+        try:
+            await play(link, lambda: Control(link, ends), tokens)
+        finally:
+            for end in ends:
+                end.close()
+
+    asyncio.run(whole())
+
+
+def call(number: int) -> RestCalled:
+    """A call to be recorded."""
+    return RestCalled("h", "w", "GET", f"/{number}", 200, "", 1)
+
+
+def test_each_question_gets_its_own_answer() -> None:
+    """Answers that come in another order are paired by number."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
+        there = control()
+        asked = [asyncio.create_task(link.ask(StatusWanted(), f"who{one}")) for one in range(3)]
+        for made in reversed(await there.until(3)):
+            there.channel.send(messages.RequestAnswered(made.number, AdminAnswer(True, {"who": made.who})))
+        assert [(await one).body["who"] for one in asked] == ["who0", "who1", "who2"]
+
+    run(play)
+
+
+def test_a_question_ends_with_the_link_or_in_time() -> None:
+    """Without a control, with one that dies, is replaced or is silent, the asker is told; nothing waits for ever."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
+        with pytest.raises(ControlAwayError, match="restarted"):
+            await link.ask(StatusWanted(), "w")
+        there = control()
+        with pytest.raises(ControlAwayError, match=r"within 0\.01 s"):
+            await link.ask(StatusWanted(), "w", seconds=0.01)
+        dying = asyncio.create_task(link.ask(StatusWanted(), "w"))
+        await there.until(2)
+        there.channel.close()
+        with pytest.raises(ControlAwayError, match="not known"):
+            await dying
+        there = control()
+        replaced = asyncio.create_task(link.ask(StatusWanted(), "w"))
+        await there.until(1)
+        control()
+        with pytest.raises(ControlAwayError):
+            await replaced
+
+    run(play)
+
+
+def test_open_questions_are_bounded() -> None:
+    """A flood of questions costs a silent control no more than so many."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
+        there = control()
+        asked = [asyncio.create_task(link.ask(StatusWanted(), "w", seconds=1)) for _ in range(200)]
+        answers = await asyncio.gather(*asked, return_exceptions=True)
+        assert all(isinstance(one, ControlAwayError) for one in answers)
+        assert len(there.heard) == 48
+
+    run(play)
+
+
+def test_what_happened_meanwhile_is_told_to_the_next_control() -> None:
+    """Calls answered while control was away are recorded when it is back, in order; the oldest go when too many."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], tokens: list[TokenKept]) -> None:
+        for number in range(1100):
+            link.tell(call(number))
+        there = control()
+        assert not link.connected
+        token = TokenKept("0123456789ab", "a", "viewer", b"", b"", 1.0)
+        there.channel.send(messages.TokensStated([token]))
+        heard = await there.until(1000)
+        assert [one.path for one in heard] == [f"/{number}" for number in range(100, 1100)]
+        assert tokens == [token]
+        assert link.connected
+
+    run(play)

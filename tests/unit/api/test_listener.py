@@ -1,0 +1,143 @@
+"""Tests of `appliance.api.listener` over loopback sockets, with a small application behind it."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Awaitable, Callable
+
+from starlette.responses import PlainTextResponse
+from starlette.types import Receive, Scope, Send
+
+from appliance.api.listener import Listener
+from appliance.config import ApiLimits
+
+REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
+
+
+async def application(scope: Scope, receive: Receive, send: Send) -> None:
+    """Says what it was asked for."""
+    await PlainTextResponse(scope["path"])(scope, receive, send)
+
+
+def run(limits: ApiLimits, play: Callable[[Connect], Awaitable[None]]) -> None:
+    """Serve on a free port and play; `play` gets a way to connect."""
+
+    async def whole() -> None:
+        sock = socket.create_server(("127.0.0.1", 0))
+        listener = Listener(application, limits)
+        await listener.start(sock, None)
+        writers: list[asyncio.StreamWriter] = []
+
+        async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+            reader, writer = await asyncio.open_connection(*sock.getsockname())
+            writers.append(writer)
+            return reader, writer
+
+        try:
+            async with asyncio.timeout(30):
+                await play(connect)
+        finally:
+            for writer in writers:
+                writer.close()
+                with contextlib.suppress(ConnectionError):
+                    await writer.wait_closed()
+            await listener.stop()
+
+    asyncio.run(whole())
+
+
+async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    """Whether a request is answered; False when the connection is closed instead."""
+    try:
+        writer.write(REQUEST)
+        await writer.drain()
+        line = await reader.readline()
+        return line.startswith(b"HTTP/1.1 200")
+    except ConnectionError:
+        return False
+
+
+async def cut_off(reader: asyncio.StreamReader) -> bool:
+    """Whether the server closes without a word."""
+    try:
+        return await reader.read(1) == b""
+    except ConnectionError:
+        return True
+
+
+def test_a_host_has_so_many_connections() -> None:
+    """One more is closed at once; when one of them ends there is room again."""
+
+    async def play(connect: Connect) -> None:
+        first = [await connect() for _ in range(3)]
+        assert all([await served(*one) for one in first])
+        assert not await served(*await connect())
+        first[0][1].close()
+        while not await served(*await connect()):
+            pass
+
+    run(ApiLimits(connections_per_host=3), play)
+
+
+def test_all_hosts_together_have_so_many() -> None:
+    """The limit for all holds whatever one host may have."""
+
+    async def play(connect: Connect) -> None:
+        assert all([await served(*await connect()) for _ in range(2)])
+        assert not await served(*await connect())
+
+    run(ApiLimits(connections=2, connections_per_host=50), play)
+
+
+def test_who_does_not_finish_his_headers_is_cut_off() -> None:
+    """At the first request and at a later one on the same connection; a new one is served."""
+
+    async def play(connect: Connect) -> None:
+        slow, later = await connect(), await connect()
+        slow[1].write(REQUEST[:20])
+        assert await served(*later)
+        await later[0].readuntil(b"\r\n\r\n")
+        await later[0].readexactly(1)
+        later[1].write(REQUEST[:20])
+        assert await cut_off(slow[0])
+        assert await cut_off(later[0])
+        assert await served(*await connect())
+
+    run(ApiLimits(header_seconds=0.3), play)
+
+
+def test_headers_without_end_are_cut_off() -> None:
+    """A head may have 64 KiB, not more, however quickly it comes."""
+
+    async def play(connect: Connect) -> None:
+        reader, writer = await connect()
+        writer.write(REQUEST[:16])
+        try:
+            for _ in range(10_000):
+                writer.write(b"X-A: " + b"x" * 1000 + b"\r\n")
+                await writer.drain()
+        except ConnectionError:
+            pass
+        else:
+            raise AssertionError("ten megabytes of headers were taken")
+        assert await cut_off(reader)
+        reader, writer = await connect()
+        writer.write(REQUEST[:-2] + b"X-B: " + b"y" * 50_000 + b"\r\n\r\n")
+        assert (await reader.readline()).startswith(b"HTTP/1.1 200")
+
+    run(ApiLimits(), play)
+
+
+def test_many_requests_on_one_connection_are_served() -> None:
+    """The limits are per request: a client that keeps its connection is never cut off for what it sent before."""
+
+    async def play(connect: Connect) -> None:
+        reader, writer = await connect()
+        for _ in range(200):
+            writer.write(REQUEST[:-2] + b"X-C: " + b"z" * 2000 + b"\r\n\r\n")
+            assert (await reader.readline()).startswith(b"HTTP/1.1 200")
+            await reader.readuntil(b"\r\n\r\n")
+            assert await reader.readexactly(1) == b"/"
+
+    run(ApiLimits(), play)
