@@ -73,6 +73,12 @@ class Observations:
             )
         )
 
+    def add(self, kind: str, monitor: str, place: tuple[str, str], time: int, count: int) -> None:
+        """So many more happened at `place`; they are told as a count."""
+        key = (kind, monitor, *place, "")
+        self._told[key] = self._told.get(key, 0) + count
+        self._last[key] = time
+
     def tick(self) -> None:
         """A second is over: tell the counts, and the state of the monitors if it changed."""
         for key, count in self._told.items():

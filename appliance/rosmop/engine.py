@@ -51,6 +51,7 @@ class MonitorSet:
         self._steps: dict[str, tuple[Step, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
         self._due: int | None = None
+        self.began: tuple[str, ...] = ()
         self._timed = False
         self._index()
 
@@ -136,6 +137,7 @@ class MonitorSet:
     ) -> Outcome:
         outcome = Outcome(time=time_ns)
         self._turn.now = time_ns
+        self.began = tuple(monitor.name for monitor in monitors)
         for monitor in monitors:
             self._begin(monitor, time_ns, outcome)
             monitor.held = restarted and monitor.code.hold
@@ -155,16 +157,22 @@ class MonitorSet:
         both sets of definitions has changed, all begin anew. Raises `SpecificationError`, and nothing changed.
         """
         following = MonitorSet.load(sources, definitions, self._on_fault)
-        known = {monitor.name: monitor for monitor in self._monitors} if self._same_types(definitions) else {}
+        return following, following.succeed(self, time_ns)
+
+    def succeed(self, before: "MonitorSet", time_ns: int) -> Outcome:
+        """Take the place of another set, as `replaced` says; `began` names those that begin with this one."""
+        known = {monitor.name: monitor for monitor in before.monitors}
+        if not before._same_types(self.definitions):
+            known = {}
         fresh = []
-        for monitor in following.monitors:
-            before = known.get(monitor.name)
-            if before is not None and before.node == monitor.node:
-                following._take_over(monitor, before, self._compiled)
+        for monitor in self.monitors:
+            earlier = known.get(monitor.name)
+            if earlier is not None and earlier.node == monitor.node:
+                self._take_over(monitor, earlier, before._compiled)
             else:
                 fresh.append(monitor)
-        following._index()
-        return following, following._start(fresh, time_ns, None, restarted=False)
+        self._index()
+        return self._start(fresh, time_ns, None, restarted=False)
 
     def _same_types(self, definitions: Definitions) -> bool:
         mine = self.definitions

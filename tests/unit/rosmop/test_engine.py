@@ -425,6 +425,26 @@ def test_an_unchanged_specification_keeps_its_state_through_a_swap() -> None:
     assert printed(following.process("/u", number(0), 11)) == ["5"]
 
 
+def test_what_goes_on_does_not_begin_again() -> None:
+    """Its `init` put out what it had to say at its own beginning; others find its variables as they are now."""
+    first = (
+        "a() { int n = 1; init() { ROS_WARN(\"begins\"); } event e() /t std_msgs/Bool '{}' { n = n + 1; } }"
+    )
+    second = (
+        "b() { int seen = 0; init() { seen = n; ROS_WARN(\"second\"); } event e() /t std_msgs/Bool '{}' {} }"
+    )
+    monitors = MonitorSet.load({"a.rv": first}, definitions())
+    assert [line.text for line in monitors.start(0).log] == ["begins"]
+    monitors.process("/t", b"\x01", 1)
+    following, outcome = monitors.replaced(
+        {"a.rv": first, "b.rv": second.replace("seen = n;", 'ROS_WARN_STREAM("n is " << n);')},
+        definitions(),
+        2,
+    )
+    assert [line.text for line in outcome.log] == ["n is 2", "second"]
+    assert len(following.monitors) == 2
+
+
 def test_a_wrong_set_is_refused_whole() -> None:
     """The set in force stays as it was."""
     monitors = load("a() {" + on("/t", "e", "return;") + "}")

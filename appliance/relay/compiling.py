@@ -1,0 +1,98 @@
+"""Specifications become monitors beside the loop, so that messages go on while a large set is compiled.
+
+One statement at a time, in the order they came; `done` is called by the loop. The first one of a relay is compiled
+at once: nothing is carried yet, and nothing may be before it is in force.
+"""
+
+import os
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from appliance.channel.messages import SpecificationsStated
+from appliance.relay.loop import READ, Loop
+from appliance.ros.definitions import Definitions
+from appliance.ros.errors import DefinitionError
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the compiler
+
+Result = MonitorSet | list[str]
+"""The monitors, or what is wrong with the specifications."""
+
+
+class Compiler:
+    """Compiles statements; `done(statement, result)` hears of each."""
+
+    def __init__(self, loop: Loop, done: Callable[[SpecificationsStated, Result], None]) -> None:
+        self._loop = loop
+        self._done = done
+        self._standard: Definitions | None = None
+        self._waiting: deque[SpecificationsStated] = deque()
+        self._thread: threading.Thread | None = None
+        self._result: Result = []
+        self._wake = -1
+
+    def now(self, message: SpecificationsStated) -> None:
+        """Compile at once."""
+        self._done(message, self._compile(message))
+
+    def later(self, message: SpecificationsStated) -> None:
+        """Compile while the loop goes on."""
+        self._waiting.append(message)
+        if self._thread is None:
+            self._begin()
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is being compiled."""
+        return self._thread is not None
+
+    def close(self) -> None:
+        """Wait for the one that is being compiled; its result is nobody's."""
+        self._waiting.clear()
+        if self._thread is not None:
+            self._thread.join()
+            self._loop.unwatch(self._wake)
+            os.close(self._wake)
+            self._thread = None
+
+    def _begin(self) -> None:
+        if self._wake < 0:
+            sys.setswitchinterval(_SWITCH_SECONDS)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._loop.watch(self._wake, READ, self._ready)
+        self._thread = threading.Thread(target=self._work, args=(self._waiting[0], self._wake), daemon=True)
+        self._thread.start()
+
+    def _work(self, message: SpecificationsStated, wake: int) -> None:
+        self._result = self._compile(message)
+        os.eventfd_write(wake, 1)
+
+    def _ready(self, _events: int) -> None:
+        if self._thread is not None:
+            self._thread.join()
+        self._loop.unwatch(self._wake)
+        os.close(self._wake)
+        self._thread = None
+        self._done(self._waiting.popleft(), self._result)
+        if self._waiting:
+            self._begin()
+
+    def _compile(self, message: SpecificationsStated) -> Result:
+        try:
+            if not message.files:
+                return MonitorSet.load({}, Definitions({}), message.on_fault)
+            if self._standard is None:
+                self._standard = standard_definitions()
+            definitions = self._standard.extended(Definitions.from_files(message.definitions))
+            return MonitorSet.load(dict(message.files), definitions, message.on_fault)
+        except SpecificationError as error:
+            return [str(one) for one in error.findings]
+        except DefinitionError as error:
+            return [str(error)]
+        except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
+            return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
