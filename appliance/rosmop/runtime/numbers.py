@@ -134,6 +134,13 @@ def fmax(left: float, right: float) -> float:
     return right if left != left or right > left else left  # noqa: PLR0124  NaN
 
 
+def positive_difference(left: float, right: float) -> float:
+    """C's `fdim`."""
+    if math.isnan(left) or math.isnan(right):
+        return math.nan
+    return left - right if left > right else 0.0
+
+
 def _exponential(function: Callable[[float], float]) -> Callable[[float], float]:
     return _total(function)
 
@@ -178,7 +185,7 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "fabs": (1, math.fabs),
     "fmin": (2, fmin),
     "fmax": (2, fmax),
-    "fdim": (2, lambda left, right: max(left - right, 0.0) if left == left and right == right else math.nan),  # noqa: PLR0124
+    "fdim": (2, positive_difference),
     "copysign": (2, math.copysign),
     "erf": (1, math.erf),
     "erfc": (1, math.erfc),

@@ -14,7 +14,7 @@ from tests.unit.rosmop.acting import definitions, load, message
 KINDS = (
     "nav_msgs/Odometry", "sensor_msgs/JointState", "sensor_msgs/LaserScan", "nav_msgs/Path", "sensor_msgs/PointCloud2",
     "sensor_msgs/CameraInfo", "trajectory_msgs/JointTrajectory", "diagnostic_msgs/DiagnosticArray", "sensor_msgs/Imu",
-    "visualization_msgs/Marker", "nav_msgs/OccupancyGrid", "geometry_msgs/PolygonStamped", 
+    "visualization_msgs/Marker", "nav_msgs/OccupancyGrid", "geometry_msgs/PolygonStamped",
     "sensor_msgs/MultiDOFJointState",
     "std_msgs/UInt8MultiArray", "geometry_msgs/PoseWithCovarianceStamped", "sensor_msgs/NavSatFix",
 )  # fmt: skip

@@ -1,0 +1,76 @@
+"""What the monitors cost for one message: `python benchmarks/monitor_messages.py`.
+
+A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
+one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
+and loading. Times are the median of the rounds, in microseconds for a message.
+"""
+
+import statistics
+import struct
+import time
+from collections.abc import Callable
+
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+
+MESSAGES = 20_000
+ROUNDS = 7
+
+REFERENCE = """reference() {
+    double limit = 1.0;
+    event go(double x, double z) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}, angular:{z:z}}}' {
+        if (x > limit && z < 1) { x = limit; }
+    }
+    event stop() /stop std_msgs/Empty '{}' { }
+    fsm: s0 [ go -> s0, stop -> s1 ] s1 [ go -> bad, stop -> s1 ] bad [ default bad ]
+    @bad { ROS_WARN("moved after stop"); }
+}
+"""
+GROWING = "growing() { event e(std::string f) /cmd geometry_msgs/TwistStamped '{header.frame_id:f}' { f += \"_x\"; } }"
+WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
+OTHERS = "".join(
+    f"other{number}() {{ event e(int x) /other{number} std_msgs/Int32 '{{data:x}}' {{ x++; }} }}\n"
+    for number in range(10)
+)
+FRAME = b"base_link"
+COMMAND = struct.pack(f"<IIII{len(FRAME)}s6d", 1, 2, 3, len(FRAME), FRAME, 2.0, 0, 0, 0, 0, 0.5)
+
+
+def microseconds(action: Callable[[], object], times: int) -> float:
+    rounds = []
+    for _ in range(ROUNDS):
+        started = time.perf_counter()
+        for _ in range(times):
+            action()
+        rounds.append((time.perf_counter() - started) / times)
+    return statistics.median(rounds) * 1e6
+
+
+def monitors(text: str) -> MonitorSet:
+    loaded = MonitorSet.load({"benchmark.rv": text}, DEFINITIONS)
+    loaded.start(0)
+    return loaded
+
+
+DEFINITIONS = standard_definitions()
+
+
+def main() -> None:
+    reference = monitors(REFERENCE)
+    rows = [
+        ("a topic of no monitor", lambda: reference.process("/elsewhere", COMMAND, 1)),
+        ("reference", lambda: reference.process("/cmd", bytearray(COMMAND), 1)),
+    ]
+    many = monitors(REFERENCE + OTHERS)
+    rows.append(("reference, ten other monitors", lambda: many.process("/cmd", bytearray(COMMAND), 1)))
+    for name, text in (("a string grows", GROWING), ("a copy of all", WHOLE)):
+        loaded = monitors(text)
+        rows.append((name, lambda loaded=loaded: loaded.process("/cmd", COMMAND, 1)))
+    for name, action in rows:
+        print(f"{name:32} {microseconds(action, MESSAGES):8.2f} µs")
+    loading = microseconds(lambda: MonitorSet.load({"benchmark.rv": REFERENCE}, DEFINITIONS), 20) / 1000
+    print(f"{'loading the reference':32} {loading:8.2f} ms")
+
+
+if __name__ == "__main__":
+    main()
