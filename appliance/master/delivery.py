@@ -42,7 +42,7 @@ class Delivery:
         limits: Limits,
         troubled: Callable[[Incarnation, str], None],
         bound: int = 10_000,
-        bound_bytes: int = 256 << 20,
+        bound_bytes: int = 64 << 20,
         tries: int = 4,
     ) -> None:
         self._timeout = timeout

@@ -164,12 +164,20 @@ class Gate:
             return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
         api = arguments[call.api]
         assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
-        if (
-            self._registry.nodes_of(host) >= self._limits.nodes
-            and self._registry.find(caller.caller_id, host, api.text) is None
-        ):
+        if self._is_one_too_many(caller, api) and self._registry.spare_of(host) is None:
             return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
         return None
+
+    def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """The node of the caller's host that is gone and goes for good, so that a new one has room."""
+        return self._registry.spare_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
+
+    def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
+        host = caller.peer.host
+        return (
+            self._registry.nodes_of(host) >= self._limits.nodes
+            and self._registry.find(caller.caller_id, host, api.text) is None
+        )
 
 
 def contested(contest: Contest, gone: bool) -> Decision:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Answer, Caller, LimitReachedError
+from appliance.master.registration import incarnation_of
 from appliance.master.registry import Kind
 from appliance.policy.model import Category, Request
 from appliance.ros.errors import ProtocolError
@@ -196,7 +197,7 @@ async def get_param_names(master: "Master", caller: Caller, _arguments: tuple[ob
 async def subscribe_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`subscribeParam(caller_id, caller_api, key)`."""
     api, key = cast(ApiUri, arguments[0]), str(arguments[1])
-    incarnation = await master.faces.incarnation_for(caller, api)
+    incarnation = await incarnation_of(master, caller, api)
     answer = await master.rosmaster.call(
         "subscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
     )

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 async def register_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
     topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await master.faces.incarnation_for(caller, api)
+    incarnation = await incarnation_of(master, caller, api)
     inner = master.faces.inner_uri(incarnation)
     answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
@@ -27,7 +27,7 @@ async def register_publisher(master: "Master", caller: Caller, arguments: tuple[
 async def register_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
     topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await master.faces.incarnation_for(caller, api)
+    incarnation = await incarnation_of(master, caller, api)
     inner = master.faces.inner_uri(incarnation)
     answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
@@ -39,7 +39,7 @@ async def register_subscriber(master: "Master", caller: Caller, arguments: tuple
 async def register_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerService(caller_id, service, service_api, caller_api)`."""
     service, service_api, api = str(arguments[0]), cast(ApiUri, arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await master.faces.incarnation_for(caller, api)
+    incarnation = await incarnation_of(master, caller, api)
     inner = master.faces.inner_uri(incarnation)
     answer = await master.rosmaster.call(
         "registerService", caller.caller_id, service, stand_in(incarnation), inner
@@ -92,6 +92,14 @@ async def _unregister(
     if answer[0] == 1 and incarnation is not None:
         master.graph.unregistered(incarnation, kind, resource)
     return answer
+
+
+async def incarnation_of(master: "Master", caller: Caller, api: ApiUri) -> Incarnation:
+    """The incarnation that registers; a new one takes the room of one of its host's that is gone."""
+    spare = master.gate.to_make_room(caller, api)
+    if spare is not None:
+        master.graph.forgotten(spare)
+    return await master.faces.incarnation_for(caller, api)
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:

@@ -162,6 +162,11 @@ class Registry:
         """How many incarnations of a host are known (for the limit per host)."""
         return self._nodes_of[host]
 
+    def spare_of(self, host: Address) -> Incarnation | None:
+        """The incarnation of a host that was lost or replaced first: who is dropped when there is no room."""
+        spare = [one for one in self._by_key.values() if one.host == host and one.life is not Life.LIVE]
+        return min(spare, key=lambda one: one.changed, default=None)
+
     def registrations_of(self, host: Address) -> int:
         """How many registrations a host has (for the limit per host)."""
         return self._registrations_of[host]
