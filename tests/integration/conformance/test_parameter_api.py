@@ -38,7 +38,9 @@ def compare(both: BothMasters, *steps: Step) -> list[Any]:
     return answers
 
 
-@pytest.mark.parametrize("value", VALUES, ids=repr)
+@pytest.mark.parametrize(
+    "value", VALUES, ids=lambda value: "binary" if isinstance(value, Binary) else str(value)
+)
 def test_value(both: BothMasters, value: Any) -> None:
     """Every kind of value is kept and comes back as it was, by itself and within its tree."""
     compare(
