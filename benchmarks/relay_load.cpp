@@ -1,4 +1,5 @@
-// A TCPROS publisher and a subscriber in one program, for measuring what is between them (no ROS needed).
+// A TCPROS publisher of relay_load/Sample and a subscriber in one program, for measuring what is between them (no ROS
+// needed).
 //
 //   relay_load BYTES SECONDS flat|window|paced
 //
@@ -29,6 +30,7 @@
 using Fields = std::map<std::string, std::string>;
 constexpr uint64_t MARKER = ~0ull;
 constexpr uint64_t WINDOW = 64;
+constexpr size_t FIXED = 32;  // of a frame of relay_load/Sample (nodes/msg), without its data
 
 int64_t now() {
   return std::chrono::duration_cast<std::chrono::nanoseconds>(std::chrono::steady_clock::now().time_since_epoch()).count();
@@ -98,16 +100,18 @@ struct Load {
     int fd = accept(listening, nullptr, nullptr);
     tune(fd);
     const Fields asked = read_header(fd);
-    write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", "992ce8a1687cec8c8bd883ec73ca41d1"},
-                      {"message_definition", "string data\n"}, {"topic", asked.at("topic")}, {"type", "std_msgs/String"}});
+    write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", "e603182a04880972f86c550eadc3cb3a"},
+                      {"message_definition", "uint64 number\nint64 sent\nfloat64 value\nuint8[] data\n"},
+                      {"topic", asked.at("topic")}, {"type", "relay_load/Sample"}});
     const size_t batch = mode == "paced" ? 1 : std::max<size_t>(1, 262144 / frame);
     std::vector<char> buffer(batch * frame);
     const auto stamp = [&](size_t slot, uint64_t number) {
-      const uint32_t length = frame - 4, text = frame - 8;
+      const uint32_t length = frame - 4, rest = frame - FIXED;
       const int64_t time = now();
+      const double value = 1;
       char* at = &buffer[slot * frame];
-      std::memcpy(at, &length, 4), std::memcpy(at + 4, &text, 4);
-      std::memcpy(at + 8, &number, 8), std::memcpy(at + 16, &time, 8);
+      std::memcpy(at, &length, 4), std::memcpy(at + 4, &number, 8), std::memcpy(at + 12, &time, 8);
+      std::memcpy(at + 20, &value, 8), std::memcpy(at + 28, &rest, 4);
     };
     const auto mark_until = [&](std::atomic<bool>& seen) {
       while (!seen) {
@@ -146,7 +150,7 @@ struct Load {
   void message(const char* at, int64_t t) {
     uint64_t number;
     int64_t time;
-    std::memcpy(&number, at + 8, 8), std::memcpy(&time, at + 16, 8);
+    std::memcpy(&number, at + 4, 8), std::memcpy(&time, at + 12, 8);
     if (number == MARKER) {
       (received ? ended : primed) = true;
       return;
@@ -189,7 +193,7 @@ struct Load {
 int main(int argc, char** argv) try {
   if (argc != 4) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced");
   Load load;
-  load.frame = std::max<size_t>(24, std::atoi(argv[1]));
+  load.frame = std::max<size_t>(FIXED, std::atoi(argv[1]));
   load.seconds = std::atof(argv[2]);
   load.mode = argv[3];
   int listening = socket(AF_INET, SOCK_STREAM, 0);

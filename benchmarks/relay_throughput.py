@@ -14,6 +14,7 @@ import statistics
 import subprocess
 import threading
 import xmlrpc.client
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +24,9 @@ from appliance.channel.messages import (
     GrantInstalled,
     NodePlaced,
     PublicationPlaced,
+    SpecificationsRefused,
+    SpecificationsStated,
+    SpecificationsTaken,
     UpstreamFound,
     UpstreamWanted,
 )
@@ -33,6 +37,7 @@ PROGRAM = HERE.parent / "build" / "benchmarks" / "relay_load"
 TOPIC_TOOLS = "/usr/lib/topic_tools/relay"
 SIZES = (32, 200, 4096, 65536, 1048576)
 MODES = ("window", "flat", "paced")
+TYPE = "relay_load/Sample"
 
 
 @dataclass
@@ -117,14 +122,20 @@ class Direct:
 class Relay:
     """This project's relay process, with a control that only knows one topic a run."""
 
-    name = "relay"
-
-    def __init__(self) -> None:
+    def __init__(self, name: str = "relay") -> None:
+        self.name = name
         self._publisher = 0
         self._runs = 0
         self._relay = RelayProcess()
         self._link: ChannelPeer = self._relay.open_link(self._answer)
         self.pid: int | None = self._relay.process.pid
+
+    def monitor(self, files: list[tuple[str, str]], definitions: dict[str, str]) -> None:
+        """Put these specifications in force."""
+        self._link.send(SpecificationsStated(1, files, definitions, {}, restarted=False))
+        answer = self._link.wait_for(lambda one: isinstance(one, SpecificationsTaken | SpecificationsRefused))
+        if isinstance(answer, SpecificationsRefused):
+            raise SystemExit(f"the relay does not take the specifications: {answer.findings}")
 
     def target(self, publisher: int) -> tuple[int, str]:
         """A new incarnation, whose publisher is this run's."""
@@ -133,7 +144,7 @@ class Relay:
         key = str(self._runs)
         with socket.create_server((LOOPBACK, 0)) as listening:
             self._link.send(NodePlaced(key, "/load", LOOPBACK), (listening.fileno(),))
-            self._link.send(PublicationPlaced(key, "/load", "std_msgs/String"))
+            self._link.send(PublicationPlaced(key, "/load", TYPE))
             self._link.send(GrantInstalled(key, "/load", LOOPBACK, "/load_listener"))
             self._relay.ping(self._runs)
             return int(listening.getsockname()[1]), "/load"
@@ -148,12 +159,13 @@ class Relay:
             self._link.send(UpstreamFound(message.key, message.topic, LOOPBACK, self._publisher))
 
 
-class TopicTools:
-    """`topic_tools relay` at a rosmaster, a fresh one each run; the publisher's node API is served here."""
+class RosRelay:
+    """A ROS node that relays, at a rosmaster, a fresh one each run; the publisher's node API is served here."""
 
-    name = "topic_tools"
-
-    def __init__(self) -> None:
+    def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
+        """`command` is given the two topics."""
+        self.name = name
+        self._command = command
         port = free_port()
         self._uri = f"http://{LOOPBACK}:{port}/"
         self._environment = {**os.environ, "ROS_MASTER_URI": self._uri, "ROS_IP": LOOPBACK}
@@ -179,9 +191,11 @@ class TopicTools:
         self._publisher = publisher
         self._runs += 1
         given, taken = f"/in{self._runs}", f"/out{self._runs}"
-        call(self._uri, "registerPublisher", "/load", given, "std_msgs/String", self._api_uri)
+        call(self._uri, "registerPublisher", "/load", given, TYPE, self._api_uri)
         self._relay = subprocess.Popen(
-            [TOPIC_TOOLS, given, taken, f"__name:=relay{self._runs}"], env=self._environment
+            [*self._command, given, taken, f"__name:=relay{self._runs}"],
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
         )
         self.pid = self._relay.pid
         found: list[str] = []
@@ -191,7 +205,7 @@ class TopicTools:
             found[:] = [node for topic, nodes in publishers if topic == taken for node in nodes]
             return bool(found)
 
-        wait_until(published, "topic_tools relay publishes")
+        wait_until(published, f"{self.name} publishes")
         uri = call(self._uri, "lookupNode", "/load", found[0])[2]
         return int(call(uri, "requestTopic", "/load_listener", taken, [["TCPROS"]])[2][2]), taken
 
@@ -260,7 +274,7 @@ def main() -> None:
     parser.add_argument("--modes", type=lambda text: text.split(","), default=list(MODES))
     options = parser.parse_args()
     results: dict[tuple[str, int, str], list[Result]] = {}
-    systems: list[System] = [Direct(), Relay(), TopicTools()]
+    systems: list[System] = [Direct(), Relay(), RosRelay()]
     try:
         for _round in range(options.rounds):
             for mode in options.modes:
