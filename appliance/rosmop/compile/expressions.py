@@ -149,7 +149,8 @@ def read(variable: Variable, node: tree.Node) -> Value:
         return Value(
             alias.type, alias.code, node.position, VariablePlace(variable), owned=False, pure=alias.pure
         )
-    return Value(variable.type, variable.code, node.position, VariablePlace(variable), owned=False)
+    place = VariablePlace(variable)
+    return Value(variable.type, variable.code, node.position, place, owned=False, constant=variable.known)
 
 
 def _message(scope: Scope, node: tree.Expression) -> Value:
@@ -219,6 +220,8 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
     target = value_of(scope, node.target)
     storing.require_place(target, f"`{node.operator}`")
     if node.operator == "=":
+        if isinstance(target.type, kinds.String) and not isinstance(node.value, tree.Elements):
+            return target, _character_or_text(scope, node.value)
         return target, converted(scope, node.value, target.type)
     if not target.pure:
         raise SpecificationError.at(
@@ -227,6 +230,14 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
     value = value_of(scope, node.value)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     return target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
+
+
+def _character_or_text(scope: Scope, node: tree.Expression) -> str:
+    """What is assigned to a string: C++ takes a character, too."""
+    value = value_of(scope, node)
+    if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
+        return f"t_bytes(({value.code} & 255,))"
+    return convert(scope, value, kinds.STRING)
 
 
 def _conditional(scope: Scope, node: tree.Expression) -> Value:

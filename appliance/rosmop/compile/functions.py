@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from appliance.rosmop.compile.loops import charge
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames, Variable
-from appliance.rosmop.compile.statements import initial, write
+from appliance.rosmop.compile.statements import initial, known, write
 from appliance.rosmop.runtime.context import MAX_CALLS
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -50,7 +50,18 @@ def _shared_variable(
         declarator.position,
         shared=True,
         constant=declaration.type.constant,
+        known=_known(scope, declaration, declarator, kind),
     )
+
+
+def _known(
+    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, kind: kinds.Type
+) -> bool | int | float | None:
+    """The value of a constant, if it can be told now; what is wrong with it is found when it is compiled."""
+    try:
+        return known(scope, declaration.type, declarator, kind)
+    except SpecificationError:
+        return None
 
 
 def compile_start(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> str:

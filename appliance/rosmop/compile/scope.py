@@ -32,6 +32,8 @@ class Variable:
     position: Position
     shared: bool = False
     constant: bool = False
+    known: bool | int | float | None = None
+    """What a `const` number is, if it is written down."""
     flag: str | None = None
     alias: Value | None = None
     used: bool = False

@@ -13,6 +13,7 @@ from appliance.rosmop.compile.expressions import assignment, converted, elements
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.compile.storing import store_lines
 from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime import numbers
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -61,7 +62,28 @@ def _declaration(scope: Scope, node: tree.Statement) -> None:
             size = scope.codecs.width(kind)
             scope.lines.add(f"{scope.context}.allocate({size}, {scope.lines.site})")
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
+        variable.known = known(scope, node.type, declarator, kind)
         scope.lines.add(f"{variable.code} = {code}")
+
+
+def known(
+    scope: Scope, name: tree.TypeName, declarator: tree.Declarator, kind: kinds.Type
+) -> bool | int | float | None:
+    """The value of a `const` number whose value is written down, for sizes of arrays and cases; None for others."""
+    if not name.constant or not kinds.is_number(kind) or declarator.is_array:
+        return None
+    if declarator.value is None or isinstance(declarator.value, tree.Elements):
+        return None
+    value = value_of(scope, declarator.value).constant
+    if isinstance(kind, kinds.Floating):
+        return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
+    if not isinstance(value, int):
+        return None
+    return numbers.wrap(value, kind.bits, kind.signed) if isinstance(kind, kinds.Integer) else bool(value)
+
+
+def _rounded(value: float, kind: kinds.Floating) -> float:
+    return value if kind.bits == 64 else numbers.f32(value)
 
 
 def initial(scope: Scope, name: tree.TypeName, declarator: tree.Declarator) -> tuple[kinds.Type, str]:

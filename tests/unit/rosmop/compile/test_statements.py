@@ -264,3 +264,23 @@ def test_an_iterator_is_no_value() -> None:
     assert "of the same vector" in refused_action(declared + "v.erase(0);")[0].text
     assert "an array of fixed length stays so long" in refused_action("int a[3]; a.erase(a.begin());")[0].text
     assert refused_action(declared + "std::cout << v.begin();")
+
+
+def test_a_constant_number_may_be_a_case_or_a_size() -> None:
+    """`const` numbers with a written value are known when the specification is loaded, shared ones, too."""
+    before = "const int ONE = 1; const unsigned char TWO = 258; const int SIZE = 3;"
+    body = """const int THREE = 3; int a[SIZE]; a[THREE - 1] = 9;
+        switch (x) { case ONE: ROS_INFO("one"); break; case TWO: ROS_INFO("two"); break; case -THREE: ROS_INFO("-3"); }
+        ROS_INFO("%d", (int) a[2]);"""
+    assert printed(body, before=before, data=1) == "one 9"
+    assert printed(body, before=before, data=2) == "two 9"
+    assert printed(body, before=before, data=-3) == "-3 9"
+    assert (
+        "past the end of an array of 3" in refused_action("int a[SIZE]; x = a[SIZE];", before=before)[0].text
+    )
+
+
+def test_a_character_can_be_assigned_to_a_string() -> None:
+    """As in C++: assigned, but not initialised; a number is refused."""
+    assert printed('std::string s = "abc"; s = \'x\'; ROS_INFO("%s", s);') == "x"
+    assert "write `std::to_string" in refused_action("std::string s; s = 65;")[0].text
