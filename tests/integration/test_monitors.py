@@ -1,6 +1,7 @@
 """Monitors in the middle of real rospy and roscpp nodes: drop, change, publish, verdict; loaded while they talk."""
 
 import json
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.processes import Process
 from tests.support.requirements import needs
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -188,3 +190,84 @@ def test_a_start_with_a_bad_file_is_an_error_that_says_where(folder: Path) -> No
         appliance.start()
     assert "broken.rv:1:" in appliance.story()
     appliance.close()
+
+
+GATE = """
+gate() {
+    bool open = false;
+    event wish(bool data) service /mode std_srvs/SetBool request '{data:data}' {
+        if (data && open) { ROS_WARN("it is open already"); return; }
+        open = data;
+    }
+    event answer(std::string text) service /mode std_srvs/SetBool response '{message:text}' {
+        text = "checked";
+    }
+}
+"""
+
+
+@pytest.mark.parametrize("to", CLIENTS)
+@pytest.mark.parametrize("by", CLIENTS)
+def test_requests_are_refused_and_responses_changed(
+    appliance: Appliance, ros: RosSession, tmp_path: Path, by: Client, to: Client
+) -> None:
+    """The client learns why as an error of the service; the service never sees the request."""
+    spec = tmp_path / "gate.rv"
+    spec.write_text(GATE)
+    appliance.rosrv("monitor", "load", str(spec))
+    server = ros.service_server(to, "/mode")
+    client = ros.service_client(by, "/mode")
+    client.send("true")
+    assert client.wait_for(event="answered")["message"] == "checked"
+    client.send("true")
+    client.wait_for(event="failed")
+    client.send("false")
+    client.wait_for_count(2, event="answered")
+    assert [event["data"] for event in server.wait_for_count(2, event="called")] == [True, False]
+    refused = appliance.audit(event="message dropped", resource="/mode")[0]
+    assert refused["detail"]["monitor"] == "gate"
+
+
+def said(listener: Process, prefix: str) -> None:
+    """The listener receives, from now on, something that begins so."""
+    listener.wait_for(lambda event: event.get("data", "").startswith(prefix), since=listener.mark())
+
+
+def _numbers(listener: Process) -> list[int]:
+    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
+
+
+def test_monitors_come_and_go_under_a_thousand_messages_a_second(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """One listener keeps up, one is stopped for a while, one comes late: nothing is lost and the order is kept."""
+    spec = tmp_path / "words.rv"
+    steady, stopped = ros.listener("rospy", "/chatter"), ros.listener("roscpp", "/chatter")
+    ros.talker("roscpp", "/chatter", "--rate", "1000", name="voice")
+    for listener in (steady, stopped):
+        listener.wait_for_count(100, event="received")
+    stopped.popen.send_signal(signal.SIGSTOP)
+    try:
+        for number in range(3):
+            spec.write_text(WORDS.replace("checked ", f"round{number} ").replace("heard == 3", "heard == -1"))
+            appliance.rosrv("monitor", "load", str(spec))
+            said(steady, f"round{number}")
+            if number == 1:
+                stopped.popen.send_signal(signal.SIGCONT)
+            appliance.rosrv("monitor", "disable", "words")
+            said(steady, "hello")
+            appliance.rosrv("monitor", "enable", "words")
+            said(steady, f"round{number}")
+    finally:
+        stopped.popen.send_signal(signal.SIGCONT)
+    late = ros.listener("rospy", "/chatter")
+    appliance.rosrv("monitor", "remove", "words")
+    said(steady, "hello")
+    late.wait_for_count(500, event="received")
+    for listener in (steady, late):
+        numbers = _numbers(listener)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    # The one that was stopped may have lost the oldest that its queue had no room for, and is told the rest in order.
+    numbers = _numbers(stopped)
+    assert numbers == sorted(set(numbers))
+    assert stopped.seen(event="received")[-1]["publisher"] == "/voice"

@@ -1,0 +1,192 @@
+"""The specifications in force: revisions, switches, what the relay is told and what it says."""
+
+import asyncio
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.channel import messages
+from appliance.master.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.master.recorder import Recorder
+from appliance.master.specifications import SpecificationsRefusedError
+from appliance.store.state import StateStore
+
+A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
+B = "hold b() { event said() /other std_msgs/String '{}' { } }"
+
+
+class Desk:
+    """The monitors of one control over its life times, with a relay that takes everything."""
+
+    def __init__(self, home: Path) -> None:
+        self.home, self.folder = home, home / "monitors"
+        self.folder.mkdir()
+        (self.folder / "a.rv").write_text(A)
+        self.log = AuditLog(home / "audit.db")
+        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        happened = self.recorder.happened
+
+        def noted(event: str, reason: str, **fields: Any) -> str:
+            self.events.append((event, fields))
+            return happened(event, reason, **fields)
+
+        self.recorder.happened = noted  # type: ignore[method-assign]
+        self.store = StateStore(home, failed=pytest.fail)
+        self.sent: list[messages.Message] = []
+        self.findings: list[str] = []
+
+    def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
+        """A control starts."""
+        monitors = Monitors(self.folder if folder else None, enable, self.store, self.recorder)
+
+        def send(message: messages.Message) -> bool:
+            self.sent.append(message)
+            if isinstance(message, messages.SpecificationsStated):
+                answer: messages.Message = messages.SpecificationsTaken(message.revision, [], [])
+                if self.findings:
+                    answer = messages.SpecificationsRefused(message.revision, self.findings)
+                asyncio.get_running_loop().call_soon(monitors.received, answer)
+            return True
+
+        monitors.send = send
+        monitors.start(restarted=restarted)
+        return monitors
+
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The loop that control runs on."""
+    return "asyncio"
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    """A folder with one specification."""
+    desk = Desk(tmp_path)
+    yield desk
+    desk.store.close()
+    desk.log.close()
+
+
+async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: Desk) -> None:
+    """The same folder again is no new revision; an operator's revision stays until `reload`."""
+    first = desk.monitors()
+    assert (first.revision, first.names(), first.differs_from_folder) == (1, ["a"], False)
+    await desk.store.settled()
+    again = desk.monitors()
+    assert again.revision == 1
+    replaced = await again.load({"b.rv": B}, {}, who="eve", note="")
+    assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
+    restarted = desk.monitors()
+    assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
+    back = await restarted.reload(who="operator")
+    assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
+    loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
+    assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
+
+
+async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
+    """Whether control or the relay finds the fault; it is a record."""
+    monitors = desk.monitors()
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+    assert not desk.sent
+    desk.findings = ["b.rv:1:1: error: something"]
+    with pytest.raises(SpecificationsRefusedError, match="something"):
+        await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    assert (monitors.revision, monitors.names()) == (1, ["a"])
+    assert [event for event, _ in desk.events].count("specifications refused") == 3
+    desk.findings = []
+    (desk.folder / "a.rv").write_text("nonsense")
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.reload(who="eve")
+    await desk.store.settled()
+    with pytest.raises(SpecificationsRefusedError):
+        desk.monitors()
+
+
+async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
+    """Only what changes is told and recorded; `--enable` is for those that nobody has switched."""
+    monitors = desk.monitors("none")
+    assert monitors.enabled("a") is False
+    assert await monitors.switch(["a", "a"], True, who="eve") == ["a"]
+    assert await monitors.switch(["a"], True, who="eve") == []
+    assert desk.sent == [messages.MonitorSwitched("a", True)]
+    assert desk.monitors("none").enabled("a") is True
+    assert monitors.statement().enabled == {"a": True}
+    with pytest.raises(UnknownMonitorError, match="there are: a"):
+        await monitors.switch(["nobody"], True, who="eve")
+    with pytest.raises(SpecificationsRefusedError, match="--enable"):
+        desk.monitors("a,nobody")
+    assert [fields["who"] for event, fields in desk.events if event == "monitor enabled"] == ["eve"]
+
+
+async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) -> None:
+    """The first relay of an appliance is not; nor is a control that finds its relay as it was."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    assert monitors.statement().restarted is False
+    monitors.received(messages.SpecificationsTaken(1, ["a", "b"], []))
+    assert "monitors restarted" not in [event for event, _ in desk.events]
+    assert monitors.statement().restarted is True
+    monitors.received(messages.SpecificationsTaken(1, ["a", "b"], ["b"]))
+    assert [fields["held"] for event, fields in desk.events if event == "monitors restarted"] == [["b"]]
+    assert monitors.held == {"b"}
+    assert await monitors.resume(["a", "b"], who="eve") == ["b"]
+    assert desk.sent[-1] == messages.MonitorResumed("b")
+    await desk.store.settled()
+    control = desk.monitors(restarted=True)
+    assert control.statement().restarted is True
+    control.received(messages.SpecificationsTaken(1, [], []))
+    assert [event for event, _ in desk.events].count("monitors restarted") == 1
+
+
+async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
+    """And a file goes whole or not at all."""
+    monitors = desk.monitors()
+    user = "c() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+    await monitors.load(
+        {"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}, {}, who="eve", note=""
+    )
+    for names in (["a"], ["c"]):
+        with pytest.raises(SpecificationsRefusedError):
+            await monitors.remove(names, who="eve")
+    with pytest.raises(UnknownMonitorError):
+        await monitors.remove(["nobody"], who="eve")
+    assert (await monitors.remove(["c", "d"], who="eve")).removed == ["c.rv"]
+    assert (await monitors.remove(["a.rv"], who="eve")).removed == ["a.rv"]
+
+
+async def test_a_change_that_is_meant_for_another_revision_is_refused(desk: Desk) -> None:
+    """Two engineers cannot overwrite each other."""
+    monitors = desk.monitors()
+    changes: list[Callable[[], Any]] = [
+        lambda: monitors.load({"b.rv": B}, {}, who="eve", note="", expected=7),
+        lambda: monitors.reload(who="eve", expected=7),
+        lambda: monitors.remove(["a"], who="eve", expected=7),
+    ]
+    for change in changes:
+        with pytest.raises(MonitorsChangedError, match="revision 1"):
+            await change()
+
+
+async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
+    """The bytes before and after as hexadecimal digits; what could not be told, too."""
+    monitors = desk.monitors()
+    told = [
+        messages.MonitorEvent("change", "a", "k", "/chatter", 1, "a changed", {}, b"\x01", b"\x02", 1),
+        messages.MonitorEvent("change", "a", "k", "/chatter", 2, "", {}, count=41),
+        messages.MonitorEvent("fault", "a", "k", "/chatter", 3, "a.rv:1:2: division by zero", {"line": 1}),
+    ]
+    monitors.received(messages.MonitorsReported(told, 5))
+    changed = [fields for event, fields in desk.events if event == "message changed"]
+    assert (changed[0]["before"], changed[0]["after"], changed[1]["count"]) == ("01", "02", 41)
+    assert monitors.records.counts["change", "a"] == 42
+    assert [fields["lost"] for event, fields in desk.events if event == "records lost"] == [5]
