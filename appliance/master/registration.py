@@ -1,4 +1,8 @@
-"""The calls that make a node part of the graph, or take it out: topics and services."""
+"""The calls that make a node part of the graph, or take it out: topics and services.
+
+A registration is on disk before its node is told of it: a ROS 1 node never registers twice, and ROSMaster, which knows
+the rest, can die in the same moment as control.
+"""
 
 from typing import TYPE_CHECKING, cast
 
@@ -19,6 +23,7 @@ async def register_publisher(master: "Master", caller: Caller, arguments: tuple[
     answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
+        await master.faces.settled()
         hidden = master.mediation.hides_publishers(topic)
         answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
     return answer
@@ -32,6 +37,7 @@ async def register_subscriber(master: "Master", caller: Caller, arguments: tuple
     answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
+        await master.faces.settled()
         answer[2] = list(master.graph.list_for(incarnation, topic))
     return answer
 
@@ -46,7 +52,6 @@ async def register_service(master: "Master", caller: Caller, arguments: tuple[ob
     )
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
-        # ROSMaster does not know the service's real port: after a crash it could not be found out again.
         await master.faces.settled()
     return answer
 
