@@ -2,10 +2,11 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from appliance.rosmop.compile import cursors, members
 from appliance.rosmop.compile.conversion import condition, convert, number
+from appliance.rosmop.compile.initializers import ValueOf, elements
 from appliance.rosmop.compile.library import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.output import Stream, formatted
 from appliance.rosmop.compile.places import Value
@@ -17,8 +18,6 @@ from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import nearest, shown
 from appliance.rosmop.types.resolve import named_type, record
-
-ValueOf = Callable[[Scope, tree.Expression], Value]
 
 _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
 _REFUSED = {
@@ -238,7 +237,7 @@ def construct(
     values = [value_of(scope, argument) for argument in arguments if not isinstance(argument, tree.Elements)]
     site = scope.lines.site
     if isinstance(kind, kinds.Vector):
-        return Value(kind, _vector(scope, kind, arguments, values, site), position)
+        return Value(kind, _vector(scope, kind, arguments, values, value_of), position)
     if isinstance(kind, kinds.Time | kinds.Duration) and values and kinds.is_number(values[0].type):
         return Value(kind, _moment(kind, values, site), position)
     if isinstance(kind, kinds.String) and len(values) == 2:
@@ -251,12 +250,15 @@ def construct(
 
 
 def _vector(
-    scope: Scope, kind: kinds.Vector, arguments: Sequence[tree.Expression], values: Sequence[Value], site: int
+    scope: Scope,
+    kind: kinds.Vector,
+    arguments: Sequence[tree.Expression],
+    values: Sequence[Value],
+    value_of: ValueOf,
 ) -> str:
-    from appliance.rosmop.compile.expressions import elements  # noqa: PLC0415  vectors of vectors are expressions
-
+    site = scope.lines.site
     if len(arguments) == 1 and isinstance(arguments[0], tree.Elements):
-        return elements(scope, arguments[0], kind)
+        return elements(scope, arguments[0], kind, value_of)
     if len(values) == 1 and isinstance(values[0].type, kinds.Vector):
         return convert(scope, values[0], kind, site)
     codecs = scope.codecs

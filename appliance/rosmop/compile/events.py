@@ -12,8 +12,8 @@ from appliance.rosmop.compile.conversion import condition, convert, literal, ref
 from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.locate import Locator, Spot, Walk, type_of_path
 from appliance.rosmop.compile.module import Lines
-from appliance.rosmop.compile.places import Value
-from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames, Variable
+from appliance.rosmop.compile.places import Value, Variable
+from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32

@@ -3,11 +3,11 @@
 import re
 from collections.abc import Callable, Mapping
 
-from appliance.rosmop.compile import calls, members, operators, storing
+from appliance.rosmop.compile import calls, initializers, members, operators, storing
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.library import CONSTANTS
-from appliance.rosmop.compile.places import CharacterPlace, Value, VariablePlace
-from appliance.rosmop.compile.scope import Scope, Variable
+from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
+from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -27,32 +27,12 @@ def value_of(scope: Scope, node: tree.Expression) -> Value:
 
 def converted(scope: Scope, node: tree.Expression, target: Type) -> str:
     """Code for an expression as a value of the target type; `{…}` makes a vector."""
-    if isinstance(node, tree.Elements):
-        return elements(scope, node, target)
-    return convert(scope, value_of(scope, node), target, scope.site(node))
+    return initializers.converted(scope, node, target, value_of)
 
 
 def elements(scope: Scope, node: tree.Elements, target: Type) -> str:
     """Code for `{a, b, c}` as a vector."""
-    if not isinstance(target, kinds.Vector):
-        if len(node.items) == 1:
-            return converted(scope, node.items[0], target)
-        if not node.items:
-            return scope.codecs.zero(target)
-        raise SpecificationError.at(
-            node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
-        )
-    if target.length is not None and len(node.items) > target.length:
-        raise SpecificationError.at(
-            node.items[target.length].position, f"more than the {target.length} elements of the array"
-        )
-    items = [converted(scope, item, target.element) for item in node.items]
-    missing = 0 if target.length is None else target.length - len(items)
-    code = f"[{', '.join(items)}]"
-    if missing:
-        rest = scope.codecs.maker(kinds.Vector(target.element, missing))
-        code = f"({code} + {rest}())"
-    return code
+    return initializers.elements(scope, node, target, value_of)
 
 
 def literal_number(node: tree.Number) -> Value:

@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Mapping
 
 from appliance.rosmop.compile.loops import charge
-from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames, Variable
+from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import initial, known, write
 from appliance.rosmop.runtime.context import MAX_CALLS
 from appliance.rosmop.syntax import tree

@@ -1,16 +1,21 @@
 """Loops and `switch` as code. Every iteration is charged, so that no loop outlives its budget."""
 
+from collections.abc import Callable, Sequence
+
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.members import element_value
-from appliance.rosmop.compile.places import Value
-from appliance.rosmop.compile.scope import Loop, Scope, Variable
+from appliance.rosmop.compile.places import Value, Variable
+from appliance.rosmop.compile.scope import Loop, Scope
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.resolve import resolve
+
+Write = Callable[[Scope, tree.Statement], None]
+"""Writes a statement; handed in, because statements contain loops and loops contain statements."""
 
 MAX_NESTED = 15
 """Loops inside each other; Python takes no more than 20."""
@@ -37,7 +42,7 @@ def weight(node: tree.Node) -> int:
     return total
 
 
-def write_while(scope: Scope, node: tree.Statement) -> None:
+def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`while` and `do … while`."""
     assert isinstance(node, tree.While)  # noqa: S101  so says the table in statements.py
     _enter(scope, node, Loop(False))
@@ -48,17 +53,15 @@ def write_while(scope: Scope, node: tree.Statement) -> None:
             scope.loops[-1].step = lambda: _leave_unless(scope, node.condition)
         else:
             _leave_unless(scope, node.condition)
-    _body(scope, node.body)
+    write_body(scope, [node.body], write)
     if node.at_end:
         with scope.indented():
             _leave_unless(scope, node.condition)
     scope.loops.pop()
 
 
-def write_for(scope: Scope, node: tree.Statement) -> None:
+def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`for (start; condition; step)`."""
-    from appliance.rosmop.compile.statements import write  # noqa: PLC0415  a loop is made of statements
-
     assert isinstance(node, tree.For)  # noqa: S101
     with scope.block():
         if node.start is not None:
@@ -70,14 +73,14 @@ def write_for(scope: Scope, node: tree.Statement) -> None:
             charge(scope, node)
             if node.condition is not None:
                 _leave_unless(scope, node.condition)
-        _body(scope, node.body)
+        write_body(scope, [node.body], write)
         if step is not None:
             with scope.indented():
                 write(scope, step)
         scope.loops.pop()
 
 
-def write_range_for(scope: Scope, node: tree.Statement) -> None:
+def write_range_for(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`for (type name : values)`."""
     assert isinstance(node, tree.RangeFor)  # noqa: S101
     values = value_of(scope, node.values)
@@ -91,7 +94,7 @@ def write_range_for(scope: Scope, node: tree.Statement) -> None:
             _by_reference(scope, node, values, kind)
         else:
             _by_value(scope, node, values, element, kind)
-        _body(scope, node.body)
+        write_body(scope, [node.body], write)
     scope.loops.pop()
 
 
@@ -125,7 +128,7 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) 
     scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
 
 
-def write_switch(scope: Scope, node: tree.Statement) -> None:
+def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`switch`: the index of the first case, then every block from there on until a `break`."""
     assert isinstance(node, tree.Switch)  # noqa: S101
     value = value_of(scope, node.value)
@@ -143,7 +146,7 @@ def write_switch(scope: Scope, node: tree.Statement) -> None:
         for index, case in enumerate(node.cases):
             if case.statements:
                 scope.lines.add(f"if {start} <= {index}:")
-                _statements(scope, case)
+                _statements(scope, case.statements, write)
         scope.lines.add("break")
     loop = scope.loops.pop()
     if loop.step is not None:
@@ -201,18 +204,17 @@ def _leave_unless(scope: Scope, node: tree.Expression) -> None:
         scope.lines.add(f"if not {condition(value_of(scope, node))}: break")
 
 
-def _body(scope: Scope, body: tree.Statement) -> None:
-    from appliance.rosmop.compile.statements import write_body  # noqa: PLC0415  a loop is made of statements
+def write_body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+    """Write statements one step deeper, in a block of names of their own."""
+    with scope.block():
+        _statements(scope, statements, write)
 
-    write_body(scope, [body])
 
-
-def _statements(scope: Scope, case: tree.Case) -> None:
-    from appliance.rosmop.compile.statements import write  # noqa: PLC0415  a case is made of statements
-
+def _statements(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+    """Write statements one step deeper; `pass` if nothing comes of them."""
     with scope.indented():
         before = len(scope.lines.lines)
-        for statement in case.statements:
+        for statement in statements:
             write(scope, statement)
         if len(scope.lines.lines) == before:
             scope.lines.add("pass")

@@ -5,7 +5,7 @@ from types import MappingProxyType
 
 from appliance.rosmop.compile import cursors
 from appliance.rosmop.compile.conversion import check_convertible, convert, number
-from appliance.rosmop.compile.places import PartPlace, SlotPlace, Value
+from appliance.rosmop.compile.places import ElementPlace, PartPlace, SlotPlace, Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.compile.storing import mark, require_place, store
 from appliance.rosmop.positions import Position
@@ -284,8 +284,6 @@ TEXT_METHODS: Mapping[str, Method] = MappingProxyType(
 
 def element_value(scope: Scope, base: Value, index: Value, position: Position, site: int) -> Value:
     """`base[index]` of a vector."""
-    from appliance.rosmop.compile.places import ElementPlace  # noqa: PLC0415
-
     assert isinstance(base.type, kinds.Vector)  # noqa: S101  the caller has looked
     kind = base.type
     if not kinds.is_number(index.type):

@@ -1,13 +1,31 @@
-"""Values of expressions as code, and the places that can be assigned."""
+"""Variables, values of expressions as code, and the places that can be assigned."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from appliance.rosmop.positions import Position
 from appliance.rosmop.types.kinds import Type
 
-if TYPE_CHECKING:
-    from appliance.rosmop.compile.scope import Variable
+
+@dataclass(eq=False)
+class Variable:
+    """A variable: its name in the text and in the code.
+
+    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is what a
+    reference stands for. `shared` variables live in the namespace of the module.
+    """
+
+    name: str
+    type: Type
+    code: str
+    position: Position
+    shared: bool = False
+    constant: bool = False
+    known: bool | int | float | None = None
+    """What a `const` number is, if it is written down."""
+    flag: str | None = None
+    alias: "Value | None" = None
+    used: bool = False
+    assigned: bool = False
 
 
 @dataclass(frozen=True)
@@ -36,7 +54,7 @@ class Place:
 class VariablePlace(Place):
     """A variable."""
 
-    variable: "Variable"
+    variable: Variable
 
 
 @dataclass(frozen=True)
@@ -74,7 +92,7 @@ class PartPlace(Place):
     site: int
 
 
-def root(value: Value) -> "Variable | None":
+def root(value: Value) -> Variable | None:
     """The variable that a place is part of."""
     place = value.place
     while place is not None:

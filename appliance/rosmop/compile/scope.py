@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from appliance.rosmop.compile.codecs import Codecs
 from appliance.rosmop.compile.module import Lines, Module, Site
-from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -16,28 +16,6 @@ from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, nearest, shown
 
 Role = Literal["action", "timer", "handler", "init", "function"]
-
-
-@dataclass(eq=False)
-class Variable:
-    """A variable: its name in the text and in the code.
-
-    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is what a
-    reference stands for. `shared` variables live in the namespace of the module.
-    """
-
-    name: str
-    type: Type
-    code: str
-    position: Position
-    shared: bool = False
-    constant: bool = False
-    known: bool | int | float | None = None
-    """What a `const` number is, if it is written down."""
-    flag: str | None = None
-    alias: Value | None = None
-    used: bool = False
-    assigned: bool = False
 
 
 @dataclass(eq=False)

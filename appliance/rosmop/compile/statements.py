@@ -3,7 +3,8 @@
 A statement that is refused is noted and the next one is looked at, so that one check finds as much as it can.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
@@ -31,16 +32,6 @@ def write(scope: Scope, node: tree.Statement) -> None:
             _KINDS[type(node)](scope, node)
     except SpecificationError as error:
         scope.shared.findings += error.findings
-
-
-def write_body(scope: Scope, statements: Sequence[tree.Statement]) -> None:
-    """Write statements one step deeper, in a block of names of their own; `pass` if nothing comes of them."""
-    with scope.block(), scope.indented():
-        before = len(scope.lines.lines)
-        for statement in statements:
-            write(scope, statement)
-        if len(scope.lines.lines) == before:
-            scope.lines.add("pass")
 
 
 # Declarations
@@ -181,10 +172,10 @@ def _if(scope: Scope, node: tree.Statement) -> None:
     assert isinstance(node, tree.If)  # noqa: S101
     with scope.at(node.condition):
         scope.lines.add(f"if {condition(value_of(scope, node.condition))}:")
-    write_body(scope, [node.yes])
+    loops.write_body(scope, [node.yes], write)
     if node.no is not None:
         scope.lines.add("else:")
-        write_body(scope, [node.no])
+        loops.write_body(scope, [node.no], write)
 
 
 def _break(scope: Scope, node: tree.Statement) -> None:
@@ -271,10 +262,10 @@ _KINDS: Mapping[type[tree.Statement], Callable[[Scope, tree.Statement], None]] =
     tree.Evaluate: _evaluate,
     tree.Block: _block,
     tree.If: _if,
-    tree.While: loops.write_while,
-    tree.For: loops.write_for,
-    tree.RangeFor: loops.write_range_for,
-    tree.Switch: loops.write_switch,
+    tree.While: partial(loops.write_while, write=write),
+    tree.For: partial(loops.write_for, write=write),
+    tree.RangeFor: partial(loops.write_range_for, write=write),
+    tree.Switch: partial(loops.write_switch, write=write),
     tree.Break: _break,
     tree.Continue: _continue,
     tree.Return: _return,

@@ -1,0 +1,46 @@
+"""What a variable is initialised or assigned with: an expression that converts, or `{a, b, c}` for a vector.
+
+`value_of` computes an expression; it is handed in, because expressions contain initialisers.
+"""
+
+from collections.abc import Callable
+
+from appliance.rosmop.compile.conversion import convert
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+ValueOf = Callable[[Scope, tree.Expression], Value]
+
+
+def converted(scope: Scope, node: tree.Expression, target: Type, value_of: ValueOf) -> str:
+    """Code for an expression as a value of the target type; `{…}` makes a vector."""
+    if isinstance(node, tree.Elements):
+        return elements(scope, node, target, value_of)
+    return convert(scope, value_of(scope, node), target, scope.site(node))
+
+
+def elements(scope: Scope, node: tree.Elements, target: Type, value_of: ValueOf) -> str:
+    """Code for `{a, b, c}` as a vector."""
+    if not isinstance(target, kinds.Vector):
+        if len(node.items) == 1:
+            return converted(scope, node.items[0], target, value_of)
+        if not node.items:
+            return scope.codecs.zero(target)
+        raise SpecificationError.at(
+            node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
+        )
+    if target.length is not None and len(node.items) > target.length:
+        raise SpecificationError.at(
+            node.items[target.length].position, f"more than the {target.length} elements of the array"
+        )
+    items = [converted(scope, item, target.element, value_of) for item in node.items]
+    missing = 0 if target.length is None else target.length - len(items)
+    code = f"[{', '.join(items)}]"
+    if missing:
+        rest = scope.codecs.maker(kinds.Vector(target.element, missing))
+        code = f"({code} + {rest}())"
+    return code
