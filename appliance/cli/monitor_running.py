@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 
 from appliance.channel.admin import (
-    AdminRequest,
     MonitorLoad,
     MonitorReload,
     MonitorRemove,
@@ -19,7 +18,7 @@ from appliance.channel.admin import (
     MonitorSwitch,
 )
 from appliance.cli.policy_output import counted, say
-from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
@@ -30,7 +29,7 @@ def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
     Example: rosrv monitor list --json
     """
-    body = _ask(state, MonitorsWanted(), as_json=as_json)
+    body = ask_or_exit(state, MonitorsWanted(), as_json=as_json)
     if as_json:
         for row in body["monitors"]:
             sys.stdout.write(json.dumps(row) + "\n")
@@ -93,7 +92,7 @@ def load(
             if path.suffix in {".msg", ".srv"} and path.is_file():
                 package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
                 definitions[f"{package.name}/{path.name}"] = _text(path)
-    _say_replaced(_ask(state, MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json)
+    _say_replaced(ask_or_exit(state, MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json)
 
 
 def remove(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
@@ -101,7 +100,7 @@ def remove(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) 
 
     Example: rosrv monitor remove safeTrigger
     """
-    _say_replaced(_ask(state, MonitorRemove(names), as_json=as_json), as_json=as_json)
+    _say_replaced(ask_or_exit(state, MonitorRemove(names), as_json=as_json), as_json=as_json)
 
 
 def reload(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
@@ -109,7 +108,7 @@ def reload(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
     Example: rosrv monitor reload
     """
-    _say_replaced(_ask(state, MonitorReload(), as_json=as_json), as_json=as_json)
+    _say_replaced(ask_or_exit(state, MonitorReload(), as_json=as_json), as_json=as_json)
 
 
 def resume(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
@@ -117,7 +116,7 @@ def resume(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) 
 
     Example: rosrv monitor resume safeTrigger
     """
-    body = _ask(state, MonitorResume(names), as_json=as_json)
+    body = ask_or_exit(state, MonitorResume(names), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
     else:
@@ -126,7 +125,7 @@ def resume(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) 
 
 def rv_state(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
-    body = _ask(state, MonitorsWanted(), as_json=as_json)
+    body = ask_or_exit(state, MonitorsWanted(), as_json=as_json)
     real, port, rows = body["rv_state"]
     if as_json:
         sys.stdout.write(json.dumps(body["rv_state"]) + "\n")
@@ -137,7 +136,7 @@ def rv_state(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
 
 def _switch(names: list[str], enabled: bool, state: Path, *, as_json: bool) -> None:
-    body = _ask(state, MonitorSwitch(names, enabled), as_json=as_json)
+    body = ask_or_exit(state, MonitorSwitch(names, enabled), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
         return
@@ -172,12 +171,4 @@ def _text(file: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"it is not UTF-8: {error.reason}"
         typer.echo(f"rosrv monitor: cannot read {file}: {reason}", err=True)
-        raise typer.Exit(2) from None
-
-
-def _ask(state: Path, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
-    try:
-        return body_or_exit(ask(state, request), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
         raise typer.Exit(2) from None

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.channel.admin import AdminRequest, PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
+from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import counted, say
-from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -34,7 +34,7 @@ def reload(
     Example: rosrv policy reload --confirm-within 5m
     """
     seconds = _seconds(confirm_within) if confirm_within is not None else None
-    body = _ask(state, PolicyReload(seconds), as_json=as_json)
+    body = ask_or_exit(state, PolicyReload(seconds), as_json=as_json)
     _say_loaded(body, as_json=as_json)
 
 
@@ -49,7 +49,7 @@ def rollback(
 
     Example: rosrv policy rollback 7
     """
-    _say_loaded(_ask(state, PolicyRollback(revision), as_json=as_json), as_json=as_json)
+    _say_loaded(ask_or_exit(state, PolicyRollback(revision), as_json=as_json), as_json=as_json)
 
 
 def confirm(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
@@ -57,7 +57,7 @@ def confirm(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
     Example: rosrv policy confirm
     """
-    body = _ask(state, PolicyConfirm(), as_json=as_json)
+    body = ask_or_exit(state, PolicyConfirm(), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
     else:
@@ -71,21 +71,13 @@ def revisions(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
     Example: rosrv policy revisions
     """
-    for row in _ask(state, PolicyRevisions(), as_json=as_json)["revisions"]:
+    for row in ask_or_exit(state, PolicyRevisions(), as_json=as_json)["revisions"]:
         if as_json:
             sys.stdout.write(json.dumps(row) + "\n")
             continue
         loaded = datetime.datetime.fromtimestamp(row["loaded"], datetime.UTC).isoformat(timespec="seconds")
         mark = "in force" if row["in_force"] else ""
         say(f"{row['revision']:>5}  {loaded}  {row['who']}: {row['note']}  {row['file']}  {mark}".rstrip())
-
-
-def _ask(state: Any, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
-    try:
-        return body_or_exit(ask(state, request), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(2) from None
 
 
 def _say_loaded(body: dict[str, Any], *, as_json: bool) -> None:

@@ -77,3 +77,12 @@ def body_or_exit(answer: AdminAnswer, *, as_json: bool) -> dict[str, Any]:
             typer.echo(finding, err=True)
         typer.echo(f"rosrv: {answer.error}", err=True)
     raise typer.Exit(1)
+
+
+def ask_or_exit(state: Path, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+    """Ask the running appliance; the answer's body. Ends the program with 1 when it refuses, 2 when none runs."""
+    try:
+        return body_or_exit(ask(state, request), as_json=as_json)
+    except NotRunningError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(2) from None

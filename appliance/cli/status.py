@@ -13,7 +13,7 @@ from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
 from appliance.cli.policy_output import counted
-from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
@@ -28,11 +28,7 @@ def status(
 
     Example: rosrv status --state /var/lib/rosrv
     """
-    try:
-        body = body_or_exit(ask(state, StatusWanted()), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(2) from None
+    body = ask_or_exit(state, StatusWanted(), as_json=as_json)
     troubles = list(_troubles(body))
     if as_json:
         sys.stdout.write(json.dumps({**body, "troubles": troubles}) + "\n")
@@ -61,6 +57,7 @@ def _troubles(body: dict[str, Any]) -> list[str]:
         found.append("no relay process: topics and services carry nothing")
     if body["rosmaster"] != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
+    found += body["ipsec"]["troubles"]
     if body["policy"]["confirm_by"] is not None:
         left = max(0, round(body["policy"]["confirm_by"] - time.time()))
         found.append(f"the policy goes back in {left} s unless confirmed: rosrv policy confirm")
@@ -102,6 +99,7 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         "relay",
         f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}",
     )
+    grid.add_row("tunnels", _tunnels(body["ipsec"]))
     grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written")
     console.print(grid)
     table = Table("process", "pid", "for", "restarts", box=None, padding=(0, 2, 0, 0), header_style="dim")
@@ -110,6 +108,12 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         since = datetime.datetime.fromisoformat(process["since"]).timestamp()
         table.add_row(process["role"], str(process["pid"]), _age(since), restarts)
     console.print(table)
+
+
+def _tunnels(ipsec: dict[str, Any]) -> str:
+    if ipsec["esp"] is None:
+        return f"{counted(ipsec['enrolled'], 'host')} enrolled"
+    return f"{ipsec['up']} of {counted(ipsec['enrolled'], 'enrolled host')} up, ESP in {ipsec['esp']}"
 
 
 def _isolation(body: dict[str, Any]) -> str:

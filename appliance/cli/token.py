@@ -4,14 +4,14 @@ import datetime
 import json
 import re
 import sys
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import AdminRequest, TokenAdd, TokenList, TokenRevoke, TokenRole
+from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRole
 from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import say
-from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 
 app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
 
@@ -37,7 +37,7 @@ def add(
 
     Example: rosrv token add alice --role operator --expires 30d
     """
-    body = _ask(state, TokenAdd(name, role, _seconds(expires)), as_json=as_json)
+    body = ask_or_exit(state, TokenAdd(name, role, _seconds(expires)), as_json=as_json)
     if as_json:
         _print(json.dumps(body))
         return
@@ -56,7 +56,7 @@ def list_tokens(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     Example: rosrv token list
     """
     now = datetime.datetime.now(datetime.UTC).timestamp()
-    for row in _ask(state, TokenList(), as_json=as_json)["tokens"]:
+    for row in ask_or_exit(state, TokenList(), as_json=as_json)["tokens"]:
         if as_json:
             _print(json.dumps(row))
             continue
@@ -77,19 +77,11 @@ def revoke(
 
     Example: rosrv token revoke alice
     """
-    body = _ask(state, TokenRevoke(name), as_json=as_json)
+    body = ask_or_exit(state, TokenRevoke(name), as_json=as_json)
     if as_json:
         _print(json.dumps(body))
     else:
         say(f"token {body['name']} ({body['role']}) is revoked")
-
-
-def _ask(state: Any, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
-    try:
-        return body_or_exit(ask(state, request), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(2) from None
 
 
 def _seconds(text: str) -> float:
