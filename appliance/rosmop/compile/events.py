@@ -7,12 +7,12 @@ the `when` or a constant of the pattern look at are decoded; only fields that we
 from dataclasses import dataclass
 
 from appliance.ros.errors import DefinitionError
-from appliance.rosmop.compile.codecs import struct_code, struct_size
-from appliance.rosmop.compile.conversion import condition, convert, literal, refusal
+from appliance.rosmop.compile.conversion import condition, refusal
 from appliance.rosmop.compile.expressions import value_of
-from appliance.rosmop.compile.locate import Locator, Spot, Walk, type_of_path
+from appliance.rosmop.compile.fields import Bound, check_overlaps, pending, read_fields, write_back
+from appliance.rosmop.compile.locate import type_of_path
 from appliance.rosmop.compile.module import Lines
-from appliance.rosmop.compile.places import Value, Variable
+from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.positions import Position
@@ -23,9 +23,6 @@ from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import UnknownNameError, nearest, shown
 from appliance.rosmop.types.resolve import resolve
-
-CHARGED = 1024
-"""A message longer than this is charged when an array or all of it is decoded."""
 
 
 @dataclass(frozen=True)
@@ -45,19 +42,6 @@ class EventCode:
     period_ns: int | None = None
     action_line: int = 0
     """The line of the code at which the action begins: what faults there has happened."""
-
-
-@dataclass(eq=False)
-class Bound:
-    """A field of the pattern: the variable it is bound to, or the constant it must equal."""
-
-    binding: tree.Binding
-    type: Type
-    variable: Variable | None = None
-    constant: bool | int | float | bytes | None = None
-    spot: Spot | None = None
-    read: str = ""  # the code's name for the field's value
-    end: str = ""  # of a field of variable size: the code's name for where it ends
 
 
 def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) -> EventCode:
@@ -215,8 +199,8 @@ def _body(
     scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, bound: list[Bound], kind: str
 ) -> tuple[list[tuple[str, int]], list[tuple[str, int]]]:
     """The lines of `when` and of the action. They come first, because they say which fields are needed."""
-    pending = scope.module.fresh("u")
-    scope.read_message = lambda: _whole(scope, pending, kind)
+    teller = scope.module.fresh("u")
+    scope.read_message = lambda: _whole(scope, teller, kind)
     own, scope.lines = scope.lines, Lines()
     when = trigger.when
     if when is not None:
@@ -234,11 +218,11 @@ def _body(
     return conditions.lines, action.lines
 
 
-def _whole(scope: Scope, pending: str, kind: str) -> str:
-    """Code for `MESSAGE`: the message with what was assigned so far, which `pending` tells."""
-    scope.whole_asked = pending
+def _whole(scope: Scope, teller: str, kind: str) -> str:
+    """Code for `MESSAGE`: the message with what was assigned so far, which `teller` tells."""
+    scope.whole_asked = teller
     record = kinds.Record(kind)
-    return f"x_whole(m, {scope.context}, {scope.codecs.decoder(record)}, {pending}(), {scope.lines.site})"
+    return f"x_whole(m, {scope.context}, {scope.codecs.decoder(record)}, {teller}(), {scope.lines.site})"
 
 
 def _assemble(
@@ -253,176 +237,17 @@ def _assemble(
     lines.site = scope.site(event)
     scope.lines = lines
     lines.add("b = m.buffer")
-    _read(scope, bound)
+    read_fields(scope, bound)
     written = [each for each in bound if each.variable is not None and each.variable.assigned]
-    _check_overlaps(scope, bound, written)
+    check_overlaps(scope, bound, written)
     for each in written:
         assert each.variable is not None  # noqa: S101
         lines.add(f"{each.variable.flag} = False")
     if scope.whole_asked is not None:
-        lines.add(f"{scope.whole_asked} = lambda: {_pending(scope, written)}")
+        lines.add(f"{scope.whole_asked} = lambda: {pending(scope, written)}")
     lines.lines += conditions
     before = len(lines.lines)
     lines.lines += action
-    _write_back(scope, written)
+    write_back(scope, written)
     lines.add("return True")
     return lines.lines, before
-
-
-def _pending(scope: Scope, written: list[Bound]) -> str:
-    """Code for the assigned fields, as (whether assigned, path, value)."""
-    entries = []
-    for each in written:
-        assert each.variable is not None  # noqa: S101
-        path = tuple(_slots(scope, each))
-        value = _as_field(scope, each)
-        entries.append(f"({each.variable.flag}, {path!r}, {value})")
-    return f"({', '.join(entries)},)" if entries else "()"
-
-
-def _slots(scope: Scope, each: Bound) -> list[int | str]:
-    """The path as indexes into lists; the parts of a time by name."""
-    kind: Type = kinds.Record(scope.message_type or "")
-    path: list[int | str] = []
-    for step in each.binding.path:
-        if isinstance(kind, kinds.Record):
-            slot = scope.messages.slot(kind.name, step.name)
-            path.append(slot.index)
-            kind = slot.type
-        else:
-            path.append(step.name)
-        if step.index is not None and isinstance(kind, kinds.Vector):
-            path.append(step.index)
-            kind = kind.element
-    return path
-
-
-def _as_field(scope: Scope, each: Bound) -> str:
-    """Code for a variable's value as the field has it."""
-    assert each.variable is not None  # noqa: S101
-    value = Value(each.variable.type, each.variable.code, each.binding.position, owned=False)
-    return convert(scope, value, each.type)
-
-
-# Reading and writing fields
-
-
-def _read(scope: Scope, bound: list[Bound]) -> None:
-    lines = scope.lines
-    layout = scope.messages.definitions.layout(scope.message_type or "")
-    walk = Walk(Locator(scope.module, scope.codecs, lines), layout, Spot(None, 0))
-    fixed: list[Bound] = []
-    large = False
-    for each in bound:
-        each.spot = walk.find(each.binding.path)
-        if each.variable is not None and not each.variable.used:
-            continue
-        if struct_code(each.type) is not None:
-            fixed.append(each)
-        elif isinstance(each.type, kinds.Vector | kinds.Record):
-            large = True
-    if large:
-        lines.add(f"if w_len(b) > {CHARGED}: {scope.context}.allocate(w_len(b), {lines.site})")
-    _read_fixed(scope, fixed)
-    for each in bound:
-        if struct_code(each.type) is None and (each.variable is None or each.variable.used):
-            each.read, each.end = scope.temporary("r"), scope.temporary("x")
-            start = "0" if each.spot is None else each.spot.code
-            lines.add(f"{each.read}, {each.end} = {scope.codecs.decode(each.type, 'b', start)}")
-    for each in bound:
-        _take(scope, each)
-
-
-def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
-    """Read numbers; those at known distances from each other with one call."""
-    groups: dict[str | None, list[Bound]] = {}
-    for each in fixed:
-        assert each.spot is not None  # noqa: S101  a number is somewhere
-        groups.setdefault(each.spot.base, []).append(each)
-    for group in groups.values():
-        waiting = sorted(group, key=_offset)
-        while waiting:
-            together = [waiting.pop(0)]
-            while waiting and _near(together[-1], waiting[0]):
-                together.append(waiting.pop(0))
-            _read_together(scope, together)
-
-
-def _offset(each: Bound) -> int:
-    return each.spot.offset if each.spot is not None else 0
-
-
-def _near(one: Bound, other: Bound) -> bool:
-    gap = _offset(other) - _offset(one) - struct_size(struct_code(one.type) or "")
-    return 0 <= gap <= 256
-
-
-def _read_together(scope: Scope, together: list[Bound]) -> None:
-    codes, names = "<", []
-    at = _offset(together[0])
-    for each in together:
-        code = struct_code(each.type) or ""
-        gap = _offset(each) - at
-        codes += (f"{gap}x" if gap else "") + code
-        at = _offset(each) + struct_size(code)
-        each.read = scope.temporary("r")
-        names += [f"{each.read}_{index}" for index in range(2)] if len(code) == 2 else [each.read]
-    unpack = scope.module.struct(codes, "unpack_from")
-    spot = together[0].spot
-    assert spot is not None  # noqa: S101
-    scope.lines.add(f"{', '.join(names)}, = {unpack}(b, {spot.code})")
-    for each in together:
-        if len(struct_code(each.type) or "") == 2:
-            scope.lines.add(f"{each.read} = {each.read}_0 * 1000000000 + {each.read}_1")
-
-
-def _take(scope: Scope, each: Bound) -> None:
-    """Compare a field with its constant, or give it to its variable."""
-    if each.constant is not None:
-        scope.lines.add(f"if not {each.read} == {literal(each.constant)}: return False")
-    elif each.variable is not None and each.variable.used:
-        value = Value(each.type, each.read, each.binding.position)
-        scope.lines.add(f"{each.variable.code} = {convert(scope, value, each.variable.type)}")
-
-
-def _write_back(scope: Scope, written: list[Bound]) -> None:
-    lines = scope.lines
-    edits = scope.temporary("w")
-    lines.add("if m.dropped: return True")
-    spliced = [each for each in written if struct_code(each.type) is None]
-    for each in written:
-        code = struct_code(each.type)
-        assert each.variable is not None  # noqa: S101
-        if code is not None:
-            assert each.spot is not None  # noqa: S101
-            packed = scope.codecs.pack([(each.type, _as_field(scope, each))])
-            lines.add(f"if {each.variable.flag}: m.patch({each.spot.code}, {packed})")
-    if not spliced:
-        return
-    lines.add(f"{edits} = []")
-    for each in spliced:
-        assert each.variable is not None  # noqa: S101
-        start = "0" if each.spot is None else each.spot.code
-        lines.add(f"if {each.variable.flag}:")
-        lines.add("    o = e_bytearray()")
-        lines.add(f"    {scope.codecs.encoder(each.type)}({_as_field(scope, each)}, o)")
-        lines.add(f"    {edits}.append(({start}, {each.end}, e_bytes(o)))")
-    lines.add(f"if {edits}: m.splice({edits})")
-
-
-def _check_overlaps(scope: Scope, bound: list[Bound], written: list[Bound]) -> None:
-    """Refuse an assignment to a field that is bound twice: one change would undo the other."""
-    for each in written:
-        path = _path(each)
-        for other in bound:
-            shorter = min(len(path), len(_path(other)))
-            if other is not each and path[:shorter] == _path(other)[:shorter]:
-                raise SpecificationError.at(
-                    max(each, other, key=lambda one: one.binding.position).binding.position,
-                    "two bindings hold this field, and one of them is assigned; bind it once",
-                )
-    del scope
-
-
-def _path(each: Bound) -> list[tuple[str, int | None]]:
-    return [(step.name, step.index) for step in each.binding.path]
