@@ -11,7 +11,8 @@ from appliance.channel.admin import GraphWanted
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", serialize_by_alias=True, validate_by_name=True)
+    # What control says more than is named here is passed on: a part of the appliance adds its own.
+    model_config = ConfigDict(extra="allow", serialize_by_alias=True, validate_by_name=True)
 
 
 class Node(_Model):

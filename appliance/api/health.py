@@ -12,7 +12,8 @@ from appliance.channel.admin import StatusWanted
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    # What control says more than is named here is passed on: a part of the appliance adds its own.
+    model_config = ConfigDict(extra="allow")
 
 
 class Health(_Model):
