@@ -1,0 +1,106 @@
+"""One command of an operator: `command.py drive FORWARD TURN SECONDS`, `command.py aim PAN TILT`, `command.py fire`.
+
+Speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON object, `drove` (with
+the position at the end), `aimed` (with the angle reached) or `fired` (with the number of shots so far).
+"""
+
+import sys
+import threading
+
+import rospy
+from geometry_msgs.msg import TwistStamped
+from landshark_messages import paintball_trigger
+from nav_msgs.msg import Odometry
+from report import report
+from sensor_msgs.msg import JointState
+from std_msgs.msg import UInt32
+
+HERTZ = 10
+SECONDS = 10.0  # a driver that is not there by then is not coming
+SETTLED = 1.0
+
+
+class Display:
+    """The newest message of a topic."""
+
+    def __init__(self, topic, kind):
+        self.message = None
+        self.changed = threading.Condition()
+        rospy.Subscriber(topic, kind, self.show)
+
+    def show(self, message):
+        with self.changed:
+            self.message = message
+            self.changed.notify_all()
+
+    def wait(self, condition, seconds=SECONDS):
+        """Wait for a message that satisfies `condition`; whether one came."""
+        with self.changed:
+            return self.changed.wait_for(
+                lambda: self.message is not None and condition(self.message), seconds
+            )
+
+
+def connected(publisher):
+    """A publisher with a subscriber; ends the program without one."""
+    rate = rospy.Rate(HERTZ)
+    for _ in range(int(SECONDS * HERTZ)):
+        if publisher.get_num_connections():
+            return publisher
+        rate.sleep()
+    sys.exit(f"command.py: nobody listens to {publisher.name}")
+
+
+def drive(forward, turn, seconds):
+    """Give a velocity for so long, and wait until the robot stands."""
+    display = Display("/landshark/odom", Odometry)
+    publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
+    rate = rospy.Rate(HERTZ)
+    for _ in range(int(seconds * HERTZ)):
+        message = TwistStamped()
+        message.header.stamp = rospy.Time.now()
+        message.twist.linear.x, message.twist.angular.z = forward, turn
+        publisher.publish(message)
+        rate.sleep()
+    display.wait(lambda odometry: odometry.twist.twist.linear.x == 0 and odometry.twist.twist.angular.z == 0)
+    position = display.message.pose.pose.position
+    report("drove", x=round(position.x, 2), y=round(position.y, 2))
+
+
+def aim(pan, tilt):
+    """Turn the gun, and wait until it points there."""
+    display = Display("/landshark/joint_states", JointState)
+    publisher = connected(rospy.Publisher("/landshark_control/turret", JointState, queue_size=10))
+    message = JointState(name=["turret_pan", "turret_tilt"], position=[pan, tilt])
+    message.header.stamp = rospy.Time.now()
+    publisher.publish(message)
+    display.wait(lambda joints: abs(joints.position[1] - tilt) < 0.01)
+    report("aimed", tilt=round(display.message.position[1], 2))
+
+
+def fire():
+    """One shot, if it comes through: the count that the driver tells within a second."""
+    kind = paintball_trigger()
+    display = Display("/landshark/shots", UInt32)
+    publisher = connected(rospy.Publisher("/landshark_control/trigger", kind, queue_size=10))
+    display.wait(lambda _shots: True)
+    before = display.message.data
+    message = kind(trigger=kind.SINGLE_SHOT)
+    message.header.stamp = rospy.Time.now()
+    publisher.publish(message)
+    display.wait(lambda shots: shots.data > before, SETTLED)
+    report("fired", shots=display.message.data, before=before)
+
+
+def main():
+    """Do one thing."""
+    what, *values = rospy.myargv()[1:] or ["nothing"]
+    actions = {"drive": (drive, 3), "aim": (aim, 2), "fire": (fire, 0)}
+    if what not in actions or len(values) != actions[what][1]:
+        sys.exit("usage: command.py drive FORWARD TURN SECONDS | aim PAN TILT | fire")
+    rospy.init_node("ocu")
+    actions[what][0](*map(float, values))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""The thesis's scenarios with the shipped monitors: on simulated drives, on a recording, on the running robot."""
+
+import json
+import math
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from examples.landshark.drive import MISSION, SHIPPED, TRIGGERED, VELOCITY, Drive, Part, Simulation, record
+from examples.landshark.messages import MONITORS, Messages
+from examples.landshark.nodes import physics
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.nodes import PYTHON, ROOT, RosSession, has_ros
+from tests.support.requirements import needs
+
+NODES = ROOT / "examples" / "landshark" / "nodes"
+OBSTACLE = physics.YARD[0]
+SLACK = (
+    2.0 * physics.COMMAND_LIFETIME + 0.2
+)  # metres: the base obeys the last command for half a second, at 2 m/s
+Record = dict[str, Any]
+
+
+def specification(name: str) -> tuple[Path, ...]:
+    """One shipped file."""
+    return (MONITORS / f"{name}.rv",)
+
+
+@pytest.fixture(scope="module")
+def unguarded() -> Drive:
+    """The mission without monitors."""
+    return Simulation().run()
+
+
+@pytest.fixture(scope="module")
+def bag(unguarded: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its recording."""
+    path = tmp_path_factory.mktemp("bags") / "drive.bag"
+    record(unguarded, path)
+    return path
+
+
+def replayed(bag: Path, *files: Path, output: Path | None = None) -> list[Record]:
+    """`rosrv monitor run --json`: its records."""
+    command = [ROSRV, "monitor", "run", *map(str, files), "--bag", str(bag), "--json"]
+    command += ["--output", str(output)] if output else []
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_without_monitors_everything_goes_wrong(unguarded: Drive) -> None:
+    """The mission is worth guarding: through the obstacle, out of the zone, a shot at the robot itself."""
+    assert unguarded.nearest(OBSTACLE) < 0
+    assert unguarded.farthest() > 24
+    assert [shot.fired for shot in unguarded.shots] == [True, True, True]
+    assert min(shot.tilt for shot in unguarded.shots) < -0.45
+
+
+def test_safe_triggering(unguarded: Drive) -> None:
+    """The one shot at the robot itself is dropped; all else is as it was, to the byte."""
+    guarded = Simulation(specification("safe_triggering")).run()
+    assert [shot.fired for shot in guarded.shots] == [True, False, True]
+    assert guarded.poses == unguarded.poses
+    assert [one.data for one in guarded.messages] == [one.data for one in unguarded.messages]
+    assert [one.topic for one in guarded.messages if one.result != "passed"] == [TRIGGERED]
+
+
+def test_safe_zone(unguarded: Drive) -> None:
+    """The robot stops at the border and comes back when it backs up and turns."""
+    guarded = Simulation(specification("safe_zone")).run()
+    assert 20 < guarded.farthest() < 20 + SLACK
+    end = guarded.poses[-1]
+    assert math.hypot(end.x, end.y) < 19
+    first = next(one for one in guarded.messages if one.result == "dropped")
+    outside = next(index for index, pose in enumerate(unguarded.poses) if math.hypot(pose.x, pose.y) > 20)
+    late = first.time - unguarded.messages[0].time - outside * 50_000_000
+    assert 0 <= late <= 101_000_000  # the next command after the border was crossed
+    assert first.topic == VELOCITY
+
+
+def test_obstacle_avoidance() -> None:
+    """The robot never touches the obstacle, an alarm is published, and backing up and turning go on."""
+    guarded = Simulation(specification("obstacle_avoidance")).run()
+    assert 0.3 < guarded.nearest(OBSTACLE) < 1.3
+    alarms = [one for one in guarded.messages if one.topic == "/landshark/obstacle_alarm"]
+    said = Messages().decode("std_msgs/String", alarms[0].data).data
+    assert said.startswith("obstacle at 1.")
+    assert said.endswith("told to drive at 1.000000 m/s")
+    assert all(one.result != "dropped" for one in guarded.messages)
+    assert guarded.farthest() > 20
+
+
+@pytest.mark.parametrize("forward", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("start", [0.0, 0.4])
+def test_no_speed_and_no_course_touches_the_obstacle(forward: float, start: float) -> None:
+    """The distance that must be free follows from the speed."""
+    mission = (
+        Part(start / 0.4 if start else 0.1, turn=0.1 if start else 0.0),
+        Part(30 / forward / 2, forward=forward),
+    )
+    guarded = Simulation(specification("obstacle_avoidance")).run(mission)
+    assert guarded.nearest(OBSTACLE) > 0.3
+    assert Simulation().run(mission).nearest(OBSTACLE) < 0
+
+
+def test_a_blind_laser_is_an_obstacle() -> None:
+    """Before the first scan, and when scans cease, the robot is not driven forward."""
+    simulation = Simulation(specification("obstacle_avoidance"))
+    simulation.laser_works = False
+    simulation.run((Part(3.0, forward=1.0),))
+    assert simulation.drive.poses[-1].x == 0
+    simulation.laser_works = True
+    simulation.run((Part(1.0), Part(2.0, forward=1.0)))
+    reached = simulation.drive.poses[-1].x
+    assert reached > 1
+    simulation.laser_works = False
+    simulation.run((Part(5.0, forward=1.0),))
+    assert simulation.drive.poses[-1].x < reached + 1.5
+
+
+def test_all_of_them_together(unguarded: Drive) -> None:
+    """Shipped as they are: each guards its own, none hinders another."""
+    guarded = Simulation(SHIPPED).run()
+    assert guarded.nearest(OBSTACLE) > 0.3
+    assert guarded.farthest() < 20 + SLACK
+    assert [shot.fired for shot in guarded.shots] == [True, False, True]
+    assert {"trigger 1"} == {text for _time, text in guarded.log if text.startswith("trigger")}
+    assert len([one for one in guarded.messages if one.topic == TRIGGERED]) == len(unguarded.shots)
+    assert sum(part.fire for part in MISSION) == 3
+
+
+def test_the_recording_is_judged_as_the_drive_would_have_been(
+    bag: Path, unguarded: Drive, tmp_path: Path
+) -> None:
+    """`rosrv monitor run` drops what the monitors would have dropped, and writes what would have come through."""
+    output = tmp_path / "guarded.bag"
+    records = replayed(bag, *SHIPPED, output=output)
+    messages = [one for one in records if "topic" in one]
+    assert [one["topic"] for one in messages] == [one.topic for one in unguarded.messages]
+    shots = [one["outcome"] for one in messages if one["topic"] == TRIGGERED]
+    assert shots == ["passed", "dropped", "passed"]
+    outcomes = {
+        topic: {one["outcome"] for one in messages if one["topic"] == topic}
+        for topic in (VELOCITY, "/landshark/odom")
+    }
+    assert outcomes == {VELOCITY: {"passed", "changed", "dropped"}, "/landshark/odom": {"passed"}}
+    alarms = [one for one in messages if one["published"]]
+    assert {one["published"][0]["topic"] for one in alarms} == {"/landshark/obstacle_alarm"}
+    assert not [one for one in records if one["faults"]]
+    again = replayed(output, *specification("safe_triggering"))
+    assert [one["outcome"] for one in again if one["topic"] == TRIGGERED] == ["passed", "passed"]
+
+
+def test_a_recording_gives_the_same_records_every_time(bag: Path) -> None:
+    """Ticks, throttled lines and silence go by the clock of the recording."""
+    assert replayed(bag, *SHIPPED) == replayed(bag, *SHIPPED)
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """An appliance with the shipped monitors."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    options = ("--monitors", str(MONITORS), "--api", "off")
+    with Appliance(policy=OPEN_POLICY, options=options) as appliance:
+        yield appliance
+
+
+@pytest.fixture(scope="module")
+def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
+    """The LandShark's nodes on this machine."""
+    with RosSession(appliance.master_uri, tmp_path_factory.mktemp("robot")) as session:
+        for program in (["base.py"], ["turret.py"], ["sensors.py", "gps"], ["sensors.py", "laser"]):
+            session.start([PYTHON, str(NODES / program[0]), *program[1:]], label=program[-1])
+        yield session
+
+
+def told(robot: RosSession, *command: str) -> Record:
+    """What `command.py` says."""
+    said = robot.run(PYTHON, str(NODES / "command.py"), *command, timeout=120).stdout
+    answer: Record = json.loads(said.splitlines()[-1])
+    return answer
+
+
+def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robot: RosSession) -> None:
+    """A shot, none, a shot; the drop is a record in the audit log."""
+    for tilt, shots in ((0.2, 1), (-0.7, 1), (0.3, 2)):
+        assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
+        assert told(robot, "fire")["shots"] == shots
+    [dropped] = appliance.audit(event="message dropped", resource=TRIGGERED)
+    assert "safeTrigger" in json.dumps(dropped)
+
+
+def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot: RosSession) -> None:
+    """Told to drive 10 m at 2 m/s with an obstacle 7 m ahead, and told so again, it does not reach it."""
+    alarm = robot.start(["/usr/bin/rostopic", "echo", "-n", "1", "/landshark/obstacle_alarm"])
+    there = told(robot, "drive", "2.0", "0", "5")
+    assert 3 < there["x"] < 6.9
+    alarm.wait_for_text("obstacle at")
+    again = told(robot, "drive", "2.0", "0", "1")
+    assert again["x"] < 6.9
+    back = told(robot, "drive", "-1.0", "0", "1")
+    assert back["x"] < again["x"]
+    assert appliance.audit(event="message changed", resource=VELOCITY)
