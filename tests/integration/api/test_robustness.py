@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -170,3 +171,22 @@ def test_the_api_may_read_the_audit_log_and_nothing_more(appliance: Appliance) -
         "relay",
     ):
         assert not may("-r", path), path
+
+
+def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:
+    """A damaged certificate: the log says what is wrong with REST, and nodes are served; mended, REST is back."""
+    with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
+        appliance.rest()
+        appliance.stop()
+        certificate = appliance.state / "api" / "certificate.pem"
+        right = certificate.read_text()
+        certificate.write_text("nonsense")
+        appliance.start()
+        assert appliance.process is not None
+        deadline = time.monotonic() + 30
+        while not any("REST cannot be served" in line for line in list(appliance.process.errors)):
+            assert time.monotonic() < deadline, appliance.story()
+            assert seconds_of_a_call(appliance) < 5
+        assert process_row(appliance, "control")["restarts"] == 0
+        certificate.write_text(right)
+        ssl.get_server_certificate(("127.0.0.1", int(appliance.ready["api"].rpartition(":")[2])), timeout=30)
