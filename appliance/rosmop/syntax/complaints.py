@@ -141,6 +141,8 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
         piece = match[0] if match else text[offset]
         found = shown(piece)
         hint = FORBIDDEN.get(piece, _HINTS.get(piece, ""))
+    if text.startswith("/*", offset):
+        return "this comment does not end; write `*/` behind it"
     container = _CONTAINER.search(text, max(0, offset - 100), offset)
     if container is not None:
         hint = f"there is no `{container[1]}`; use a `std::vector`"

@@ -10,7 +10,7 @@ from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.unit.rosmop.acting import act, definitions, load, message, refused, refused_action
 
-PATIENCE = 20.0  # seconds; the machine may be busy, an endless loop is endless
+PATIENCE = 20.0  # seconds of processor time; an endless loop is endless
 
 BUDGET = "more than 1000000 instructions for one message; is there a loop without end?"
 MEMORY = "the values of a specification may hold 16 MiB together"
@@ -50,9 +50,9 @@ BOMBS = [
 def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
     """Loops, recursion and growth without end stop at the budget or the limit of memory, and drop the message."""
     tracemalloc.start()
-    began = time.monotonic()
+    began = time.process_time()
     outcome = act(body, before=before, data=3)
-    took = time.monotonic() - began
+    took = time.process_time() - began
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert [text in fault.text for fault in outcome.faults] == [True]
@@ -101,10 +101,10 @@ REFUSED = [
 @pytest.mark.parametrize(("body", "text"), REFUSED)
 def test_what_cannot_be_good_is_refused(body: str, text: str) -> None:
     """Nesting, sizes and names that ask for more than the language has are errors at load, in bounded time."""
-    began = time.monotonic()
+    began = time.process_time()
     findings = refused_action(body)
     assert any(text in finding.text for finding in findings)
-    assert time.monotonic() - began < PATIENCE
+    assert time.process_time() - began < PATIENCE
 
 
 DEEP_BUT_RIGHT = [
@@ -216,3 +216,28 @@ def test_shared_arrays_beyond_the_limit_are_refused() -> None:
     """What does not fit is refused before anything is made."""
     text = "a() { double v[16000000]; event e() /t std_msgs/Empty '{}' { } }"
     assert "a specification may hold 16 MiB" in refused(text)[0].text
+
+
+HEAD = "a() { event e(int x) /t std_msgs/Int32 '{data:x}' { "
+LONG = [
+    HEAD + "x = " + "(" * 60000,
+    HEAD + "x = " + "(" * 30000 + "1" + ")" * 30000 + "; } }",
+    HEAD + "{" * 60000 + "}" * 60000 + "} }",
+    HEAD + "x = " + "x+" * 50000 + "1; } }",
+    "a() { " + "event " * 20000,
+    "/*" * 60000,
+    "a() { event e() /t std_msgs/Empty '{}' {} ere: " + "/ " * 40000 + "@match {} }",
+    "a() { event e(int x) /t std_msgs/Int32 '{" + "a." * 50000 + "b:x}' {} }",
+    "a() { event e(int x) /t std_msgs/Int32 '{" + "a:{" * 30000 + "b:x" + "}" * 30000 + "}' {} }",
+    "a() { " + "int a; " * 15000 + "}",
+    "a() { " + "void f() { } " * 9000 + "}",
+    "a() { event e() /t std_msgs/Empty '{}' {} " + "ere: e @match { } " * 5000 + "x }",
+]
+
+
+@pytest.mark.parametrize("text", LONG, ids=range(len(LONG)))
+def test_a_long_text_is_answered_in_time(text: str) -> None:
+    """Whatever fills a file, its errors are told within seconds."""
+    began = time.process_time()
+    assert refused(text)
+    assert time.process_time() - began < PATIENCE

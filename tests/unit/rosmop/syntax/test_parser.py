@@ -208,6 +208,7 @@ REFUSALS = [
         "found `}` after the formula; a property needs a handler",
     ),
     ("a() {\n@fail { } }", 2, 1, "a handler belongs to a property"),
+    ("a() { /* what", 1, 7, "this comment does not end; write `*/` behind it"),
     ("class A { };", 1, 1, "`class` is not part of the language; types cannot be declared"),
     ("a() { struct b { int c; }; }", 1, 7, "`struct` is not part of the language"),
     ("a() { event x() /t p/T '{data:}' { } }", 1, 31, "found `}`, expected"),
