@@ -16,7 +16,6 @@ from appliance.master.registry import Incarnation, Life, Registry, new_key
 from appliance.master.turns import Turns
 from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
-from appliance.store.state import StateStore
 
 
 class Faces:
@@ -30,7 +29,6 @@ class Faces:
         self,
         registry: Registry,
         places: Places,
-        store: StateStore,
         *,
         inner_port: int,
         serve: Callable[[Incarnation], Handler],
@@ -45,7 +43,6 @@ class Faces:
     ) -> None:
         self._registry = registry
         self._places = places
-        self._store = store
         self._inner_port = inner_port
         self._serve = serve
         self._address_for = address_for
@@ -99,10 +96,6 @@ class Faces:
             coming.add_done_callback(lambda _done: self._coming.pop(identity, None))
         return await asyncio.shield(coming)
 
-    async def settled(self) -> None:
-        """Wait until all that was registered so far would survive a crash."""
-        await self._store.settled()
-
     async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         outer_port, relay_port = self._places.open()
         incarnation = Incarnation(
@@ -120,7 +113,6 @@ class Faces:
         )
         self._registry.add(incarnation)
         await self.open(incarnation)
-        await self.settled()  # a node never registers twice: it must be known after a crash, too
         return incarnation
 
     async def open(self, incarnation: Incarnation) -> None:

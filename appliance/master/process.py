@@ -238,7 +238,6 @@ class _Control:
         self._faces = Faces(
             registry,
             self._places,
-            self._store,
             inner_port=inner_port,
             serve=lambda one: self._pipeline.handler(NODE_CALLS, target=one),
             address_for=addresses.told_to,

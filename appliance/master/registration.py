@@ -1,7 +1,7 @@
 """The calls that make a node part of the graph, or take it out: topics and services.
 
-A registration is on disk before its node is told of it: a ROS 1 node never registers twice, and ROSMaster, which knows
-the rest, can die in the same moment as control.
+A registration outlasts control before its node is told of it (the store writes ahead): a ROS 1 node never registers
+twice, and ROSMaster, which knows the rest, can die in the same moment as control.
 """
 
 from typing import TYPE_CHECKING, cast
@@ -23,7 +23,6 @@ async def register_publisher(master: "Master", caller: Caller, arguments: tuple[
     answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
-        await master.faces.settled()
         hidden = master.mediation.hides_publishers(topic)
         answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
     return answer
@@ -37,7 +36,6 @@ async def register_subscriber(master: "Master", caller: Caller, arguments: tuple
     answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
-        await master.faces.settled()
         answer[2] = list(master.graph.list_for(incarnation, topic))
     return answer
 
@@ -52,7 +50,6 @@ async def register_service(master: "Master", caller: Caller, arguments: tuple[ob
     )
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
-        await master.faces.settled()
     return answer
 
 

@@ -1,7 +1,7 @@
 """One SQLite file with one writer thread: statements are queued, written in groups, and can be awaited.
 
-What was queued together is committed together with whatever else is waiting (group commit). A process that is
-killed loses at most what was not yet taken from the queue; whoever must not lose a row awaits `settled`.
+What was queued together is committed together with whatever else is waiting (group commit). A process that is killed
+loses nothing: what is queued stands in a file of its own until the database has it (`ahead`).
 """
 
 import asyncio
@@ -9,13 +9,22 @@ import contextlib
 import queue
 import sqlite3
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-Parameters = Sequence[str | int | float | bytes | None]
+import msgspec
+
+from appliance.store.ahead import Parameters, WriteAhead
+
 _GROUP = 2_000
 _GATHER_SECONDS = 0.002  # a statement that nobody awaits waits this long for company
+
+
+class _Queued(NamedTuple):
+    sql: str
+    parameters: Parameters
+    ahead: bool
 
 
 class StoreError(Exception):
@@ -37,11 +46,13 @@ class Database:
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=NORMAL")
             self._connection.executescript(schema)
+            self._ahead = WriteAhead(path.with_suffix(".ahead"))
+            self._catch_up()
         except sqlite3.Error as error:
             raise StoreError(f"{path}: {error}; {_advice(error)}") from error
-        self._queue: queue.SimpleQueue[tuple[str, Parameters] | Callable[[], None] | None] = (
-            queue.SimpleQueue()
-        )
+        except (OSError, msgspec.MsgspecError) as error:
+            raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
+        self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._hurry = threading.Event()
         self._thread = threading.Thread(target=self._write, name="store", daemon=True)
@@ -55,9 +66,14 @@ class Database:
         except sqlite3.Error as error:
             raise StoreError(f"{self._path}: {error}") from error
 
-    def submit(self, sql: str, parameters: Parameters = ()) -> None:
-        """Queue one statement."""
-        self._queue.put((sql, parameters))
+    def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
+        """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values)."""
+        if ahead:
+            try:
+                self._ahead.append((sql, parameters))
+            except OSError as error:
+                self._failed(f"{self._path.with_suffix('.ahead')}: {error}")
+        self._queue.put(_Queued(sql, parameters, ahead))
 
     async def settled(self) -> None:
         """Wait until everything queued so far is in the file."""
@@ -79,28 +95,29 @@ class Database:
         self._queue.put(None)
         self._thread.join()
         self._connection.close()
+        self._ahead.close()
 
     def _write(self) -> None:
         while True:
             group = [self._queue.get()]
-            if isinstance(group[0], tuple) and self._queue.empty():
+            if isinstance(group[0], _Queued) and self._queue.empty():
                 self._hurry.wait(_GATHER_SECONDS)
             self._hurry.clear()
             while len(group) < _GROUP and not self._queue.empty():
                 group.append(self._queue.get())
-            self._commit([one for one in group if isinstance(one, tuple)])
+            self._commit([one for one in group if isinstance(one, _Queued)])
             for one in group:
                 if callable(one):
                     one()
             if None in group:
                 return
 
-    def _commit(self, statements: list[tuple[str, Parameters]]) -> None:
+    def _commit(self, statements: list[_Queued]) -> None:
         while statements:
             try:
                 self._connection.execute("BEGIN")
-                for sql, parameters in statements:
-                    self._connection.execute(sql, parameters)
+                for one in statements:
+                    self._connection.execute(one.sql, one.parameters)
                 self._connection.execute("COMMIT")
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
@@ -109,7 +126,18 @@ class Database:
                 if self._closing.wait(0.5):
                     return
             else:
+                self._ahead.taken(sum(one.ahead for one in statements))
                 return
+
+    def _catch_up(self) -> None:
+        """Carry out what a killed process left, before anything is read."""
+        left = self._ahead.left()
+        if left:
+            self._connection.execute("BEGIN")
+            for sql, parameters in left:
+                self._connection.execute(sql, parameters)
+            self._connection.execute("COMMIT")
+        self._ahead.clear()
 
 
 def _advice(error: sqlite3.Error) -> str:

@@ -185,7 +185,7 @@ class StateStore:
     def save_parameters(self, tree: dict[str, Any]) -> None:
         """Keep the whole parameter tree."""
         self._database.submit(
-            "INSERT OR REPLACE INTO parameters VALUES (1, ?)", (msgspec.msgpack.encode(tree),)
+            "INSERT OR REPLACE INTO parameters VALUES (1, ?)", (msgspec.msgpack.encode(tree),), ahead=False
         )
 
     def load_parameters(self) -> dict[str, Any]:

@@ -1,14 +1,28 @@
 """One SQLite file with one writer thread."""
 
 import asyncio
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from appliance.store.ahead import WriteAhead
 from appliance.store.database import Database, StoreError
 
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from appliance.store.database import Database
+database = Database(Path(sys.argv[1]) / "state.db", sys.argv[2], failed=print)
+for number in range(5000):
+    database.submit("INSERT OR REPLACE INTO thing VALUES ('last', ?)", (number,))
+    database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", ("row " + str(number),))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
 SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER)"
 
 
@@ -86,3 +100,40 @@ def test_a_place_that_cannot_be_written_is_not_taken_for_a_bad_file(tmp_path: Pa
     with pytest.raises(StoreError, match=r"state\.db.*make room") as caught:
         Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail)
     assert "move" not in str(caught.value)
+
+
+def test_what_a_killed_process_had_queued_is_there_after_the_next_start(tmp_path: Path) -> None:
+    """Nothing that `submit` took is lost to SIGKILL, whatever the writer thread had done by then; in order."""
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    assert again.query("SELECT count(*) FROM thing") == [(5001,)]
+    assert again.query("SELECT size FROM thing WHERE name = ?", ("last",)) == [(4999,)]
+    again.close()
+
+
+def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
+    database: Database, tmp_path: Path
+) -> None:
+    """It does not grow with the number of statements that were ever made."""
+
+    async def scene() -> None:
+        for number in range(100):
+            database.submit("INSERT INTO thing VALUES (?, 1)", (str(number),))
+        await database.settled()
+
+    asyncio.run(scene())
+    assert (tmp_path / "state.ahead").stat().st_size == 0
+
+
+def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
+    """Half a statement at the end was never answered for: the whole ones before it are carried out."""
+    ahead = WriteAhead(tmp_path / "state.ahead")
+    ahead.append(("INSERT OR REPLACE INTO thing VALUES ('whole', 1)", ()))
+    ahead.close()
+    with (tmp_path / "state.ahead").open("ab") as file:
+        file.write(b"\x00\x00\x01\x00 torn")
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    assert database.query("SELECT name FROM thing") == [("whole",)]
+    database.close()
+    assert (tmp_path / "state.ahead").stat().st_size == 0
