@@ -1,7 +1,8 @@
 """One command of an operator: `command.py drive FORWARD TURN SECONDS`, `command.py aim PAN TILT`, `command.py fire`.
 
 Speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON object, `drove` (with
-the position at the end), `aimed` (with the angle reached) or `fired` (with the number of shots so far).
+the position at the end), `aimed` (with the angle reached) or `fired` (with the number of shots so far). What is said
+once is latched, as `rostopic pub -1` does: a driver that connects a moment later hears it, too.
 """
 
 import sys
@@ -70,7 +71,7 @@ def drive(forward, turn, seconds):
 def aim(pan, tilt):
     """Turn the gun, and wait until it points there."""
     display = Display("/landshark/joint_states", JointState)
-    publisher = connected(rospy.Publisher("/landshark_control/turret", JointState, queue_size=10))
+    publisher = connected(rospy.Publisher("/landshark_control/turret", JointState, queue_size=10, latch=True))
     message = JointState(name=["turret_pan", "turret_tilt"], position=[pan, tilt])
     message.header.stamp = rospy.Time.now()
     publisher.publish(message)
@@ -82,7 +83,7 @@ def fire():
     """One shot, if it comes through: the count that the driver tells within a second."""
     kind = paintball_trigger()
     display = Display("/landshark/shots", UInt32)
-    publisher = connected(rospy.Publisher("/landshark_control/trigger", kind, queue_size=10))
+    publisher = connected(rospy.Publisher("/landshark_control/trigger", kind, queue_size=10, latch=True))
     display.wait(lambda _shots: True)
     before = display.message.data
     message = kind(trigger=kind.SINGLE_SHOT)
