@@ -7,6 +7,7 @@ here because something reads it.
 
 import ipaddress
 import re
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -160,6 +161,22 @@ class Firewall(_Section):
     )
 
 
+class Ipsec(_Section):
+    """The tunnels of trusted hosts; they are opened when the first host is enrolled."""
+
+    pool: IPv4Network = Field(
+        default=IPv4Network("10.113.11.0/24"),
+        description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
+    )
+
+    @field_validator("pool")
+    @classmethod
+    def _room_for_hosts(cls, pool: IPv4Network) -> IPv4Network:
+        if not 16 <= pool.prefixlen <= 29:
+            raise ValueError(f"{pool} must have a prefix length from 16 to 29")
+        return pool
+
+
 class ApiLimits(_Section):
     """What the REST interface accepts; beyond it a client is told to come back later."""
 
@@ -227,6 +244,10 @@ class Settings(_Section):
     api_names: list[str] = Field(
         default=[], description="names REST is called by; addresses and localhost always are"
     )
+    hosts: Path = Field(
+        default=Path("ipsec/hosts.yaml"),
+        description="the hosts that are meant to be enrolled; may be missing",
+    )
     relays: Count = Field(default=1, le=1, description="relay processes")
     advertise: list[Advertisement] = []
     limits: Limits = Limits()
@@ -234,6 +255,7 @@ class Settings(_Section):
     liveness: Liveness = Liveness()
     relay: Relay = Relay()
     firewall: Firewall = Firewall()
+    ipsec: Ipsec = Ipsec()
     api_limits: ApiLimits = ApiLimits()
 
     @field_validator("api_tls")

@@ -30,7 +30,7 @@ _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN"}
 # What Kubernetes and container links put there for a service that happens to be named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
-_PATH_KEYS = ("policy", "monitors", "state")
+_PATH_KEYS = ("policy", "monitors", "state", "hosts")
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 
 KeyPath = tuple[str | int, ...]

@@ -136,11 +136,42 @@ class TokenRevoke(AdminRequest, frozen=True, tag="token revoke"):
     name: str
 
 
+class HostAdd(AdminRequest, frozen=True, tag="host add"):
+    """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
+
+    `address`: the virtual address it shall have; None: the next free one.
+    """
+
+    name: str
+    request: str
+    days: float = 90
+    address: str | None = None
+
+
+class HostRenew(AdminRequest, frozen=True, tag="host renew"):
+    """A new certificate for an enrolled host; the one before is revoked."""
+
+    name: str
+    request: str
+    days: float = 90
+
+
+class HostList(AdminRequest, frozen=True, tag="host list"):
+    """All hosts that were enrolled or declared, with their tunnels."""
+
+
+class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
+    """Let a host in no more, and cut what it has, now."""
+
+    name: str
+
+
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
     | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange
 )  # fmt: skip
-AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke
+HostRequest = HostAdd | HostRenew | HostList | HostRevoke
+AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke | HostRequest
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "busy", "failed"]

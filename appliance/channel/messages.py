@@ -561,6 +561,7 @@ class RestCalled(Message):
 # --- tunnels: control -> supervisor over the lifeline, control <-> the process that runs charon ------------
 
 Esp = Literal["kernel", "user space"]
+APPLIANCE_NAME = "rosrv-appliance"  # in the appliance's own certificate; no host may have it
 
 
 class TunnelsWanted(Message):
@@ -596,6 +597,7 @@ class TunnelHost(msgspec.Struct, frozen=True):
 class TunnelsStated(Message):
     """All that charon is to have: certificates and the list of revoked ones in PEM, the hosts that may come."""
 
+    number: int
     esp: Esp
     address: str
     authority: bytes
@@ -630,8 +632,9 @@ class TunnelSeen(msgspec.Struct, frozen=True):
 
 
 class TunnelsReported(Message):
-    """All tunnels that stand now; charon has taken what was stated last."""
+    """All tunnels that stand now; charon has taken the statement with the number `taken`."""
 
+    taken: int
     rows: list[TunnelSeen]
 
 

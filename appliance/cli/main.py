@@ -9,6 +9,7 @@ from appliance.cli import (
     audit,
     config,
     demo,
+    host,
     monitor,
     monitor_running,
     policy,
@@ -54,6 +55,7 @@ for order in (
 monitor.app.command(name="rvstate", hidden=True)(monitor_running.rv_state)
 app.add_typer(monitor.app, name="monitor")
 app.add_typer(config.app, name="config")
+app.add_typer(host.app, name="host")
 app.add_typer(token.app, name="token")
 
 

@@ -14,6 +14,7 @@ import msgspec
 import appliance
 from appliance.channel import admin
 from appliance.master.core import Master
+from appliance.master.hosts import HostRefusedError, Hosts
 from appliance.master.measures import measures_of
 from appliance.master.monitor_orders import change_monitors, monitors_body, monitors_status
 from appliance.master.monitors import MonitorsChangedError, UnknownMonitorError
@@ -54,6 +55,7 @@ class Administration:
         store: StateStore,
         surroundings: Surroundings,
         *,
+        hosts: Hosts,
         lag: Callable[[], tuple[int, float]],
         audit_failed: Callable[[], str | None],
         audit_degraded: Callable[[], str | None],
@@ -64,6 +66,7 @@ class Administration:
         self._tokens = tokens
         self._store = store
         self._surroundings = surroundings
+        self._hosts = hosts
         self._lag = lag
         self._audit_failed = audit_failed
         self._audit_degraded = audit_degraded
@@ -83,8 +86,9 @@ class Administration:
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
         except (RevisionChangedError, MonitorsChangedError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="conflict")
-        except TokenRefusedError as error:
-            return admin.AdminAnswer(False, error=str(error), trouble="refused")
+        except (TokenRefusedError, HostRefusedError) as error:
+            ours = isinstance(error, HostRefusedError) and error.ours
+            return admin.AdminAnswer(False, error=str(error), trouble="failed" if ours else "refused")
         except (UnknownThingError, UnknownMonitorError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="unknown")
 
@@ -97,6 +101,8 @@ class Administration:
                     return body
             case admin.TokenAdd() | admin.TokenList() | admin.TokenRevoke():
                 return await self._manage_tokens(request)
+            case admin.HostAdd() | admin.HostRenew() | admin.HostList() | admin.HostRevoke():
+                return await self._manage_hosts(request, who)
             case (
                 admin.MonitorLoad()
                 | admin.MonitorReload()
@@ -138,6 +144,17 @@ class Administration:
                 return {"tokens": [_token(row) for row in self._tokens.rows()]}
             case admin.TokenRevoke(name):
                 return _token(await self._tokens.revoke(name))
+
+    async def _manage_hosts(self, request: admin.HostRequest, who: str) -> dict[str, Any]:
+        match request:
+            case admin.HostAdd(name, text, days, address):
+                return await self._hosts.add(name, text, days, address, who)
+            case admin.HostRenew(name, text, days):
+                return await self._hosts.renew(name, text, days, who)
+            case admin.HostList():
+                return {"hosts": self._hosts.rows()}
+            case admin.HostRevoke(name):
+                return await self._hosts.revoke(name, who)
 
     # --- the policy ---
 
@@ -217,6 +234,7 @@ class Administration:
                 "warnings": len(self._policies.current.warnings),
                 "confirm_by": self._policies.confirm_by,
             },
+            "ipsec": self._hosts.status(),
             "monitors": monitors_status(self._master.monitors),
             "rosmaster": "reachable" if self._master.rosmaster.reachable else "being rebuilt",
             "relay": "connected" if relay.connected else "away",

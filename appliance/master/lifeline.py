@@ -27,6 +27,7 @@ class ControlLifeline:
         self.processes_changed: Callable[[], None] = lambda: None
         self.reload_requested: Callable[[], None] = lambda: None
         self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
+        self.tunnels_enclosed: Callable[[messages.TunnelsEnclosed], None] = lambda answer: None  # noqa: ARG005 - as above
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
         self._early_links: list[tuple[str, int]] = []
 
@@ -102,6 +103,8 @@ class ControlLifeline:
             case messages.ProbePassed():
                 self.surroundings.probe = "passed"
                 self.probed("")
+            case messages.TunnelsEnclosed():
+                self.tunnels_enclosed(message)
             case messages.RouteFound(host, address):
                 for future in self._routes.pop(host, ()):
                     if not future.done():

@@ -6,7 +6,7 @@ and says everything that is wrong with it. Every policy that came into force is 
 
 import asyncio
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,12 +65,20 @@ class Policies:
     """
 
     def __init__(
-        self, file: Path, store: StateStore, recorder: Recorder, *, robot: Collection[Address | Network]
+        self,
+        file: Path,
+        store: StateStore,
+        recorder: Recorder,
+        *,
+        robot: Collection[Address | Network],
+        hosts: Callable[[], Mapping[str, Address]] = dict,
     ) -> None:
+        """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing."""
         self.file = file
         self._store = store
         self._recorder = recorder
         self._robot = robot
+        self._hosts = hosts
         self._current: Policy | None = None
         self._revert: asyncio.Task[None] | None = None
         self.confirm_by: float | None = None
@@ -146,6 +154,17 @@ class Policies:
         revoked = self._keep(policy, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
+    def hosts_changed(self) -> int:
+        """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
+        if self._current is None:
+            return 0
+        try:
+            self._current = self._compile(self._current.text, self._current.file)
+        except PolicyRefusedError as error:  # the same text: only a defect could make it wrong
+            _log.error("the policy does not know the new hosts", findings=error.findings)
+            return 0
+        return self.changed(self._current)
+
     def rollback(self, revision: int | None, *, who: str) -> Loaded:
         """Bring a kept revision into force (None: the one before this). Raises `PolicyRefusedError`."""
         before = self.revision
@@ -215,7 +234,7 @@ class Policies:
 
     def _compile(self, text: str, file: str) -> Policy:
         try:
-            return compile_policy(text, file=file, hosts={}, robot=self._robot)
+            return compile_policy(text, file=file, hosts=self._hosts(), robot=self._robot)
         except PolicyError as error:
             raise PolicyRefusedError([str(one) for one in error.findings]) from error
 

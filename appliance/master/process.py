@@ -23,12 +23,14 @@ from appliance.config import Settings, load_resolved
 from appliance.master.addresses import Addresses
 from appliance.master.admin import AdminServer
 from appliance.master.administration import Administration
+from appliance.master.authority import Authority
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.core import Master
 from appliance.master.delivery import Delivery
 from appliance.master.faces import Faces
 from appliance.master.gate import Gate, HostLimits
 from appliance.master.graph import Graph
+from appliance.master.hosts import Hosts
 from appliance.master.http import Handler, HttpLimits, HttpServer, Peer, Visitors, listen
 from appliance.master.inner import InnerFace
 from appliance.master.journal import StoreJournal, restore
@@ -123,8 +125,13 @@ class _Control:
         kept = self._lifeline.sockets
         restarted = _RVMASTER in kept
         self._make_records()
+        await self._make_hosts()
         self._policies = Policies(
-            self._settings.policy, self._store, self._recorder, robot=robot_addresses(self._settings)
+            self._settings.policy,
+            self._store,
+            self._recorder,
+            robot=robot_addresses(self._settings),
+            hosts=lambda: self._hosts.addresses,
         )
         self._policies.start(restarted=restarted)
         self._monitors = Monitors(
@@ -142,12 +149,16 @@ class _Control:
         self._lifeline.links["api"] = lambda descriptor: self._rest.attach(
             Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
         )
+        self._lifeline.links["charon"] = lambda descriptor: self._hosts.attach(
+            Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
+        )
         self._lifeline.probed = self._probed
         self._lifeline.processes_changed = self._reconciler.wake
         self._lifeline.reload_requested = self._reload_on_signal
         self._lifeline.open_links()
         for work in (
             self._reconciler.run(), self._liveness.run(), self._visitors.sweep(), self._save_parameters(),
+            self._hosts.run(),
             self._publisher.run(self._reconciler.ready),
         ):  # fmt: skip
             self._tasks.append(self._loop.create_task(work))
@@ -176,6 +187,21 @@ class _Control:
         self._store = StateStore(
             self._home, failed=lambda reason: _log.error("state is not written", reason=reason)
         )
+
+    async def _make_hosts(self) -> None:
+        """Before the policy, which names them: their addresses count once clear text is kept out."""
+        self._authority = Authority()
+        self._hosts = Hosts(
+            self._store,
+            self._recorder,
+            self._authority,
+            pool=self._settings.ipsec.pool,
+            declared=self._settings.hosts,
+            listen=self._settings.listen_address,
+            say=self._lifeline.say,
+        )
+        self._lifeline.tunnels_enclosed = self._hosts.enclosed
+        await self._hosts.start()
 
     def _take_sockets(self) -> dict[str, socket.socket]:
         host, port = self._settings.listen_address
@@ -312,6 +338,8 @@ class _Control:
             self._master, limits=self._limits, offload=int(settings.limits.offload_bytes)
         )
         self._revocation = Revocation(self._master)
+        self._hosts.changed = self._policies.hosts_changed
+        self._hosts.expel = self._revocation.expel
         self._policies.changed = lambda policy: self._policy_changed(policy.ports)
         self._inner = InnerFace(registry, self._delivery, self._limits)
 
@@ -346,6 +374,7 @@ class _Control:
             self._tokens,
             self._store,
             self._lifeline.surroundings,
+            hosts=self._hosts,
             lag=lambda: self._audit.lag,
             audit_failed=lambda: self._audit.failed,
             audit_degraded=lambda: self._audit.degraded,
@@ -478,8 +507,11 @@ class _Control:
     def _signer_link(self, descriptor: int) -> None:
         channel = Channel(socket.socket(fileno=descriptor), messages.SignerLink)
         self._signer = channel
+        self._authority.attach(channel)
 
         def received(message: object, _descriptors: tuple[int, ...]) -> None:
+            if self._authority.received(message):
+                return
             if isinstance(message, messages.SignatureMade):
                 self._audit.signed(message.number, message.signature, message.public_key)
             elif isinstance(message, messages.SignatureRefused):
@@ -488,6 +520,7 @@ class _Control:
         def closed() -> None:
             if self._signer is channel:
                 self._signer = None
+                self._authority.attach(None)
 
         channel.attach(self._loop, received, closed)
         self._audit.request_signatures()

@@ -11,7 +11,7 @@ from appliance.master.core import Master
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Kind, Registration
 from appliance.master.relays import TOPIC
-from appliance.policy.model import Category, Decision, Request
+from appliance.policy.model import Address, Category, Decision, Request
 from appliance.store.state import PermissionRow
 
 _log = structlog.get_logger()
@@ -41,6 +41,21 @@ class Revocation:
         for row in self._master.relay.permissions():
             decision = self._decide_permission(row)
             if not decision.allowed:
+                self._master.relay.revoke(row)
+                self._record(row, decision)
+                count += 1
+        return count
+
+    def expel(self, host: Address, reason: str) -> int:
+        """Take back all that a host has, whatever the policy says; how much that was."""
+        decision, count = Decision(False, None, reason), 0
+        for incarnation, registration in list(self._master.registry.in_order()):
+            if incarnation.host == host and not incarnation.own:
+                self._master.graph.revoked(incarnation, registration, decision)
+                self._tell(incarnation, registration)
+                count += 1
+        for row in self._master.relay.permissions():
+            if row.host == str(host):
                 self._master.relay.revoke(row)
                 self._record(row, decision)
                 count += 1

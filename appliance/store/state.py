@@ -1,4 +1,4 @@
-"""The tables of control's state file: incarnations, registrations, parameters, policy revisions, tokens, settings."""
+"""The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,6 +36,11 @@ CREATE TABLE IF NOT EXISTS token (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
     created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS host (
+    name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE, serial TEXT NOT NULL, expires REAL NOT NULL,
+    enrolled REAL NOT NULL, revoked REAL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS revoked_certificate (serial TEXT PRIMARY KEY, moment REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
 
@@ -88,6 +93,21 @@ class RevisionRow:
     loaded: float
     who: str
     note: str
+
+
+@dataclass(frozen=True, slots=True)
+class HostRow:
+    """An enrolled host: its virtual address, its certificate's serial number (hexadecimal) and end.
+
+    Times are seconds since the epoch; `revoked` is None while it may come. The address stays its name's.
+    """
+
+    name: str
+    address: str
+    serial: str
+    expires: float
+    enrolled: float
+    revoked: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +255,27 @@ class StateStore:
     def tokens(self) -> list[TokenRow]:
         """All tokens that were ever made, the oldest first."""
         return [TokenRow(*row) for row in self._database.query("SELECT * FROM token ORDER BY created")]
+
+    # --- hosts that come through tunnels ---
+
+    def save_host(self, row: HostRow) -> None:
+        """Keep a host, its new certificate, or that it is revoked."""
+        self._database.submit(
+            "INSERT OR REPLACE INTO host VALUES (?, ?, ?, ?, ?, ?)",
+            (row.name, row.address, row.serial, row.expires, row.enrolled, row.revoked),
+        )
+
+    def hosts(self) -> list[HostRow]:
+        """All hosts that were ever enrolled, by name."""
+        return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
+
+    def save_revoked_certificate(self, serial: str, moment: float) -> None:
+        """Keep for good that a certificate is revoked."""
+        self._database.submit("INSERT OR IGNORE INTO revoked_certificate VALUES (?, ?)", (serial, moment))
+
+    def revoked_certificates(self) -> list[tuple[str, float]]:
+        """Serial numbers of all revoked certificates, and since when."""
+        return list(self._database.query("SELECT serial, moment FROM revoked_certificate ORDER BY moment"))
 
     # --- settings ---
 

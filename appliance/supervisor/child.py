@@ -36,6 +36,7 @@ class Plan(msgspec.Struct, frozen=True):
     entry: str | None = None
     index: int | None = None
     path: str | None = None
+    capabilities: tuple[str, ...] = ()
     argv: tuple[str, ...] = ()
     environment: dict[str, str] = {}
 
@@ -67,7 +68,7 @@ def _prepare(plan: Plan) -> None:
     privileges.raise_file_limit(plan.files)
     if not plan.network:
         offline.leave_network_if_allowed()
-    privileges.drop(plan.account, parent=plan.parent)
+    privileges.drop(plan.account, parent=plan.parent, capabilities=plan.capabilities)
     if not plan.network:
         offline.forbid_sockets()
     _require(plan.account, plan.home, os.R_OK | os.W_OK | os.X_OK)

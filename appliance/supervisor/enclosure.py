@@ -20,6 +20,8 @@ from typing import Any, Literal
 
 import structlog
 
+from appliance.network import links
+from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.rules import FirewallSettings, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
@@ -27,6 +29,8 @@ from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
+
+TUNNEL_INTERFACE = "ipsec0"  # charon's, when ESP runs in user space
 
 log = structlog.get_logger()
 
@@ -67,6 +71,16 @@ class Enclosure:
         Raises `NetworkError` when others cannot be kept out.
         """
 
+    def open_tunnels(self, pool: str, address: str) -> Esp:  # noqa: ARG002  the same everywhere
+        """Take addresses of `pool` through IPsec only from now on, and have `address`; where ESP runs.
+
+        Raises `NetworkError` when clear text cannot be kept out, or ESP can run nowhere.
+        """
+        raise NetworkError(
+            f"isolation {self.kind} has no firewall that would keep tunnelled addresses from being forged:"
+            " use isolation container"
+        )
+
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
         """The machine's address by which `host` reaches the appliance; None: the one it used."""
         return None
@@ -93,6 +107,7 @@ class Contained(Enclosure):
         self._namespace = namespace or Namespace.own()
         self._backend = backend
         self._firewall: Firewall | None = None
+        self._tunnels: tuple[str, Esp] | None = None  # the pool of their addresses
 
     def build(self) -> None:
         """Install the firewall. Raises `StartError`."""
@@ -118,6 +133,23 @@ class Contained(Enclosure):
         if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
             self._ports = replace(self._ports, inner=inner_port, own=own_port)
             self._firewall.update(self._settings())
+
+    def open_tunnels(self, pool: str, address: str) -> Esp:
+        """Close the pool to clear text first; only then it has a way in."""
+        if self._firewall is None:
+            raise NetworkError("the firewall is not in force")
+        esp = choose_esp(self._namespace)
+        before, self._tunnels = self._tunnels, (str(ipaddress.ip_network(pool)), esp)
+        if self._tunnels != before:
+            try:
+                self._firewall.update(self._settings())
+            except NetworkError:
+                self._tunnels = before
+                raise
+        own = f"{ipaddress.IPv4Address(address)}/32"
+        if own not in links.addresses(self._namespace):
+            links.add_address(self._namespace, "lo", own)
+        return esp
 
     def report(self) -> dict[str, Any]:
         """Back end, rules with counters; rules that are gone are put back first."""
@@ -167,6 +199,8 @@ class Contained(Enclosure):
             client_ports=self._namespace.run(_client_ports),
             api_port=self._ports.api,
             api_networks=self._api_networks(),
+            tunnel_only=(self._tunnels[0],) if self._tunnels else (),
+            tunnel_interface=TUNNEL_INTERFACE if self._tunnels and self._tunnels[1] == "user space" else None,
         )
 
     def _api_networks(self) -> tuple[str, ...]:
@@ -192,6 +226,10 @@ class InNamespace(Contained):
         """Be in the namespace, with the calling thread."""
         with self._namespace.entered():
             yield
+
+    def open_tunnels(self, pool: str, address: str) -> Esp:
+        """Not here: IKE and ESP (UDP) are not forwarded to the namespace."""
+        return Enclosure.open_tunnels(self, pool, address)
 
     def build(self) -> None:
         """Make the namespace, its way to the host's networks, and the firewall. Raises `StartError`."""

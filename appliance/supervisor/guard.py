@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import structlog
 
-from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed, TunnelsEnclosed
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Enclosure
 
@@ -61,6 +61,19 @@ class Guard:
         except NetworkError as error:
             return f"control's inner ports cannot be closed to others: {error}"
         return await self.look()
+
+    async def open_tunnels(self, pool: str, address: str) -> TunnelsEnclosed:
+        """Close a pool of addresses to clear text; where ESP runs, or why there can be no tunnels."""
+        try:
+            async with self._one_at_a_time:
+                esp = await in_thread(lambda: self.enclosure.open_tunnels(pool, address))
+                report = await in_thread(self.enclosure.report)
+        except (NetworkError, ValueError) as error:
+            return TunnelsEnclosed(None, str(error))
+        self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
+        self._tell(self._report)
+        log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
+        return TunnelsEnclosed(esp)
 
     async def route_to(self, host: str) -> str | None:
         """The machine's address by which `host` reaches the appliance; None when its own route is right."""

@@ -4,7 +4,8 @@ Invariants, in the order in which they are made true by `drop`:
 
 1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), also when that was killed before the request
    was made.
-2. No supplementary groups, no capability in any of the five sets, no way to gain one (`no_new_privs`).
+2. No supplementary groups, no capability in any of the five sets but those that the role is given (ambient, so
+   that its own children have them too), no way to gain another (`no_new_privs`).
 3. Files it makes are its own (`umask 077`).
 
 As a caller who is not root only 1 and 3 and `no_new_privs` apply; there is nothing else to give up.
@@ -14,6 +15,7 @@ import ctypes
 import os
 import resource
 import signal
+from collections.abc import Sequence
 
 from appliance.supervisor.users import Account
 
@@ -21,7 +23,9 @@ _PR_SET_PDEATHSIG = 1
 _PR_CAPBSET_DROP = 24
 _PR_SET_NO_NEW_PRIVS = 38
 _PR_CAP_AMBIENT = 47
+_PR_CAP_AMBIENT_RAISE = 2
 _PR_CAP_AMBIENT_CLEAR_ALL = 4
+_PR_SET_KEEPCAPS = 8
 _CLONE_NEWNET = 0x40000000
 _LAST_CAPABILITY_FILE = "/proc/sys/kernel/cap_last_cap"
 _CAPABILITY_VERSION_3 = 0x20080522
@@ -68,6 +72,7 @@ SUPERVISORS = {
     "SETGID": 6,  # start them as their users
     "SETUID": 7,
     "SETPCAP": 8,  # without any capability
+    "NET_BIND_SERVICE": 10,  # give it to charon: ports 500 and 4500
     "NET_ADMIN": 12,  # firewall
     "NET_RAW": 13,  # its iptables back end
     "SYS_PTRACE": 19,  # say who has a port, find what a crash left in the namespace
@@ -93,15 +98,21 @@ def keep_supervisors() -> None:
         raise _last_error("capset")
 
 
-def drop(account: Account, *, parent: int) -> None:
-    """Become `account` for good; see the invariants above. Raises `OSError` when the kernel refuses."""
+def drop(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
+    """Become `account` for good, with these capabilities of `SUPERVISORS`; see the invariants above.
+
+    Raises `OSError` when the kernel refuses.
+    """
     os.umask(0o077)
     if os.geteuid() == 0:
-        _empty_bounding_set()
+        kept = sum(1 << SUPERVISORS[name] for name in capabilities)
+        _empty_bounding_set(but=kept)
         os.setgroups([])
         os.setresgid(account.gid, account.gid, account.gid)
+        if kept:
+            prctl(_PR_SET_KEEPCAPS, 1)
         os.setresuid(account.uid, account.uid, account.uid)
-        _empty_capabilities()
+        _reduce_capabilities(kept)
     prctl(_PR_SET_NO_NEW_PRIVS, 1)
     die_with_parent(parent)
 
@@ -120,13 +131,17 @@ def _empty_bounding_set(*, but: int = 0) -> None:
             return
 
 
-def _empty_capabilities() -> None:
+def _reduce_capabilities(kept: int) -> None:
+    """Have exactly the capabilities of this bit set, and let them pass to programs that are executed."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     libc = ctypes.CDLL(None, use_errno=True)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
-    nothing = (ctypes.c_uint32 * 6)()
-    if libc.capset(header, nothing) != 0:
+    low, high = kept & 0xFFFFFFFF, kept >> 32
+    if libc.capset(header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high)) != 0:
         raise _last_error("capset")
+    for capability in SUPERVISORS.values():
+        if kept >> capability & 1:
+            prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_RAISE, capability)
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:

@@ -48,7 +48,8 @@ class Role:
     is the role that must be ready first. `outlives_control` roles are stopped last. `files` is the
     limit on open files. `readable_by` is the user whose group may pass through `part` and read what there is
     readable for it. `listens`: each of its lives is given the listening socket that the supervisor holds for it.
-    `dispensable`: when it cannot serve, the others go on without it.
+    `dispensable`: when it cannot serve, the others go on without it. `on_demand`: started when control asks for it.
+    `capabilities` are those of `privileges.SUPERVISORS` that it keeps.
     """
 
     name: str
@@ -67,6 +68,8 @@ class Role:
     readable_by: str | None = None
     listens: bool = False
     dispensable: bool = False
+    on_demand: bool = False
+    capabilities: tuple[str, ...] = ()
 
 
 def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = True) -> tuple[Role, ...]:
@@ -119,7 +122,7 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = 
             part="control",
             entry="appliance.master.process:main",
             path=lambda facts: facts.config,
-            links=("relay", "signer", "api"),
+            links=("relay", "signer", "api", "charon"),
             files=65_536,
             readable_by="rosrv-api",
         ),
@@ -148,6 +151,17 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = 
             listens=True,
             dispensable=True,
             files=4096,
+        ),
+        Role(
+            name="charon",
+            user="rosrv-ipsec",
+            part="ipsec",
+            entry="appliance.ipsec.process:main",
+            path=lambda facts: facts.part("ipsec"),
+            links=("control",),
+            dispensable=True,
+            on_demand=True,
+            capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
         ),
     )
     return tuple(role for role in roles if api or role.name != "api")

@@ -40,7 +40,10 @@ from appliance.channel.messages import (
     SocketRestored,
     SocketsRestored,
     Stop,
+    TunnelsEnclosed,
+    TunnelsWanted,
 )
+from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health
 from appliance.supervisor.child import Plan
 from appliance.supervisor.enclosure import Enclosure
@@ -60,8 +63,14 @@ _STOP_SECONDS = 3.0
 _TERMINATE_SECONDS = 0.3
 _LAST_SECONDS = 1.0
 
-_FROM_ANY = (Pong, Ready, Failed)
-_FROM_CONTROL = (SocketKept, SocketDropped, RouteWanted, ApplianceStopRequested)
+_FROM_ANY: tuple[type[Message], ...] = (Pong, Ready, Failed)
+_FROM_CONTROL: tuple[type[Message], ...] = (
+    SocketKept,
+    SocketDropped,
+    RouteWanted,
+    ApplianceStopRequested,
+    TunnelsWanted,
+)
 
 log = structlog.get_logger()
 
@@ -157,7 +166,7 @@ class Supervisor:
 
     async def _start(self) -> None:
         for post in self._posts:
-            if post.role.after is None and not self._stopping.is_set():
+            if post.role.after is None and not post.role.on_demand and not self._stopping.is_set():
                 self._fill(post)
                 if post.role.asks:
                     await self._until_answering(post)
@@ -220,6 +229,7 @@ class Supervisor:
             entry=role.entry,
             index=post.index if role.indexed else None,
             path=str(role.path(facts)) if role.path else None,
+            capabilities=role.capabilities,
         )
         if role.program is None:
             return plan
@@ -261,6 +271,11 @@ class Supervisor:
                     life.kill()
                 else:
                     self.stop(reason)
+            case _:
+                self._control_said(life, message, descriptors)
+
+    def _control_said(self, life: Life, message: Message, descriptors: tuple[int, ...]) -> None:
+        match message:
             case SocketKept(name):
                 self._keep(life, name, descriptors[0])
             case SocketDropped(name):
@@ -268,6 +283,8 @@ class Supervisor:
                     self._kept.drop(name)
             case RouteWanted(host):
                 self._spawn(self._route(life, host))
+            case TunnelsWanted(pool, address):
+                self._spawn(self._open_tunnels(life, pool, address))
             case ApplianceStopRequested(reason):
                 log.warning("control asks to end the appliance", reason=reason)
                 self.stop()
@@ -310,6 +327,18 @@ class Supervisor:
 
     async def _route(self, life: Life, host: str) -> None:
         life.send(RouteFound(host, await self._guard.route_to(host)))
+
+    async def _open_tunnels(self, life: Life, pool: str, address: str) -> None:
+        if not CHARON.exists():
+            reason = f"{CHARON} is not there: apt install charon-systemd strongswan-swanctl libcharon-extra-plugins"
+            life.send(TunnelsEnclosed(None, reason))
+            return
+        answer = await self._guard.open_tunnels(pool, address)
+        if answer.esp is not None:
+            for post in self._posts:
+                if post.role.on_demand and post.life is None and post.due is None:
+                    self._fill(post)
+        life.send(answer)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)

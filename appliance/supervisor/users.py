@@ -16,6 +16,7 @@ NUMERIC_IDS = {
     "rosrv-relay": 61013,
     "rosrv-api": 61014,
     "rosrv-signer": 61015,
+    "rosrv-ipsec": 61016,
 }
 
 

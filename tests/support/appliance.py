@@ -75,11 +75,12 @@ class Appliance:
             "--state",
             str(self.state),
         ]
-        command += ["--policy", str(self.policy_file), *self.options]
+        command += ["--policy", str(self.policy_file)]
         inside = "0.0.0.0" if self.isolation == "netns" else self.host.address
         command += ["--listen", "127.0.0.1:0" if loopback else f"{inside}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
+        command += self.options  # last, for of a flag given twice the second counts
         self.process = Process(self.host, command, env=_environment(), label="rosrv up")
         if self.json:
             self.ready = self.process.wait_for(event="ready", timeout=60)

@@ -1,0 +1,179 @@
+"""charon as a child: started, provisioned over vici, watched. Blocking calls, for one thread at a time.
+
+Provisioning is a difference: what is wanted and was not loaded is loaded, what is no longer wanted is unloaded and its
+tunnel closed. A host whose certificate was replaced has its tunnel closed too: it comes back with the new one.
+"""
+
+import contextlib
+import socket
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vici import Session
+from vici.exception import CommandException
+
+from appliance.ipsec.strongswan import Tunnel, connection, connection_name, host_of, pool
+
+PROGRAM = Path("/usr/sbin/charon-systemd")
+_SECONDS = 10.0
+
+
+class CharonError(Exception):
+    """charon cannot be used; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """Certificates in PEM, and the list of revoked ones; `address` is the appliance's own in the tunnels."""
+
+    address: str
+    authority: bytes
+    certificate: bytes
+    revocations: bytes
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A tunnel that stands, as charon has it; `seconds` since it was established."""
+
+    name: str
+    remote: str
+    seconds: int
+    bytes_in: int
+    bytes_out: int
+
+
+class Vici:
+    """The conversation with a running charon. Raises `CharonError`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._session = self._connect()
+        self._loaded: dict[str, Tunnel] = {}
+        self._material: Material | None = None
+
+    def load_key(self, key: bytes) -> None:
+        """Give charon the appliance's private key (PEM)."""
+        with self._said("the appliance's key"):
+            self._session.load_key({"type": "any", "data": key})
+
+    def provision(self, tunnels: Sequence[Tunnel], material: Material) -> None:
+        """Make charon's tunnels exactly these. What is revoked is cut before anything new is loaded."""
+        wanted = {tunnel.name: tunnel for tunnel in tunnels}
+        before = self._material
+        if before is None or before.authority != material.authority:
+            with self._said("the authority's certificate"):
+                self._session.load_cert({"type": "x509", "flag": "ca", "data": material.authority})
+        if before is None or before.revocations != material.revocations:
+            with self._said("the list of revoked certificates"):
+                self._session.load_cert({"type": "x509crl", "data": material.revocations})
+                # charon takes the first valid list that it finds, and its cache may hold the one before.
+                self._session.flush_certs()
+        earlier = dict(self._loaded)
+        for name in earlier.keys() - wanted.keys():
+            self._unload(name)
+        fresh = before is None or (before.address, before.certificate) != (
+            material.address,
+            material.certificate,
+        )
+        for tunnel in tunnels:
+            was = earlier.get(tunnel.name)
+            if fresh or was != tunnel:
+                self._load(tunnel, material)
+            if was is not None and was.serial != tunnel.serial:
+                self._close(tunnel.name)
+        self._material = material
+
+    def seen(self) -> list[Seen]:
+        """The tunnels that stand now."""
+        with self._said("the list of tunnels"):
+            found = [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
+        return [one for name, row in found if (one := _seen(name, row)) is not None]
+
+    def version(self) -> str:
+        """charon's version."""
+        with self._said("its version"):
+            return str(self._session.version()["version"].decode())
+
+    def listen(self) -> Iterator[tuple[str, bool, str]]:
+        """Tunnels going up and down, on a connection of its own: host, up, real address. Ends when charon does."""
+        session = self._connect(timeout=None)
+        try:
+            for _kind, event in session.listen(["child-updown"]):
+                if event is None:
+                    continue
+                up = event.get("up") == b"yes"
+                for name, row in event.items():
+                    host = host_of(name) if isinstance(row, dict) else None
+                    if host is not None:
+                        yield host, up, _text(row, "remote-host")
+        except OSError:
+            return
+
+    def _load(self, tunnel: Tunnel, material: Material) -> None:
+        with self._said(f"the tunnel of {tunnel.name}"):
+            self._session.load_pool(pool(tunnel))
+            self._session.load_conn(
+                connection(
+                    tunnel,
+                    address=material.address,
+                    certificate=material.certificate,
+                    authority=material.authority,
+                )
+            )
+        self._loaded[tunnel.name] = tunnel
+
+    def _unload(self, name: str) -> None:
+        with self._said(f"the end of the tunnel of {name}"):
+            self._session.unload_conn({"name": connection_name(name)})
+            self._close(name)
+            with contextlib.suppress(
+                CommandException
+            ):  # its address is still in use until the tunnel is gone
+                self._session.unload_pool({"name": connection_name(name)})
+        del self._loaded[name]
+
+    def _close(self, name: str) -> None:
+        with self._said(f"the end of the tunnel of {name}"), contextlib.suppress(CommandException):
+            # It says so when there is none to close.
+            list(self._session.terminate({"ike": connection_name(name), "timeout": "-1", "force": "yes"}))
+
+    def _connect(self, timeout: float | None = _SECONDS) -> Any:
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        sock.settimeout(timeout)
+        try:
+            sock.connect(str(self._path))
+        except OSError as error:
+            sock.close()
+            raise CharonError(f"charon does not answer on {self._path}: {error}") from error
+        return Session(sock)
+
+    @contextlib.contextmanager
+    def _said(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except (CommandException, OSError) as error:
+            raise CharonError(f"charon did not take {what}: {error}") from error
+
+
+def _seen(name: str, row: Any) -> Seen | None:
+    host = host_of(name)
+    if host is None or _text(row, "state") != "ESTABLISHED":
+        return None
+    children = [one for one in row.get("child-sas", {}).values() if _text(one, "state") == "INSTALLED"]
+    if not children:
+        return None
+    return Seen(
+        host,
+        _text(row, "remote-host"),
+        int(_text(row, "established") or 0),
+        sum(int(_text(one, "bytes-in") or 0) for one in children),
+        sum(int(_text(one, "bytes-out") or 0) for one in children),
+    )
+
+
+def _text(row: Any, key: str) -> str:
+    value = row.get(key, b"")
+    return value.decode("ascii", "replace") if isinstance(value, bytes) else ""

@@ -1,0 +1,107 @@
+"""What an enrolled host is given: one archive with its certificate and all that joins it to the appliance. No I/O.
+
+The kit uses the host's own strongSwan in its own places (`/etc/swanctl`), so what confines that (AppArmor) and other
+tunnels of the host go on. The child's traffic selectors are the host's virtual address and the appliance's: the
+tunnel carries what goes to the appliance and nothing else.
+"""
+
+import io
+import tarfile
+from dataclasses import dataclass
+from importlib.resources import files
+from string import Template
+
+from appliance.channel.messages import APPLIANCE_NAME
+from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
+
+CONNECTION = "rosrv"
+_SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "README")
+
+
+@dataclass(frozen=True)
+class Kit:
+    """The parts of a kit; `key` is None where the host has made its own. `protect` is an nftables file."""
+
+    name: str
+    address: str
+    appliance: str  # the appliance's address in the tunnel
+    endpoint: str  # the address or name at which the host reaches the appliance
+    master: str  # the URI of RVMaster through the tunnel
+    certificate: str
+    authority: str
+    key: str | None
+    protect: str
+
+
+def archive(kit: Kit) -> bytes:
+    """The kit as `.tar.gz`: one folder, `rosrv-NAME`."""
+    members = [
+        ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
+        ("swanctl/x509ca/rosrv-ca.pem", kit.authority, 0o644),
+        ("swanctl/x509/rosrv.pem", kit.certificate, 0o644),
+        ("protect.nft", kit.protect, 0o644),
+    ]
+    if kit.key is not None:
+        members.append(("swanctl/private/rosrv.key", kit.key, 0o600))
+    values = {"name": kit.name, "address": kit.address, "appliance": kit.appliance, "master": kit.master}
+    values |= {"endpoint": kit.endpoint, "connection": CONNECTION, "child": CHILD}
+    for script in _SCRIPTS:
+        text = files("appliance.ipsec").joinpath("kit_files", script).read_text(encoding="utf-8")
+        members.append((script, _Template(text).substitute(values), 0o644 if script == "README" else 0o755))
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+        for path, content, mode in members:
+            data = content.encode()
+            entry = tarfile.TarInfo(f"rosrv-{kit.name}/{path}")
+            entry.size, entry.mode = len(data), mode
+            tar.addfile(entry, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def swanctl_conf(kit: Kit) -> str:
+    """The host's tunnel as swanctl reads it."""
+    return f"""\
+# The tunnel of {kit.name} to the ROSRV appliance. Made by `rosrv host add`.
+connections {{
+  {CONNECTION} {{
+    version = 2
+    remote_addrs = {kit.endpoint}
+    vips = 0.0.0.0
+    proposals = {", ".join(IKE_PROPOSALS)}
+    encap = yes
+    mobike = yes
+    dpd_delay = 5s
+    keyingtries = 0
+    send_cert = always
+    local {{
+      auth = pubkey
+      certs = rosrv.pem
+      id = fqdn:{kit.name}
+    }}
+    remote {{
+      auth = pubkey
+      cacerts = rosrv-ca.pem
+      id = fqdn:{APPLIANCE_NAME}
+    }}
+    children {{
+      {CHILD} {{
+        local_ts = dynamic
+        remote_ts = {kit.appliance}/32
+        esp_proposals = {", ".join(ESP_PROPOSALS)}
+        start_action = start
+        close_action = start
+        dpd_action = restart
+      }}
+    }}
+  }}
+}}
+"""
+
+
+class _Template(Template):
+    """`@name@` stands for a value: the scripts keep their `$`."""
+
+    delimiter = "@"
+    pattern = r"""
+    @(?:(?P<escaped>@)|(?P<named>[a-z]+)@|(?P<braced>(?!))|(?P<invalid>(?!)))
+    """  # type: ignore[assignment]  # string.Template takes a text here and compiles it itself

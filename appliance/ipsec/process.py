@@ -1,0 +1,258 @@
+"""The process that runs charon: it alone speaks to it, and it holds the appliance's own key for the tunnels.
+
+Its life: it makes a key (once), asks control for a certificate for it, and is told the state that is wanted
+(`TunnelsStated`), whole each time. charon is started at the first one. When charon dies, this process ends too, and
+the supervisor starts both again; nothing is taken over from the life before.
+
+Invariants:
+
+1. The private key stays in this process's own directory (mode 0600) and in charon.
+2. charon has what this process has: a user of its own, and the capabilities to change the network and to bind the
+   ports 500 and 4500. It dies with this process.
+3. Nothing that a stranger sends is parsed here but charon's log, as lines of text, and at most
+   `REFUSALS_PER_SECOND` of them are passed on.
+"""
+
+import asyncio
+import os
+import socket
+import sys
+import time
+from collections.abc import Awaitable
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import (
+    APPLIANCE_NAME,
+    CertificateNeeded,
+    Failed,
+    Lifeline,
+    LinkOpened,
+    Message,
+    Ping,
+    Pong,
+    Ready,
+    Stop,
+    TunnelChanged,
+    TunnelLink,
+    TunnelRefused,
+    TunnelSeen,
+    TunnelsReported,
+    TunnelsStated,
+)
+from appliance.ipsec.charon import PROGRAM, CharonError, Material, Vici
+from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.refusals import Refusals
+from appliance.ipsec.requests import make_key, signing_request
+from appliance.ipsec.strongswan import Tunnel, configuration
+
+KEY_FILE = "appliance.key"
+REFUSALS_PER_SECOND = 20
+REPORT_SECONDS = 2.0
+RENEW_SECONDS = 30 * 86_400.0
+_START_SECONDS = 15.0
+
+_log = structlog.get_logger()
+
+
+class TunnelProcess:
+    """Serves one lifeline and the link to control until it is told to stop or charon has died."""
+
+    def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
+        self._lifeline = lifeline
+        self._directory = directory
+        self._key = key
+        self._control: Channel | None = None
+        self._ended = asyncio.Event()
+        self._wanted: TunnelsStated | None = None
+        self._changed = asyncio.Event()
+        self._taken = 0
+        self._charon: asyncio.subprocess.Process | None = None
+        self._vici: Vici | None = None
+        self._refusals = Refusals()
+        self._second = (0, 0)  # of the last refusals, and how many they were
+        self._tasks: set[asyncio.Future[Any]] = set()
+        self.failed = False
+
+    async def run(self) -> None:
+        """Serve until the end; `failed` says that it was no orderly one."""
+        self._loop = asyncio.get_running_loop()
+        self._lifeline.attach(self._loop, self._supervisor_said, self._ended.set)
+        self._lifeline.send(Ready())
+        self._spawn(self._provision())
+        self._spawn(self._report())
+        self._spawn(self._renew())
+        await self._ended.wait()
+        for task in self._tasks:
+            task.cancel()
+        if self._charon is not None and self._charon.returncode is None:
+            self._charon.terminate()
+            await self._charon.wait()
+
+    # --- what this process is told ---
+
+    def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case Ping(number):
+                self._lifeline.send(Pong(number))
+            case Stop():
+                self._ended.set()
+            case LinkOpened(role="control"):
+                self._open_link(descriptors[0])
+            case _:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+
+    def _open_link(self, descriptor: int) -> None:
+        if self._control is not None:
+            self._control.close()
+        link = self._control = Channel(socket.socket(fileno=descriptor), TunnelLink)
+        link.attach(self._loop, self._control_said, lambda: self._link_closed(link))
+        self._ask()
+
+    def _link_closed(self, link: Channel) -> None:
+        if self._control is link:
+            self._control = None
+
+    def _control_said(self, message: Any, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelsStated):
+            self._wanted = message
+            self._changed.set()
+
+    def _ask(self) -> None:
+        self._tell(CertificateNeeded(signing_request(self._key, APPLIANCE_NAME)))
+
+    def _tell(self, message: Message) -> None:
+        if self._control is None:
+            return
+        try:
+            self._control.send(message)
+        except ChannelClosedError:
+            self._control = None
+
+    # --- charon ---
+
+    async def _provision(self) -> None:
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            wanted = self._wanted
+            assert wanted is not None  # noqa: S101  set before the event
+            if self._vici is None:
+                self._vici = await self._start(wanted)
+            vici = self._vici
+            tunnels = [Tunnel(one.name, one.address, one.serial) for one in wanted.hosts]
+            material = Material(wanted.address, wanted.authority, wanted.certificate, wanted.revocations)
+            await asyncio.to_thread(vici.provision, tunnels, material)
+            self._taken = wanted.number
+            await self._say_how_it_stands(vici)
+
+    async def _start(self, wanted: TunnelsStated) -> Vici:
+        conf, sock = self._directory / "strongswan.conf", self._directory / "vici.sock"
+        conf.write_text(configuration(self._directory, wanted.esp))
+        sock.unlink(missing_ok=True)
+        self._charon = await asyncio.create_subprocess_exec(
+            "/usr/bin/setpriv",
+            "--pdeathsig=SIGKILL",
+            str(PROGRAM),
+            env={"STRONGSWAN_CONF": str(conf), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"},
+            stdin=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            limit=1 << 20,
+        )
+        self._spawn(self._read_log(self._charon))
+        vici = await self._connect(sock)
+        await asyncio.to_thread(vici.load_key, self._key)
+        self._loop.run_in_executor(None, self._listen, vici)
+        return vici
+
+    async def _connect(self, path: Path) -> Vici:
+        deadline = time.monotonic() + _START_SECONDS
+        while True:
+            try:
+                return Vici(path)
+            except CharonError:
+                if time.monotonic() > deadline:
+                    raise
+            await asyncio.sleep(0.05)
+
+    def _listen(self, vici: Vici) -> None:
+        for host, up, remote in vici.listen():
+            self._loop.call_soon_threadsafe(self._tell, TunnelChanged(host, up, remote))
+
+    async def _read_log(self, charon: asyncio.subprocess.Process) -> None:
+        assert charon.stderr is not None  # noqa: S101  a pipe was asked for
+        last = ""
+        async for raw in charon.stderr:
+            last = raw.decode("utf-8", "replace").rstrip() or last
+            refusal = self._refusals.read(last)
+            if refusal is not None and self._may_tell():
+                self._tell(TunnelRefused(refusal.remote, refusal.reason))
+        status = await charon.wait()
+        raise CharonError(f"charon ended (status {status}), last it said: {last}")
+
+    def _may_tell(self) -> bool:
+        second, count = int(time.monotonic()), self._second[1]
+        self._second = (second, count + 1 if second == self._second[0] else 1)
+        return self._second[1] <= REFUSALS_PER_SECOND
+
+    async def _report(self) -> None:
+        while True:
+            await asyncio.sleep(REPORT_SECONDS)
+            if self._vici is not None and not self._changed.is_set():
+                await self._say_how_it_stands(self._vici)
+
+    async def _say_how_it_stands(self, vici: Vici) -> None:
+        rows = await asyncio.to_thread(vici.seen)
+        self._tell(
+            TunnelsReported(
+                self._taken,
+                [TunnelSeen(one.name, one.remote, one.seconds, one.bytes_in, one.bytes_out) for one in rows],
+            )
+        )
+
+    async def _renew(self) -> None:
+        while True:
+            await asyncio.sleep(RENEW_SECONDS)
+            self._ask()
+
+    # --- tasks ---
+
+    def _spawn(self, work: Awaitable[None]) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
+
+    def _finished(self, task: "asyncio.Future[None]") -> None:
+        self._tasks.discard(task)
+        if task.cancelled() or self._ended.is_set():
+            return
+        error = task.exception()
+        _log.error("the tunnels end and are started again", reason=str(error))
+        self.failed = True
+        self._ended.set()
+
+
+def main(lifeline_fd: int, directory: Path) -> None:
+    """Be this process: `lifeline_fd` is the lifeline's descriptor, `directory` its own."""
+    lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
+    try:
+        key = _own_key(directory / KEY_FILE)
+    except (SignerKeyError, OSError) as error:
+        lifeline.send(Failed(f"the tunnels cannot use the appliance's key: {error}"))
+        sys.exit(1)
+    process = TunnelProcess(lifeline, directory, key)
+    asyncio.run(process.run())
+    # A thread may wait for charon's answer, and nothing is left to be written: no waiting for it.
+    sys.stderr.flush()
+    os._exit(1 if process.failed else 0)
+
+
+def _own_key(path: Path) -> bytes:
+    if not path.exists():
+        write_whole(path, make_key(), 0o600)
+    require_private(path)
+    return path.read_bytes()

@@ -1,0 +1,79 @@
+"""From charon's log: whom it refused, and why. No I/O.
+
+charon tells of tunnels that stand in events, of those that it refused only in its log. A worker thread handles one
+packet from its arrival to its answer, so the lines of one thread between the two belong together.
+"""
+
+import re
+from dataclasses import dataclass, field
+
+_LINE = re.compile(r"(\d\d)\[[A-Z]{3}\] (.*)")
+_ARRIVED = re.compile(r"received packet: from (\S+)\[\d+\] to ")
+_REFUSED = re.compile(
+    r"generating IKE_\S+ response \d+ \[ (?:.* )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
+)
+_REASONS = (
+    "revoked",
+    "no issuer certificate found",
+    "no trusted",
+    "no matching peer config",
+    "no IKE config found",
+    "constraint check failed",
+    "validation failed",
+    "subject certificate invalid",
+    "signature",
+    "no acceptable proposal found",
+    "received proposals",
+    "certificate status",
+    "is not valid",
+)
+_WORDS = {
+    "AUTH_FAILED": "authentication failed",
+    "NO_PROP": "no acceptable proposal",
+    "FAIL_CP_REQ": "no address for it",
+    "TS_UNACCEPT": "traffic that is not allowed",
+}
+_LONGEST = 400
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A host that was refused: its real address, and charon's reasons."""
+
+    remote: str
+    reason: str
+
+
+@dataclass
+class _Packet:
+    remote: str
+    reasons: list[str] = field(default_factory=list)
+
+
+class Refusals:
+    """Reads the log line by line."""
+
+    def __init__(self) -> None:
+        self._packets: dict[str, _Packet] = {}  # by worker thread: charon has 16
+
+    def read(self, line: str) -> Refusal | None:
+        """The refusal that this line completes, if it does."""
+        found = _LINE.match(line)
+        if found is None:
+            return None
+        thread, text = found[1], found[2]
+        arrived = _ARRIVED.match(text)
+        if arrived is not None:
+            self._packets[thread] = _Packet(arrived[1])
+            return None
+        packet = self._packets.get(thread)
+        if packet is None:
+            return None
+        refused = _REFUSED.match(text)
+        if refused is None:
+            if any(reason in text for reason in _REASONS):
+                packet.reasons.append(text.strip())
+            return None
+        del self._packets[thread]
+        reasons = "; ".join([_WORDS[refused[1]], *packet.reasons])
+        return Refusal(packet.remote, reasons[:_LONGEST])

@@ -1,0 +1,28 @@
+"""A key and its signing request, made where the key is to be used. No I/O."""
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import NameOID
+
+
+def make_key() -> bytes:
+    """A new ECDSA key on P-384, in PEM (PKCS #8)."""
+    key = ec.generate_private_key(ec.SECP384R1())
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def signing_request(key: bytes, name: str) -> bytes:
+    """The request (PKCS #10, PEM) for a certificate in this name, signed by a key that `make_key` made."""
+    private = load_pem_private_key(key, password=None)
+    if not isinstance(private, ec.EllipticCurvePrivateKey):
+        raise ValueError("the key is not an ECDSA key: remove its file, and another is made")
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    request = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(private, hashes.SHA384())
+    return request.public_bytes(Encoding.PEM)

@@ -1,0 +1,114 @@
+"""What charon is told: its configuration file, and over vici the tunnels of the enrolled hosts. No I/O.
+
+Invariants:
+
+1. AES-256-GCM, SHA-384 and Curve25519 or ECP-384; nothing weaker is offered or accepted.
+2. A host is let in by a certificate of the appliance's own authority that is on no list of revoked ones (without a
+   valid list: nobody), under the name in it; it gets the one address that is kept for this name, and nothing but
+   the appliance's address on the other side. A host that is not enrolled has no configuration that could match.
+3. charon loads the plugins named here and no others: none that runs programs or asks the network for lists.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from appliance.channel.messages import APPLIANCE_NAME, Esp
+
+USER_SPACE_INTERFACE = "ipsec0"
+IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")
+ESP_PROPOSALS = ("aes256gcm16-x25519", "aes256gcm16-ecp384")
+CHILD = "ros"
+_PLUGINS = ("random", "nonce", "openssl", "pem", "x509", "revocation", "constraints", "pubkey", "kdf")
+_PREFIX = "host-"
+
+
+@dataclass(frozen=True)
+class Tunnel:
+    """An enrolled host: its name, the virtual address kept for it, and the serial number of its certificate."""
+
+    name: str
+    address: str
+    serial: str
+
+
+def plugins(esp: Esp) -> str:
+    """The plugins that charon loads, in order, on the appliance and on hosts."""
+    kernel = ("kernel-libipsec",) if esp == "user space" else ()
+    return " ".join((*_PLUGINS, *kernel, "kernel-netlink", "socket-default", "vici"))
+
+
+def configuration(directory: Path, esp: Esp) -> str:
+    """`strongswan.conf` of the appliance's charon, which keeps its socket in `directory` and logs to stderr."""
+    return f"""\
+charon-systemd {{
+  load = {plugins(esp)}
+  retransmit_tries = 4
+  retransmit_timeout = 1.0
+  retransmit_base = 1.6
+  half_open_timeout = 15
+  cookie_threshold = 30
+  block_threshold = 10
+  init_limit_half_open = 200
+  plugins {{
+    vici {{
+      socket = unix://{directory}/vici.sock
+    }}
+  }}
+  syslog {{
+  }}
+  filelog {{
+    stderr {{
+      default = 1
+      flush_line = yes
+    }}
+  }}
+}}
+"""
+
+
+def connection_name(host: str) -> str:
+    """The name of a host's connection and pool in charon."""
+    return _PREFIX + host
+
+
+def host_of(connection: str) -> str | None:
+    """The host of a connection; None for one that is not ours (a handshake before it is known whose)."""
+    return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
+
+
+def pool(tunnel: Tunnel) -> dict[str, Any]:
+    """The one address of a host, for vici's `load-pool`."""
+    return {connection_name(tunnel.name): {"addrs": f"{tunnel.address}-{tunnel.address}"}}
+
+
+def connection(tunnel: Tunnel, *, address: str, certificate: bytes, authority: bytes) -> Mapping[str, Any]:
+    """The tunnel of a host, for vici's `load-conn`; `address` is the appliance's own in the tunnel."""
+    child = {
+        "local_ts": [f"{address}/32"],
+        "remote_ts": ["dynamic"],
+        "esp_proposals": list(ESP_PROPOSALS),
+        "dpd_action": "clear",
+        "close_action": "none",
+    }
+    return {
+        connection_name(tunnel.name): {
+            "version": "2",
+            "proposals": list(IKE_PROPOSALS),
+            "unique": "replace",
+            "encap": "yes",
+            "mobike": "yes",
+            "dpd_delay": "5s",
+            "send_cert": "always",
+            "pools": [connection_name(tunnel.name)],
+            "local": {"auth": "pubkey", "certs": [certificate], "id": f"fqdn:{APPLIANCE_NAME}"},
+            "remote": {
+                "auth": "pubkey",
+                "cacerts": [authority],
+                "id": f"fqdn:{tunnel.name}",
+                "revocation": "strict",
+            },
+            "children": {CHILD: child},
+        }
+    }

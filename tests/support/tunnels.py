@@ -1,0 +1,124 @@
+"""A host that joins the appliance by its kit: unpacked, with a charon of its own, in the host's namespace.
+
+with JoinedHost(lab_host, kit, folder) as host:
+    ros = RosSession(host.master, home, host)
+
+The kit's own `join.sh` needs a machine with systemd; here the same strongSwan is given the same files.
+"""
+
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.ipsec.strongswan import plugins
+from appliance.network.esp import choose_esp
+from appliance.network.lab import Host
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import need_program
+
+_CONFIGURATION = """\
+charon-systemd {{
+  load = {plugins}
+  retransmit_tries = 2
+  retransmit_timeout = 1.0
+  retransmit_base = 1.2
+  plugins {{
+    vici {{
+      socket = unix://{directory}/vici.sock
+    }}
+  }}
+  filelog {{
+    output {{
+      path = /dev/stdout
+      default = 1
+      flush_line = yes
+    }}
+  }}
+}}
+"""
+
+
+def need_strongswan() -> None:
+    """charon and swanctl are installed."""
+    need_program("charon-systemd", "charon-systemd libcharon-extra-plugins")
+    need_program("swanctl", "strongswan-swanctl")
+
+
+class JoinedHost:
+    """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
+
+    def __init__(self, host: Host, kit: Path, directory: Path) -> None:
+        """Unpack the kit into `directory`, which must be new."""
+        self.outer = host
+        self.directory = directory
+        directory.mkdir()
+        subprocess.run(["tar", "-xzf", str(kit), "-C", str(directory)], check=True)
+        (self.folder,) = directory.iterdir()
+        readme = (self.folder / "README").read_text()
+        self.master = readme.split("ROS_MASTER_URI=")[1].split()[0]
+        self.address = readme.split("ROS_IP=")[1].split()[0]
+        self.charon: Process | None = None
+        self.keeper: Process | None = None
+
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a program on the host."""
+        return self.outer.popen(args, **options)
+
+    def start(self) -> Self:
+        """Start charon and give it the kit; it begins to ask for the tunnel."""
+        conf = self.directory / "strongswan.conf"
+        text = _CONFIGURATION.format(
+            plugins=plugins(choose_esp(self.outer.namespace)), directory=self.directory
+        )
+        conf.write_text(text)
+        environment = {"STRONGSWAN_CONF": str(conf), "PATH": os.environ["PATH"]}
+        self.charon = Process(
+            self.outer, ["charon-systemd"], env=environment, label=f"charon of {self.outer.name}"
+        )
+        self.charon.wait_for(lambda event: "spawning" in str(event.get("text")))
+        done = self.outer.popen(
+            ["swanctl", "--load-all", "--noprompt", "--uri", f"unix://{self.directory}/vici.sock"],
+            env=environment | {"SWANCTL_DIR": str(self.folder / "swanctl")},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        out, _ = done.communicate(timeout=LIMIT)
+        assert done.returncode == 0, f"swanctl: {out}\n{self.charon.story()}"
+        command = [str(self.folder / "keep.sh"), "--uri", f"unix://{self.directory}/vici.sock"]
+        self.keeper = Process(self.outer, command, env=environment, label="keep.sh")
+        return self
+
+    def wait_until_up(self, since: int = 0) -> None:
+        """The tunnel stands, as this side sees it."""
+        assert self.charon is not None
+        self.charon.wait_for(
+            lambda event: (
+                "CHILD_SA ros" in str(event.get("text")) and "established" in str(event.get("text"))
+            ),
+            since=since,
+        )
+
+    def wait_until_refused(self) -> None:
+        """The appliance said no."""
+        assert self.charon is not None
+        self.charon.wait_for(lambda event: "AUTHENTICATION_FAILED" in str(event.get("text")))
+
+    def stop(self) -> None:
+        """End charon: the tunnel is closed."""
+        if self.keeper is not None:
+            self.keeper.kill()
+            self.keeper.stop()
+            self.keeper = None
+        if self.charon is not None:
+            self.charon.stop(with_signal=signal.SIGTERM)
+            self.charon = None
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()

@@ -1,0 +1,87 @@
+"""Tests of a host's kit: what is in it, and for whose eyes."""
+
+import io
+import subprocess
+import tarfile
+from dataclasses import replace
+
+import pytest
+
+from appliance.ipsec.kit import Kit, archive, swanctl_conf
+from appliance.network.firewall.rules import PortRange
+from appliance.network.protect import protection
+
+KIT = Kit(
+    name="ocu-1",
+    address="10.113.11.2",
+    appliance="10.113.11.1",
+    endpoint="192.168.1.20",
+    master="http://10.113.11.1:11311",
+    certificate="CERTIFICATE\n",
+    authority="AUTHORITY\n",
+    key="KEY\n",
+    protect=protection(["10.113.11.1"], PortRange(32768, 60999), ()),
+)
+
+
+def unpack(kit: Kit) -> dict[str, tuple[str, int]]:
+    """Text and mode of every file of a kit."""
+    with tarfile.open(fileobj=io.BytesIO(archive(kit))) as tar:
+        found = {}
+        for member in tar:
+            file = tar.extractfile(member)
+            assert file is not None
+            found[member.name] = (file.read().decode(), member.mode)
+        return found
+
+
+def test_a_kit_is_one_folder_with_a_private_key_for_its_owner_only() -> None:
+    """Everything is in `rosrv-NAME`; the key has mode 600, the scripts can be run."""
+    found = unpack(KIT)
+    assert {path.split("/")[0] for path in found} == {"rosrv-ocu-1"}
+    assert found["rosrv-ocu-1/swanctl/private/rosrv.key"] == ("KEY\n", 0o600)
+    assert found["rosrv-ocu-1/swanctl/x509/rosrv.pem"][0] == "CERTIFICATE\n"
+    assert found["rosrv-ocu-1/swanctl/x509ca/rosrv-ca.pem"][0] == "AUTHORITY\n"
+    for script in ("join.sh", "leave.sh", "keep.sh"):
+        assert found[f"rosrv-ocu-1/{script}"][1] == 0o755
+
+
+def test_a_host_that_made_its_key_gets_none() -> None:
+    """Without a key in it, nothing in the archive is private."""
+    assert "rosrv-ocu-1/swanctl/private/rosrv.key" not in unpack(replace(KIT, key=None))
+
+
+@pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh"])
+def test_scripts_are_complete_shell(script: str) -> None:
+    """The shell reads them without a complaint, and what stands for a value was replaced."""
+    text = unpack(KIT)[f"rosrv-ocu-1/{script}"][0]
+    done = subprocess.run(["/bin/sh", "-n"], input=text, text=True, capture_output=True, check=False)
+    assert done.stderr == ""
+    for word in ("@name@", "@address@", "@endpoint@", "@master@", "@child@", "@connection@", "@appliance@"):
+        assert word not in text
+
+
+def test_join_tells_what_ros_needs() -> None:
+    """The last lines of join.sh have the master and the address of this host."""
+    assert (
+        "ROS_MASTER_URI=http://10.113.11.1:11311 ROS_IP=10.113.11.2" in unpack(KIT)["rosrv-ocu-1/join.sh"][0]
+    )
+
+
+def test_the_tunnel_carries_the_way_to_the_appliance_only() -> None:
+    """The selectors are the virtual address and the appliance's; weaker proposals are not in the file."""
+    text = swanctl_conf(KIT)
+    assert "remote_ts = 10.113.11.1/32" in text
+    assert "local_ts = dynamic" in text
+    assert "id = fqdn:ocu-1" in text
+    proposals = [line for line in text.splitlines() if "proposals" in line]
+    assert proposals
+    for line in proposals:
+        for one in line.split("=")[1].split(","):
+            assert one.strip().startswith("aes256gcm16-")
+            assert one.strip().endswith(("-x25519", "-ecp384"))
+
+
+def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
+    """Its ROS ports are open to the appliance's tunnel address and to nobody else."""
+    assert "ip saddr { 10.113.11.1 } accept" in unpack(KIT)["rosrv-ocu-1/protect.nft"][0]

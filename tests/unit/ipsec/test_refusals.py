@@ -1,0 +1,52 @@
+"""Tests of reading charon's log for those it refused."""
+
+from appliance.ipsec.refusals import Refusal, Refusals
+
+REVOKED = """\
+09[NET] received packet: from 10.88.0.20[4500] to 10.88.0.2[4500] (1184 bytes)
+11[NET] received packet: from 10.88.0.66[500] to 10.88.0.2[500] (268 bytes)
+09[CFG] checking certificate status of "O=ROSRV, CN=ocu-1"
+09[CFG] certificate was revoked on Nov 20 06:53:25 UTC 2026, reason: unspecified
+11[IKE] 10.88.0.66 is initiating an IKE_SA
+11[ENC] generating IKE_SA_INIT response 0 [ SA KE No N(NATD_S_IP) N(NATD_D_IP) CERTREQ ]
+09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]
+"""
+
+
+def refusals(text: str) -> list[Refusal]:
+    """What a log says."""
+    reader = Refusals()
+    return [found for line in text.splitlines() if (found := reader.read(line)) is not None]
+
+
+def test_the_reason_belongs_to_the_packet_of_its_thread() -> None:
+    """Lines of two packets are mixed; the refusal has the address and the reasons of its own."""
+    (found,) = refusals(REVOKED)
+    assert found.remote == "10.88.0.20"
+    assert found.reason.startswith("authentication failed; ")
+    assert "revoked on Nov 20" in found.reason
+
+
+def test_a_handshake_that_goes_well_is_no_refusal() -> None:
+    """An answer without an error says nothing."""
+    lines = REVOKED.replace("N(AUTH_FAILED)", "IDr CERT AUTH CPRP(ADDR) SA TSi TSr N(MOBIKE_SUP)")
+    assert refusals(lines) == []
+
+
+def test_the_answer_may_have_more_than_the_error() -> None:
+    """A refused child or address among other payloads is a refusal too."""
+    (found,) = refusals(
+        REVOKED.replace("[ N(AUTH_FAILED) ]", "[ IDr CERT AUTH N(MOBIKE_SUP) N(TS_UNACCEPT) ]")
+    )
+    assert found.reason.startswith("traffic that is not allowed")
+
+
+def test_a_name_chosen_by_a_stranger_makes_no_long_reason() -> None:
+    """What is passed on is bounded, whatever the certificate says."""
+    (found,) = refusals(REVOKED.replace("unspecified", "x" * 5000))
+    assert len(found.reason) <= 400
+
+
+def test_what_is_no_line_of_the_log_is_passed_over() -> None:
+    """Rubbish and lines of threads that have no packet are nothing."""
+    assert refusals("\n\nrubbish\n09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]\n") == []
