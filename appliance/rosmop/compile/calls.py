@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from appliance.rosmop.compile import cursors, members
 from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.initializers import ValueOf, elements
+from appliance.rosmop.compile.invocation import Invocation
 from appliance.rosmop.compile.library import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.output import Stream, formatted
 from appliance.rosmop.compile.places import Value
@@ -40,7 +41,7 @@ def call(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
         base = value_of(scope, callee.base)
         arguments = [value_of(scope, argument) for argument in node.arguments]
         at = (node.position, scope.site(node))
-        return members.call(members.Invocation(scope, base, callee.name, arguments, at))
+        return members.call(Invocation(scope, base, callee.name, arguments, at))
     if not isinstance(callee, tree.Name):
         raise SpecificationError.at(node.position, "only functions can be called")
     return _named(scope, node, callee.parts, value_of)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 
-from appliance.rosmop.compile import calls, initializers, members, operators, storing
+from appliance.rosmop.compile import calls, initializers, members, operators, storing, vector_members
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.library import CONSTANTS
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
@@ -250,7 +250,7 @@ def _index(scope: Scope, node: tree.Expression) -> Value:
     base, index = value_of(scope, node.base), value_of(scope, node.index)
     site = scope.site(node)
     if isinstance(base.type, kinds.Vector):
-        return members.element_value(scope, base, index, node.position, site)
+        return vector_members.element_value(scope, base, index, node.position, site)
     if isinstance(base.type, kinds.String | kinds.Characters):
         code = convert(scope, index, kinds.LONG)
         place = CharacterPlace(base, code, site) if base.place is not None else None

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.expressions import value_of
-from appliance.rosmop.compile.members import element_value
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Loop, Scope
+from appliance.rosmop.compile.vector_members import element_value
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError

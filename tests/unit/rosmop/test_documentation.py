@@ -7,7 +7,9 @@ import pytest
 
 from appliance.rosmop.compile.library import LIBRARY
 from appliance.rosmop.compile.loops import MAX_NESTED
-from appliance.rosmop.compile.members import MOMENT_METHODS, TEXT_METHODS, VECTOR_METHODS
+from appliance.rosmop.compile.string_members import TEXT_METHODS
+from appliance.rosmop.compile.time_members import MOMENT_METHODS
+from appliance.rosmop.compile.vector_members import VECTOR_METHODS
 from appliance.rosmop.runtime.context import BUDGET, MAX_BYTES, MAX_CALLS
 from appliance.rosmop.runtime.numbers import MATH
 from appliance.rosmop.syntax.parser import MAX_CHARACTERS, MAX_DEPTH

@@ -1,0 +1,86 @@
+"""A call of a member function while it is compiled: its base, its arguments, and the results it can have."""
+
+from collections.abc import Callable, Sequence
+
+from appliance.rosmop.compile.conversion import convert, number
+from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.compile.storing import mark, require_place, store
+from appliance.rosmop.positions import Position
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+
+
+class Invocation:
+    """A call of a member function."""
+
+    def __init__(
+        self, scope: Scope, base: Value, name: str, arguments: Sequence[Value], at: tuple[Position, int]
+    ) -> None:
+        self.scope = scope
+        self.base = base
+        self.name = name
+        self.arguments = arguments
+        self.position, self.site = at
+
+    def count(self, least: int, most: int | None = None) -> int:
+        """How many arguments there are; refuses another number."""
+        number_of = len(self.arguments)
+        if not least <= number_of <= (least if most is None else most):
+            wanted = str(least) if most in (None, least) else f"{least} to {most}"
+            raise SpecificationError.at(
+                self.position, f"`{self.name}` takes {wanted} argument(s), not {number_of}"
+            )
+        return number_of
+
+    def index(self, position: int, default: int | None = None) -> str:
+        """An argument as an index."""
+        if default is not None and position >= len(self.arguments):
+            return str(default)
+        value = self.arguments[position]
+        if not kinds.is_number(value.type):
+            raise SpecificationError.at(value.position, f"`{self.name}` needs a number; this is {value.type}")
+        return number(value.code, value.type, kinds.ULONG)
+
+    def text(self, position: int) -> str:
+        """An argument as a string; a character is one of length 1."""
+        value = self.arguments[position]
+        if value.type == kinds.CHAR:
+            return f"t_bytes(({value.code} & 255,))"
+        return convert(self.scope, value, kinds.STRING)
+
+    def value(self, kind: kinds.Type, code: str, *, pure: bool = True) -> Value:
+        """The result."""
+        return Value(kind, code, self.position, pure=pure and self.base.pure)
+
+    def changes(self, code: str) -> Value:
+        """The result of a function that gives the base a new value."""
+        require_place(self.base, f"`{self.name}`")
+        return Value(kinds.VOID, store(self.scope, self.base, code), self.position, pure=False)
+
+    def changes_in_place(self, code: str, *, grows: bool = True) -> Value:
+        """The result of a function that changes the vector itself."""
+        require_place(self.base, f"`{self.name}`")
+        if grows and isinstance(self.base.type, kinds.Vector) and self.base.type.length is not None:
+            raise SpecificationError.at(
+                self.position, f"`{self.name}`: an array of fixed length stays so long"
+            )
+        flag = mark(self.scope, self.base)
+        whole = f"(({flag} := True), {code})[1]" if flag else code
+        return Value(kinds.VOID, whole, self.position, pure=False)
+
+
+Method = Callable[[Invocation], Value]
+"""A member function: from a call to its value."""
+
+
+def length(call: Invocation) -> Value:
+    """`size()`, `length()`."""
+    call.count(0)
+    return call.value(kinds.ULONG, f"l_len({call.base.code})")
+
+
+def empty(call: Invocation) -> Value:
+    """`empty()`."""
+    call.count(0)
+    return call.value(kinds.BOOL, f"(not {call.base.code})")
