@@ -40,6 +40,13 @@ METRICS = (
     Metric(
         "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
     ),
+    Metric(
+        "rosrv_monitor_events_total",
+        "counter",
+        ("kind", "monitor"),
+        "what monitors did: verdict, drop, change, fault, log, publish",
+    ),
+    Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
     Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),
     Metric("rosrv_rosmaster_reachable", "gauge", (), "1 while the real ROS Master answers"),

@@ -89,7 +89,7 @@ def _buckets(counts: list[int]) -> list[tuple[str, float]]:
 
 def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
     status = body["status"]
-    policy, audit = status["policy"], status["audit"]
+    policy, audit, monitors = status["policy"], status["audit"], status["monitors"]
     relayed = body["relayed"]
     return {
         "rosrv_info": [((status["version"],), 1)],
@@ -102,6 +102,13 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
         "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body["monitors"]],
+        "rosrv_monitors": [
+            (("enabled",), monitors["enabled"]),
+            (("disabled",), monitors["loaded"] - monitors["enabled"]),
+            (("holding",), len(monitors["held"])),
+            (("failing",), len(monitors["failing"])),
+        ],
         "rosrv_nodes": [((state,), count) for state, count in body["nodes"].items()],
         "rosrv_registrations": [((kind,), count) for kind, count in body["registrations"].items()],
         "rosrv_rosmaster_reachable": [((), status["rosmaster"] == "reachable")],

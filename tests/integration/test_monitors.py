@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.requirements import needs
 
@@ -274,3 +274,68 @@ def test_monitors_come_and_go_under_a_thousand_messages_a_second(
     numbers = _numbers(stopped)
     assert numbers == sorted(set(numbers))
     assert stopped.seen(event="received")[-1]["publisher"] == "/voice"
+
+
+LANDSHARK = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "examples" / "landshark" / "nodes")!r})
+import rospy
+from landshark_messages import paintball_trigger
+from sensor_msgs.msg import JointState
+Trigger = paintball_trigger()
+rospy.init_node(sys.argv[1])
+"""
+GUN = (
+    LANDSHARK
+    + """
+rospy.Subscriber("/landshark_control/trigger", Trigger, lambda m: print('{"event": "shot"}', flush=True))
+print('{"event": "ready"}', flush=True)
+rospy.spin()
+"""
+)
+OPERATOR = (
+    LANDSHARK
+    + """
+aim = rospy.Publisher("/landshark/joint_states", JointState, queue_size=10)
+fire = rospy.Publisher("/landshark_control/trigger", Trigger, queue_size=10)
+print('{"event": "ready"}', flush=True)
+for line in sys.stdin:
+    for _ in range(5):
+        aim.publish(JointState(name=["pan", "turret_tilt"], position=[0.0, float(line)]))
+        rospy.sleep(0.1)
+    fire.publish(Trigger())
+    print('{"event": "fired", "tilt": "' + line.strip() + '"}', flush=True)
+"""
+)
+
+
+@pytest.mark.parametrize("relay", ["all", "monitored"])
+def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -> None:
+    """The gun fires only while it does not point at the robot itself; in either mode of the relay."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    options = (
+        "--monitors",
+        str(ROOT / "monitors"),
+        "--enable",
+        "safeTrigger",
+        "--api",
+        "off",
+        "--relay",
+        relay,
+    )
+    with Appliance(options=options) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
+        assert monitor(appliance, "safeTrigger")["enabled"] is True
+        assert monitor(appliance, "safeZone")["enabled"] is False
+        gun = ros.start([PYTHON, "-c", GUN, "gun"], label="gun")
+        operator = ros.start([PYTHON, "-c", OPERATOR, "operator"], label="operator")
+        for process in (gun, operator):
+            process.wait_for(event="ready")
+        operator.send("0.2")
+        gun.wait_for(event="shot")
+        for tilt in ("-0.6", "0.1"):
+            operator.send(tilt)
+            operator.wait_for(event="fired", tilt=tilt)
+        gun.wait_for_count(2, event="shot")
+        assert monitor(appliance, "safeTrigger")["drops"] == 1
+        dropped = appliance.audit(event="message dropped", resource="/landshark_control/trigger")
+        assert dropped[0]["detail"]["monitor"] == "safeTrigger"

@@ -22,12 +22,14 @@ def body() -> dict[str, Any]:
         "status": {
             "version": "1", "since": 5.0, "relay": "connected", "rosmaster": "reachable",
             "policy": {"revision": 3, "differs_from_file": True},
+            "monitors": {"loaded": 3, "enabled": 2, "held": ["b"], "failing": []},
             "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None},
             "processes": [{"role": "control", "pid": 1, "restarts": 4}],
         },
         "queued_deliveries": 6,
         "nodes": {"live": 2, "lost": 1},
         "registrations": {"publication": 3},
+        "monitors": [["drop", "safeTrigger", 4]],
         "relayed": {"/a\"\\\n": [1, 2, 3]},
         "connections": {"topic": 7},
         "rest": [(("GET", "200"), 8)],
@@ -54,6 +56,8 @@ def test_values_are_what_was_counted() -> None:
     }
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
     assert samples["rosrv_decision_seconds_count", ()] == 2
+    assert samples["rosrv_monitor_events_total", (("kind", "drop"), ("monitor", "safeTrigger"))] == 4
+    assert samples["rosrv_monitors", (("state", "disabled"),)] == 1
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.00025"),)] == 0
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.0005"),)] == 1
     assert samples["rosrv_decision_seconds_bucket", (("le", str(BOUNDS[-1])),)] == 1
