@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.channel.admin import AdminRequest, HostAdd, HostList, HostRenew, HostRevoke
+from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke
 from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import say
-from appliance.cli.running import DEFAULT_STATE, NotRunningError, State, ask, body_or_exit
+from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 from appliance.ipsec.kit import Kit, archive
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.firewall.rules import PortRange
@@ -61,7 +61,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     Example: rosrv host add ocu-1 --appliance 192.168.1.20
     """
     kit = _KitWriter(name, appliance, csr=csr, out=out, opened=opened, ports=ports)
-    body = _ask(state, HostAdd(name, kit.request, days, address), as_json=as_json)
+    body = ask_or_exit(state, HostAdd(name, kit.request, days, address), as_json=as_json)
     kit.write(body, as_json=as_json)
 
 
@@ -82,7 +82,7 @@ def kit(  # noqa: PLR0917  as above
     Example: rosrv host kit ocu-1 --appliance 192.168.1.20
     """
     writer = _KitWriter(name, appliance, csr=csr, out=out, opened=opened, ports=ports)
-    body = _ask(state, HostRenew(name, writer.request, days), as_json=as_json)
+    body = ask_or_exit(state, HostRenew(name, writer.request, days), as_json=as_json)
     writer.write(body, as_json=as_json)
 
 
@@ -92,7 +92,7 @@ def list_hosts(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
     Example: rosrv host list
     """
-    for row in _ask(state, HostList(), as_json=as_json)["hosts"]:
+    for row in ask_or_exit(state, HostList(), as_json=as_json)["hosts"]:
         if as_json:
             _print(json.dumps(row))
             continue
@@ -116,7 +116,7 @@ def revoke(name: _Name, state: State = DEFAULT_STATE, as_json: _Json = False) ->
 
     Example: rosrv host revoke ocu-1
     """
-    body = _ask(state, HostRevoke(name), as_json=as_json)
+    body = ask_or_exit(state, HostRevoke(name), as_json=as_json)
     if as_json:
         _print(json.dumps(body))
     else:
@@ -207,14 +207,6 @@ def _read_request(path: Path) -> str:
         raise usage_error(f"--csr {path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise usage_error(f"--csr {path}: not a signing request in PEM") from None
-
-
-def _ask(state: Any, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
-    try:
-        return body_or_exit(ask(state, request), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(2) from None
 
 
 def _moment(seconds: float) -> str:
