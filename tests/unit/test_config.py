@@ -74,3 +74,19 @@ def test_a_time_is_a_positive_number(value: object) -> None:
     """No limit can be switched off by an odd number."""
     with pytest.raises(ValidationError):
         Settings.model_validate({"limits": {"header_seconds": value}})
+
+
+@pytest.mark.parametrize("api", ["0.0.0.0:8443", "[::]:8443", "10.0.0.2:8443", "robot:8443"])
+def test_rest_in_clear_text_stays_on_this_machine(api: str) -> None:
+    """Tokens never cross a network in clear text; on loopback they may."""
+    with pytest.raises(ValidationError, match="clear text"):
+        Settings(api=api, api_tls=False)
+    for here in ("127.0.0.1:1", "[::1]:1", "localhost:1", "127.9.9.9:1", "off"):
+        assert Settings(api=here, api_tls=False).api == here
+
+
+def test_rest_can_be_off() -> None:
+    """`off`, also as YAML reads it, is no address."""
+    assert Settings.model_validate({"api": "off"}).api_address is None
+    assert Settings.model_validate({"api": False}).api_address is None
+    assert Settings().api_address == ("127.0.0.1", 8443)

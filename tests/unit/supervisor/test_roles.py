@@ -44,3 +44,12 @@ def test_rows_are_consistent() -> None:
     assert all((role.entry is None) != (role.program is None) for role in roles)
     parts = [role.part for role in roles if role.entry]
     assert len(parts) == len(set(parts))
+
+
+def test_rest_can_be_left_out() -> None:
+    """Without REST there is no such role; it is the one that the others do without."""
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE)}
+    assert set(roles) - {role.name for role in roles_of(rosmaster=HERE, rosout=HERE, api=False)} == {"api"}
+    assert roles["api"].dispensable
+    assert not roles["control"].dispensable
+    assert roles["control"].readable_by == roles["api"].user

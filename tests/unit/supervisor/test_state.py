@@ -10,6 +10,7 @@ import pytest
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.users import account_of
 
 ROLES = (
     Role(name="control", user="rosrv", part="control"),
@@ -75,3 +76,19 @@ def test_a_directory_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) ->
     (tmp_path / "file").write_text("")
     with pytest.raises(StartError, match=r"file/state cannot be used: .*--state DIR"):
         StateDirectory(tmp_path / "file" / "state")
+
+
+def test_a_part_that_a_group_may_pass(tmp_path: Path) -> None:
+    """As root: the folder is in the reader's group, which new files get; also where it was made otherwise before.
+    As anybody else there is one user, and the folder is his alone."""
+    shared = (Role(name="control", user="rosrv", part="control", readable_by="rosrv-api"),)
+    for roles in (ROLES[:1], shared, shared):
+        state = StateDirectory(tmp_path)
+        state.prepare(roles)
+        state.close()
+    found = (tmp_path / "control").stat()
+    if os.geteuid() == 0:
+        assert stat.S_IMODE(found.st_mode) == 0o2710
+        assert (found.st_uid, found.st_gid) == (account_of("rosrv").uid, account_of("rosrv-api").gid)
+    else:
+        assert stat.S_IMODE(found.st_mode) == 0o700
