@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 _log = structlog.get_logger()
 _MULTICALL = "system.multicall"
-_TOGETHER = frozenset({"getParam", "setParam", "hasParam", "deleteParam"})
+# Parts of a multicall that are sent before the one before them is answered: only what reaches ROSMaster in one request
+# (`batch`), because roslaunch clears and sets parameters in one multicall, and the order is what counts.
+_TOGETHER = frozenset({"hasParam"})
 _LONGEST_RUN = 64
 _LONGEST_STRETCH = 0.005  # seconds of a multicall without a look at anybody else
 _RECORDED = (KEY, SEARCH_KEY, NODE, SUBGRAPH)  # resolved names: short, and what a reviewer asks for
