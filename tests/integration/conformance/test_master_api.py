@@ -306,6 +306,24 @@ def test_unknown_call_is_denied(both: BothMasters) -> None:
         assert "is not a call that is served here" in message
 
 
+def test_parts_of_a_multicall_are_made_in_order(both: BothMasters) -> None:
+    """roslaunch clears and sets parameters in one multicall: each part finds what the part before it left."""
+    parts = [
+        {"methodName": method, "params": [TESTER, *params]}
+        for number in range(200)
+        for method, *params in (
+            ("setParam", "/order", {"number": number, "text": "x" * (number % 7)}),
+            ("getParam", "/order/number"),
+            ("deleteParam", "/order"),
+            ("hasParam", "/order"),
+            ("setParam", f"/kept/p{number}", number),
+        )
+    ]
+    answers = both.call("system.multicall", parts)
+    assert answers.plain == answers.appliance
+    assert differences(both.call("getParamNames", TESTER)) == []
+
+
 def test_multicall(both: BothMasters) -> None:
     """`system.multicall` answers each part as the call by itself; roslaunch sets its parameters so."""
     parts = [
