@@ -102,7 +102,8 @@ def _robot(text: str) -> Address | Network:
 
 def _compile(text: str, file: str, current: Mapping[str, Any]) -> Policy:
     try:
-        return compile_policy(text, file=file, hosts={}, robot=[_robot(one) for one in current["robot"]])
+        hosts = {name: ipaddress.ip_address(address) for name, address in current["hosts"].items()}
+        return compile_policy(text, file=file, hosts=hosts, robot=[_robot(one) for one in current["robot"]])
     except PolicyError as error:
         raise _refused(findings_of(error.findings)) from error
 

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke
-from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import say
 from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 from appliance.ipsec.kit import Kit, archive
@@ -139,17 +138,17 @@ class _KitWriter:
         ports: str,
     ) -> None:
         if not _ENDPOINT.fullmatch(appliance):
-            raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
+            raise _usage_error(f"--appliance {appliance!r} is neither an address nor a name")
         self._endpoint = appliance
         self._path = out or Path(f"rosrv-{name.replace('/', '_')}.tar.gz")
         if self._path.exists():
-            raise usage_error(f"{self._path} is there already: remove it, or name another with --out")
+            raise _usage_error(f"{self._path} is there already: remove it, or name another with --out")
         first, _, last = ports.partition("-")
         try:
             self._ports = PortRange(int(first), int(last or first))
             self._open = parse_services(opened or [])
         except ValueError as error:
-            raise usage_error(str(error)) from None
+            raise _usage_error(str(error)) from None
         self._key: str | None = None
         if csr is None:
             key = make_key()
@@ -199,14 +198,20 @@ class _KitWriter:
 _SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
 
 
+def _usage_error(text: str) -> typer.Exit:
+    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    typer.echo(f"rosrv host: {text}", err=True)
+    return typer.Exit(2)
+
+
 def _read_request(path: Path) -> str:
     try:
         with path.open("rb") as file:
             return file.read(_LONGEST_REQUEST + 1).decode("ascii")
     except OSError as error:
-        raise usage_error(f"--csr {path}: {error.strerror}") from None
+        raise _usage_error(f"--csr {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise usage_error(f"--csr {path}: not a signing request in PEM") from None
+        raise _usage_error(f"--csr {path}: not a signing request in PEM") from None
 
 
 def _moment(seconds: float) -> str:

@@ -187,6 +187,7 @@ class Administration:
             "confirm_by": self._policies.confirm_by,
             "warnings": [str(one) for one in self._policies.current.warnings],
             "robot": [str(one) for one in self._policies.robot],
+            "hosts": {name: str(address) for name, address in self._policies.hosts.items()},
             "cases_file": str(self._policies.cases_file),
             **self._cases(),
         }

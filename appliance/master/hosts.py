@@ -96,7 +96,8 @@ class Hosts:
         self._link: Channel | None = None
         self._certificate: bytes | None = None
         self._dirty = asyncio.Event()
-        self._number = 0  # of the last statement
+        # Of the last statement: greater than any of an earlier life, which charon's process may still report.
+        self._number = time.time_ns()
         self._wake = asyncio.Event()
         self._taken_number = 0
         self.changed: Callable[[], int] = lambda: 0

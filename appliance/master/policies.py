@@ -210,6 +210,11 @@ class Policies:
         """What the group `robot` stands for."""
         return self._robot
 
+    @property
+    def hosts(self) -> Mapping[str, Address]:
+        """What `host:NAME` stands for."""
+        return self._hosts()
+
     # --- inside ---
 
     def _prepare(self, text: str, file: str) -> Policy:

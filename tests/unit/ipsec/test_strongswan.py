@@ -1,0 +1,58 @@
+"""Tests of what charon is told."""
+
+from pathlib import Path
+
+from appliance.ipsec.strongswan import (
+    ESP_PROPOSALS,
+    IKE_PROPOSALS,
+    Tunnel,
+    configuration,
+    connection,
+    host_of,
+    plugins,
+    pool,
+)
+
+TUNNEL = Tunnel("ocu-1", "10.113.11.2", "a1")
+
+
+def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
+    """The pool has one address; the selectors are it and the appliance's own."""
+    assert pool(TUNNEL) == {"host-ocu-1": {"addrs": "10.113.11.2-10.113.11.2"}}
+    made = connection(TUNNEL, address="10.113.11.1", certificate=b"C", authority=b"A")["host-ocu-1"]
+    assert made["pools"] == ["host-ocu-1"]
+    assert made["children"]["ros"]["local_ts"] == ["10.113.11.1/32"]
+    assert made["children"]["ros"]["remote_ts"] == ["dynamic"]
+
+
+def test_a_host_is_its_certificate() -> None:
+    """Its name in the certificate, of this authority, not revoked: without a valid list nobody comes in."""
+    remote = connection(TUNNEL, address="10.113.11.1", certificate=b"C", authority=b"A")["host-ocu-1"][
+        "remote"
+    ]
+    assert remote == {"auth": "pubkey", "cacerts": [b"A"], "id": "fqdn:ocu-1", "revocation": "strict"}
+
+
+def test_nothing_weak_is_offered() -> None:
+    """AES-256-GCM, SHA-384, Curve25519 or ECP-384."""
+    assert {proposal.rpartition("-")[0] for proposal in IKE_PROPOSALS} == {"aes256gcm16-prfsha384"}
+    assert {proposal.rpartition("-")[0] for proposal in ESP_PROPOSALS} == {"aes256gcm16"}
+    assert {proposal.rpartition("-")[2] for proposal in (*IKE_PROPOSALS, *ESP_PROPOSALS)} == {
+        "x25519",
+        "ecp384",
+    }
+
+
+def test_charon_loads_what_it_needs_and_runs_no_programs() -> None:
+    """ESP in user space comes before the kernel's where it is wanted; scripts and fetching are not there at all."""
+    in_user_space, in_kernel = plugins("user space").split(), plugins("kernel").split()
+    assert in_user_space.index("kernel-libipsec") < in_user_space.index("kernel-netlink")
+    assert "kernel-libipsec" not in in_kernel
+    assert not {"updown", "ext-auth", "curl", "stroke", "resolve"} & set(in_user_space)
+    assert "socket = unix:///state/ipsec/vici.sock" in configuration(Path("/state/ipsec"), "kernel")
+
+
+def test_a_connection_that_is_not_ours_is_nobodys() -> None:
+    """A handshake before it is known whose it is has no host."""
+    assert host_of("host-ocu-1") == "ocu-1"
+    assert host_of("(unnamed)") is None
