@@ -20,7 +20,7 @@ from appliance.ros.errors import LimitExceededError, PeerError
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
-_KEEP_AREA = 2 << 20
+_KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one costs four times the rest
 
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
