@@ -1,0 +1,192 @@
+"""Processes killed or stopped in the middle of their work, policies reloaded under load: nothing is lost or halved."""
+
+import contextlib
+import os
+import signal
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from appliance.channel.admin import PolicyReload
+from appliance.cli.running import ask
+from tests.support.field import Field, Impostor, answering
+from tests.support.processes import LIMIT
+
+POLICY = """\
+[Nodes]
+default = *
+[Publishers]
+default = *
+[Subscribers]
+default = *
+[Commands]
+default = *
+"""
+BURST = 60
+
+
+class Burst:
+    """A node after the other registers from the robot, each with a topic and a parameter, as fast as they are let."""
+
+    def __init__(self, field: Field, name: str, count: int = BURST) -> None:
+        self._field, self._name, self._count = field, name, count
+        self.node = Impostor(field.robot, answering([1, "", 4711]))
+        self.registered: list[str] = []
+        self.failed: list[Any] = []
+        self.half = threading.Event()
+        self._over = threading.Event()
+        self._threads = [
+            threading.Thread(
+                target=field.robot.run, args=(lambda start=start: self._register(start),), daemon=True
+            )
+            for start in range(4)
+        ]
+
+    def _register(self, start: int) -> None:
+        for number in range(start, self._count, 4):
+            name = f"{self._name}_{number}"
+            while not self._over.is_set():  # a cut connection is tried again, as the client libraries do
+                with contextlib.suppress(OSError, xmlrpc.client.ProtocolError):
+                    with xmlrpc.client.ServerProxy(self._field.master) as server:
+                        answer: Any = server.registerPublisher(
+                            name, f"/b{name}", "std_msgs/String", self.node.uri
+                        )
+                        server.setParam(name, f"/burst{name}", number)
+                    break
+            else:
+                return
+            (self.registered if answer[0] == 1 else self.failed).append(name if answer[0] == 1 else answer)
+            if len(self.registered) * 2 > self._count:
+                self.half.set()
+
+    def __enter__(self) -> "Burst":
+        for thread in self._threads:
+            thread.start()
+        assert self.half.wait(LIMIT)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self.finish()
+        self.node.__exit__(*exc)
+
+    def finish(self) -> None:
+        """Wait until all are through."""
+        for thread in self._threads:
+            thread.join(LIMIT)
+            assert not thread.is_alive()
+
+    def all_there(self, *, parameters: bool = True) -> None:
+        """Every node that was told that it is registered is registered, with its parameter; none was refused."""
+        assert not self.failed, self.failed[:3]
+        assert len(self.registered) == self._count
+        state = self._field.call(self._field.robot, "getSystemState", "/looker")[2]
+        publishers = dict(map(tuple, state[0]))
+        missing = [name for name in self.registered if publishers.get(f"/b{name}") != [name]]
+        assert not missing
+        if not parameters:
+            return
+        values = self._field.call(self._field.robot, "getParam", "/looker", "/burst")[2]
+        assert {f"/{key}" for key in values} >= set(self.registered)
+
+
+@pytest.fixture
+def working(battlefield: Field) -> Iterator[Field]:
+    """The field; afterwards messages flow again (some may have been lost meanwhile), and a new node joins."""
+    yield battlefield
+    battlefield.listener.wait_for(event="received", since=battlefield.listener.mark())
+    late = battlefield.ros.on(battlefield.ocu).listener("rospy", "/chatter")
+    late.wait_for(event="received", publisher="/voice")
+    late.stop()
+
+
+@pytest.mark.parametrize("role", ["control", "rosmaster", "relay"])
+def test_killed_in_a_burst_of_registrations(working: Field, role: str) -> None:
+    """`kill -9` in the middle of many registrations: each that was confirmed is there afterwards, and none fails."""
+    pid = working.appliance.pids(role)[0]
+    with Burst(working, f"/burst_{role}") as burst:
+        os.kill(pid, signal.SIGKILL)
+        burst.finish()
+        burst.all_there()
+
+
+def test_both_killed_at_once(working: Field) -> None:
+    """Control and ROSMaster die together: what was confirmed comes from disk."""
+    pids = [working.appliance.pids(role)[0] for role in ("rosmaster", "control")]
+    with Burst(working, "/burst_both") as burst:
+        for pid in pids:
+            os.kill(pid, signal.SIGKILL)
+        burst.finish()
+        burst.all_there(parameters=False)  # the last second of those is not on disk
+
+
+def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:
+    """A ROSMaster that does not move delays calls; none fails, and it is not killed for it."""
+    pid = working.appliance.pids("rosmaster")[0]
+    with Burst(working, "/burst_stopped") as burst:
+        os.kill(pid, signal.SIGSTOP)
+        working.listener.wait_for_count(
+            len(working.listener.seen(event="received")) + 150, event="received"
+        )  # three seconds of messages, which do not need it
+        os.kill(pid, signal.SIGCONT)
+        burst.finish()
+        burst.all_there()
+    assert working.appliance.pids("rosmaster") == [pid]
+
+
+def test_reloads_under_load(working: Field) -> None:
+    """Two hundred reloads, some broken, while nodes register: each call is decided by one whole policy."""
+    even = POLICY.replace("[Subscribers]", "[Subscribers]\n/even_topic = 10.77.0.66")
+    odd = POLICY.replace("[Publishers]", "[Publishers]\n/odd_topic = 10.77.0.66")
+    over = threading.Event()
+    odd_answers: list[Any] = []
+
+    def keep_asking() -> None:
+        while not over.is_set():
+            with contextlib.suppress(OSError), xmlrpc.client.ServerProxy(working.master) as server:
+                odd_answers.append(
+                    server.registerPublisher(
+                        "/odd_one", "/odd_topic", "std_msgs/String", "http://10.77.0.20:40404/"
+                    )
+                )
+                server.unregisterPublisher("/odd_one", "/odd_topic", "http://10.77.0.20:40404/")
+
+    asking = threading.Thread(target=working.ocu.run, args=(keep_asking,), daemon=True)
+    asking.start()
+    with Burst(working, "/burst_reload", 120) as burst:
+        for _ in range(67):
+            for text, fine in ((even, True), (odd, True), (odd + "nonsense\n[", False)):
+                working.appliance.policy_file.write_text(text)
+                answer = ask(working.appliance.state, PolicyReload())
+                assert answer.ok is fine, answer
+        burst.finish()
+        over.set()
+        asking.join(LIMIT)
+        burst.all_there()
+    granted = [one for one in odd_answers if one[0] == 1]
+    denied = [one for one in odd_answers if one[0] != 1]
+    assert granted
+    assert denied
+    assert all("[Publishers] /odd_topic" in one[1] for one in denied), denied[:3]
+    working.appliance.reload(POLICY)
+
+
+def test_the_whole_appliance_restarts(battlefield: Field) -> None:
+    """`rosrv up` again on the same state, nodes alive: they go on without being restarted, with their parameters."""
+    field = battlefield
+    heard = field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear")
+    heard.wait_for(event="received")
+    with Burst(field, "/burst_restart", 20) as burst:
+        burst.finish()
+        field.call(field.robot, "setParam", "/looker", "/kept/over", {"a": [1, 2.5, "x"]})
+        field.appliance.stop()
+        before = heard.mark()
+        field.appliance.start()
+        heard.wait_for(event="received", since=before)
+        burst.all_there()
+        assert field.call(field.robot, "getParam", "/looker", "/kept/over")[2] == {"a": [1, 2.5, "x"]}
+        nodes = field.ros.run("rosnode", "list").stdout.split()
+        assert {"/voice", "/ear", "/python_ear", "/burst_restart_0"} <= set(nodes)
