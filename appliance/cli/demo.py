@@ -2,7 +2,8 @@
 
 A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator,
 and an attacker. The operator drives and fires; the attacker tries what ROS 1 lets anybody do; for each
-the rule that decided is read from the audit log. The exit status says whether the robot did what its
+the rule that decided is read from the audit log. At last the operator himself makes a mistake that no policy can
+forbid, and a monitor keeps it from the robot. The exit status says whether the robot did what its
 operator wanted and nothing else: scripts can rely on it.
 """
 
@@ -90,6 +91,7 @@ class Show:
             self.refuse(self.stage.attack(name))
         self.shut_out(self.stage.attack(AROUND))
         self.aftermath(operator, before)
+        self.mistake(operator)
         self.summary()
         return all(result.good for result in self.results)
 
@@ -194,6 +196,31 @@ class Show:
         for result in results:
             self.say(f"{'' if result.good else 'NOT: '}{result.what}: {result.remark}")
         self.results += results
+
+    def mistake(self, operator: Actor) -> None:
+        """What a policy cannot forbid, for it is the operator who does it: a monitor can."""
+        self.headline("The operator makes a mistake: he fires while the gun points at the robot itself")
+        operator.stop()
+        self.stage.command("aim", "0", "-0.6")
+        self.fires("without a monitor the robot hits itself", hit=True)
+        self.stage.enable_monitor("safeTrigger")
+        self.say(f"rosrv monitor enable safeTrigger  ({self.stage.monitors / 'safe_triggering.rv'})")
+        self.fires("with the monitor it does not", hit=False)
+        dropped = self.stage.audit("--event", "message dropped", "--limit", "10")
+        mine = [one for one in dropped if one["detail"].get("monitor") == "safeTrigger"]
+        why = mine[0]["reason"] if mine else "missing"
+        self.say(f"audit record: {why}")
+        self.results.append(Result("audit record: the dropped trigger", bool(mine), why))
+        self.stage.command("aim", "0", "0.2")
+        self.fires("away from the robot it still fires", hit=True)
+
+    def fires(self, what: str, *, hit: bool) -> None:
+        """Pull the trigger; `hit`: a shot is to come."""
+        fired = self.stage.command("fire")
+        shots = fired["shots"] - fired["before"]
+        good = shots == (1 if hit else 0)
+        self.results.append(Result(what, good, f"{shots} shots"))
+        self.say(f"{'' if good else 'NOT: '}{what}: {'1 shot' if shots == 1 else f'{shots} shots'}")
 
     def summary(self) -> None:
         """How much of it was as it should be, and what was not."""

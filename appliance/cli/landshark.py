@@ -139,6 +139,7 @@ class Stage:
 
     def __init__(self, lab: Lab, examples: Path) -> None:
         self.nodes = examples / "landshark" / "nodes"
+        self.monitors = examples.parent / "monitors"
         self.policy = examples / "landshark" / "landshark-demo.ini"
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-demo-"))
         self.directory.chmod(0o755)  # the appliance's processes run as other users
@@ -157,6 +158,10 @@ class Stage:
             f"{APPLIANCE}:11311",
             "--policy",
             str(self.policy),
+            "--monitors",
+            str(self.monitors),
+            "--enable",
+            "none",
             "--state",
             str(self.state),
         ]
@@ -193,6 +198,23 @@ class Stage:
     def start_operator(self) -> Actor:
         """The operator control unit."""
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
+
+    def command(self, what: str, *values: str) -> Event:
+        """One command of the operator, once his unit has ended: what `command.py` says of it."""
+        program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
+        actor = self._start(self.operator_host, "ocu command", program)
+        said = actor.expect({"drive": "drove", "aim": "aimed", "fire": "fired"}[what])
+        actor.stop()
+        self.actors.remove(actor)
+        return said
+
+    def enable_monitor(self, name: str) -> None:
+        """`rosrv monitor enable NAME`, while the robot runs."""
+        command = [sys.executable, "-m", "appliance.cli.main", "monitor", "enable", name]
+        command += ["--state", str(self.state)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
+        if done.returncode:
+            raise DemoError(f"the monitor {name} cannot be enabled: {done.stderr.strip()}")
 
     def attack(self, name: str) -> Attack:
         """Have the attacker try one thing."""
