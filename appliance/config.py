@@ -202,6 +202,9 @@ class Settings(_Section):
     enable: str = Field(
         default="all", description="monitors enabled at start unless they were switched: all, none, or NAME,…"
     )
+    on_fault: Literal["drop", "pass"] = Field(
+        default="drop", description="what becomes of a message at which an action of a monitor faults"
+    )
     publish_as: Annotated[str, AfterValidator(_checked_name)] = Field(
         default="/rosrv", description="the node name under which monitors publish"
     )

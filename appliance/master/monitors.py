@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import structlog
 
@@ -73,11 +74,14 @@ class Monitors:
         enable: str,
         store: StateStore,
         recorder: Recorder,
+        *,
+        on_fault: Literal["drop", "pass"] = "drop",
     ) -> None:
         self.folder = folder
         self._enable = enable
         self._store = store
         self._recorder = recorder
+        self._on_fault: Literal["drop", "pass"] = on_fault
         self._switches: dict[str, bool] = {}
         self._answers: dict[int, asyncio.Future[list[str]]] = {}
         self._changing = asyncio.Lock()
@@ -305,6 +309,7 @@ class Monitors:
             self.sources.definitions,
             {name: self.enabled(name) for name in self.checked.monitors},
             restarted,
+            self._on_fault,
         )
 
     async def _change(self, sources: Sources, keeper: str, who: str, note: str) -> Replaced:
@@ -339,6 +344,7 @@ class Monitors:
             sources.definitions,
             {name: self.enabled(name) for name in checked.monitors},
             False,
+            self._on_fault,
         )
         try:
             if not self.send(statement):

@@ -139,6 +139,7 @@ class _Control:
             self._settings.enable,
             self._store,
             self._recorder,
+            on_fault=self._settings.on_fault,
         )
         self._monitors.start(restarted=restarted)
         self._make_parts(self._take_sockets())

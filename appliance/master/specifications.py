@@ -17,6 +17,7 @@ from appliance.rosmop.syntax.errors import SpecificationError
 
 _MOST_FILES = 1000
 _LONGEST_FILE = 1 << 20
+_LONGEST = 8 << 20  # all of them, definitions included: they travel in one message
 
 
 class SpecificationsRefusedError(Exception):
@@ -72,6 +73,10 @@ def check(sources: Sources) -> Checked:
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
+        )
+    if sum(map(len, [*sources.files.values(), *sources.definitions.values()])) > _LONGEST:
+        raise SpecificationsRefusedError(
+            [f"specifications and definitions are longer than {_LONGEST} characters"]
         )
     for name, text in sources.files.items():
         if len(text) > _LONGEST_FILE:

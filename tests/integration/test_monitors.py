@@ -339,3 +339,24 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
         assert monitor(appliance, "safeTrigger")["drops"] == 1
         dropped = appliance.audit(event="message dropped", resource="/landshark_control/trigger")
         assert dropped[0]["detail"]["monitor"] == "safeTrigger"
+
+
+def test_the_publisher_has_the_configured_name_and_is_hidden_and_faults_pass(
+    folder: Path, tmp_path: Path
+) -> None:
+    """`publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    divide = "if (heard == 2) { heard = heard / (heard - 2); }\n        text = "
+    (folder / "words.rv").write_text(WORDS.replace("text = ", divide, 1))
+    config = folder / "appliance.yaml"
+    config.write_text("publish_as: /guard\nhide_publisher: true\non_fault: pass\n")
+    options = ("--config", str(config), "--monitors", str(folder), "--api", "off")
+    with Appliance(options=options) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
+        alarm = ros.listener("rospy", "/alarm")
+        listener = ros.listener("rospy", "/chatter")
+        ros.talker("rospy", "/chatter", "--rate", "3")
+        assert alarm.wait_for(event="received")["publisher"] == "/guard"
+        heard = [event["data"] for event in listener.wait_for_count(3, event="received")]
+        assert [text.startswith("checked") for text in heard] == [True, False, True]
+        assert appliance.audit(event="monitor fault")[0]["detail"]["values"]["heard"] == 2
+        assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout

@@ -44,6 +44,8 @@ def test_demo() -> None:
         "refused   go past the master",
         "[Commands] default (landshark-demo.ini:",
         "allowed   watch the battery",
+        "without a monitor the robot hits itself: 1 shot",
+        "with the monitor it does not: 0 shots",
     ):
         assert line in said
     assert left_behind() == []
