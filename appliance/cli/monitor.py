@@ -21,7 +21,10 @@ from appliance.rosmop.logics.interface import CompiledProperty
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
 
-app = typer.Typer(help="Monitors: check specifications, try them on a recording, run them on the robot.", no_args_is_help=True)
+app = typer.Typer(
+    help="Monitors: check specifications, try them on a recording, run them on the robot.",
+    no_args_is_help=True,
+)
 
 _Files = Annotated[
     list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
