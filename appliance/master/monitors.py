@@ -120,8 +120,10 @@ class Monitors:
             elif sources.files or last is not None:
                 self._keep(sources, checked, who=_DISK, note="read at start")
         unknown = sorted(self._named() - self.checked.monitors.keys())
-        if unknown:
+        if unknown and self.who == _DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
+        if unknown:  # it was removed while the robot ran
+            _log.warning("--enable names monitors that are not loaded", monitors=unknown)
 
     # --- looking ---
 

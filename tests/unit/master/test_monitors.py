@@ -128,6 +128,16 @@ async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
     assert [fields["who"] for event, fields in desk.events if event == "monitor enabled"] == ["eve"]
 
 
+async def test_a_monitor_that_was_removed_while_the_robot_ran_does_not_keep_it_from_starting(
+    desk: Desk,
+) -> None:
+    """Though `--enable` still names it; nor does a crash of control."""
+    monitors = desk.monitors("a")
+    await monitors.remove(["a"], who="eve")
+    assert desk.monitors("a").names() == []
+    assert desk.monitors("a", restarted=True).names() == []
+
+
 async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) -> None:
     """The first relay of an appliance is not; nor is a control that finds its relay as it was."""
     (desk.folder / "b.rv").write_text(B)
