@@ -31,6 +31,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from appliance.network import links
 from appliance.network.endings import end_processes
@@ -38,11 +39,12 @@ from appliance.network.firewall.firewall import RuleStatus, statuses
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.rules import Chain, Family, Interface, PortRange, Rule, Verdict, family_of
 from appliance.network.forwarding import Forwarding
-from appliance.network.listeners import listening_ports
+from appliance.network.listeners import listening_ports, udp_ports_in_use
 from appliance.network.namespaces import Namespace, NetworkError, require_privileges
 
 INSIDE = "eth0"
 _CANDIDATES = 64
+_TUNNELS = (PortRange.one(500), PortRange.one(4500))  # IKE; ESP in UDP
 _POOL = ipaddress.IPv4Network("10.111.0.0/16")
 _POOL6 = ipaddress.IPv6Network("fd52:4f53:5256::/48")
 
@@ -101,6 +103,7 @@ class Isolation:
         self.ends: dict[Family, Ends] = {}
         self._backend = NftBackend(host)
         self._rules: tuple[Rule, ...] = ()
+        self._routers: tuple[Family, ...] = ()
         self._forwarding = Forwarding(host)
         self._lock: int | None = None
 
@@ -148,6 +151,20 @@ class Isolation:
             for chain in self._backend.foreign_forward_drops()
         )
 
+    def forward_tunnels(self) -> None:
+        """Forward IKE and ESP (UDP 500 and 4500) too from now on. Raises: NetworkError if the host uses them itself."""
+        rules = isolation_rules(self.settings, self.ends, self._routers, udp=_TUNNELS)
+        if rules == self._rules:
+            return
+        used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
+        if used:
+            raise NetworkError(
+                f"the host has a program of its own on UDP {', '.join(map(str, sorted(used)))}, where the appliance's"
+                " tunnels arrive: stop it (a strongSwan of the host?), or run the appliance in a container"
+            )
+        self._backend.install(rules)
+        self._rules = rules
+
     def put_rules_back(self) -> None:
         """Install the rules on the host again, when somebody took them away."""
         if self._rules:
@@ -169,6 +186,7 @@ class Isolation:
             if family == 4:  # so that packets the host sends from 127.0.0.1 may leave on this link
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
+        self._routers = routers
         self._rules = isolation_rules(settings, self.ends, routers)
         self._backend.install(self._rules)  # before forwarding is turned on
         self._forwarding.enable(tuple(self.ends))
@@ -263,9 +281,16 @@ class Isolation:
 
 
 def isolation_rules(
-    settings: IsolationSettings, ends: dict[Family, Ends], routers: tuple[Family, ...]
+    settings: IsolationSettings,
+    ends: dict[Family, Ends],
+    routers: tuple[Family, ...],
+    *,
+    udp: tuple[PortRange, ...] = (),
 ) -> tuple[Rule, ...]:
-    """Return the rules on the host; `routers` are the families for which the host was a router before."""
+    """Return the rules on the host; `routers` are the families for which the host was a router before.
+
+    `udp` are ports that are forwarded besides the TCP ports of the settings.
+    """
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
     rules = [
         Rule(
@@ -304,7 +329,8 @@ def isolation_rules(
                 )
             )
         rules.append(_loopback(family, inward))
-        rules += [_forward(ports, end, outward) for ports in settings.ports]
+        rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
+        rules += [_forward("UDP", ports, end, outward) for ports in udp]
         rules.append(
             Rule(
                 chain=Chain.SOURCE_NAT,
@@ -330,13 +356,14 @@ def _loopback(family: Family, inward: Interface) -> Rule:
     return Rule(chain=Chain.NAT, purpose="not from ::1", verdict=Verdict.RETURN, destination="::1")
 
 
-def _forward(ports: PortRange, end: Ends, outward: Interface) -> Rule:
+def _forward(protocol: Literal["TCP", "UDP"], ports: PortRange, end: Ends, outward: Interface) -> Rule:
     return Rule(
         chain=Chain.NAT,
-        purpose=f"TCP {ports} to the appliance, IPv{family_of(end.appliance)}",
+        purpose=f"{protocol} {ports} to the appliance, IPv{family_of(end.appliance)}",
         verdict=Verdict.DNAT,
         arrives_on=outward,
-        tcp_ports=ports,
+        tcp_ports=ports if protocol == "TCP" else None,
+        udp_ports=ports if protocol == "UDP" else None,
         local_destination=True,
         to=end.appliance,
     )

@@ -18,6 +18,17 @@ def listening_ports() -> set[int]:
     return {number for _, number in _listeners()}
 
 
+def udp_ports_in_use() -> set[int]:
+    """Return the UDP ports that someone has bound, on whatever address."""
+    found = set()
+    for name in ("udp", "udp6"):
+        table = Path("/proc/thread-self/net", name)
+        if table.exists():
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                found.add(int(line.split()[1].rpartition(":")[2], 16))
+    return found
+
+
 def _listeners() -> Iterator[tuple[str, int]]:
     for name in ("tcp", "tcp6"):
         table = Path("/proc/thread-self/net", name)

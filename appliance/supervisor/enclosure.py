@@ -78,7 +78,7 @@ class Enclosure:
         """
         raise NetworkError(
             f"isolation {self.kind} has no firewall that would keep tunnelled addresses from being forged:"
-            " use isolation container"
+            " use isolation netns or container"
         )
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
@@ -228,8 +228,10 @@ class InNamespace(Contained):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Not here: IKE and ESP (UDP) are not forwarded to the namespace."""
-        return Enclosure.open_tunnels(self, pool, address)
+        """As in a container; then IKE and ESP are forwarded to the namespace."""
+        esp = super().open_tunnels(pool, address)
+        self._isolation.forward_tunnels()
+        return esp
 
     def build(self) -> None:
         """Make the namespace, its way to the host's networks, and the firewall. Raises `StartError`."""
@@ -252,8 +254,12 @@ class InNamespace(Contained):
         return (*(ends.host for ends in self._isolation.ends.values()), *self._ports.api_networks)
 
     def route_to(self, host: str) -> str | None:
-        """The host's address by which the peer reaches it."""
-        ipaddress.ip_address(host)  # control says what it was told; only an address goes on from here
+        """The host's address by which the peer reaches it; a peer in a tunnel reaches the appliance itself."""
+        address = ipaddress.ip_address(
+            host
+        )  # control says what it was told; only an address goes on from here
+        if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
+            return None
         return self._isolation.host_address_for(host)
 
     def report(self) -> dict[str, Any]:

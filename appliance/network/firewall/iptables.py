@@ -91,13 +91,19 @@ def render_rule(rule: Rule) -> list[RenderedRule]:
 
 def _attributes(rule: Rule) -> tuple[tuple[str, str], ...]:
     given = {
-        "protocol": "tcp" if rule.tcp_ports is not None or rule.opening else None,
+        "protocol": _protocol(rule),
         "in_interface": _interface(rule.arrives_on),
         "out_interface": _interface(rule.leaves_on),
         "src": rule.source,
         "dst": rule.destination,
     }
     return tuple((name, value) for name, value in given.items() if value is not None)
+
+
+def _protocol(rule: Rule) -> str | None:
+    if rule.udp_ports is not None:
+        return "udp"
+    return "tcp" if rule.tcp_ports is not None or rule.opening else None
 
 
 def _matches(rule: Rule) -> tuple[Extension, ...]:
@@ -107,6 +113,8 @@ def _matches(rule: Rule) -> tuple[Extension, ...]:
     if rule.opening:
         tcp.append(("tcp-flags", ("SYN,ACK", "SYN")))
     matches: list[Extension] = [("tcp", tuple(tcp))] if tcp else []
+    if rule.udp_ports is not None:
+        matches.append(("udp", (("dport", str(rule.udp_ports).replace("-", ":")),)))
     if rule.uid is not None:
         matches.append(("owner", (("uid-owner", str(rule.uid)),)))
     if rule.clear_text:

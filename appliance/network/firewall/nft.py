@@ -104,6 +104,18 @@ def render_rule(rule: Rule) -> list[Json]:
     return [_body(rule, [_match(_meta("nfproto"), f"ipv{family}")], family) for family in rule.families()]
 
 
+def _transport(rule: Rule) -> list[Json]:
+    """The matches of a TCP or UDP header."""
+    expressions: list[Json] = []
+    for transport, ports in (("tcp", rule.tcp_ports), ("udp", rule.udp_ports)):
+        if ports is not None:
+            expressions.append(_match(_payload(transport, "dport"), _ports(ports)))
+    if rule.opening:
+        flags = {"&": [_payload("tcp", "flags"), {"|": ["syn", "ack"]}]}
+        expressions.append(_match(flags, "syn"))
+    return expressions
+
+
 def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
     protocol = "ip6" if family == 6 else "ip"
     expressions = list(head)
@@ -113,11 +125,7 @@ def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
     for field, network in (("saddr", rule.source), ("daddr", rule.destination)):
         if network is not None:
             expressions.append(_match(_payload(protocol, field), _network(network)))
-    if rule.tcp_ports is not None:
-        expressions.append(_match(_payload("tcp", "dport"), _ports(rule.tcp_ports)))
-    if rule.opening:
-        flags = {"&": [_payload("tcp", "flags"), {"|": ["syn", "ack"]}]}
-        expressions.append(_match(flags, "syn"))
+    expressions += _transport(rule)
     if rule.uid is not None:
         expressions.append(_match(_meta("skuid"), rule.uid))
     if rule.clear_text:

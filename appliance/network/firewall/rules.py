@@ -114,6 +114,7 @@ class Rule:
     source: str | None = None
     destination: str | None = None
     tcp_ports: PortRange | None = None
+    udp_ports: PortRange | None = None
     opening: bool = False  # a SYN without ACK
     uid: int | None = None  # the owner of the local socket; chain OUT only
     clear_text: bool = False  # did not come (OUT: does not leave) through IPsec
@@ -126,6 +127,8 @@ class Rule:
     def __post_init__(self) -> None:
         if self.verdict is Verdict.RESET and self.tcp_ports is None:
             raise ValueError(f"rule {self.purpose!r}: only TCP can be reset")
+        if self.udp_ports is not None and (self.tcp_ports is not None or self.opening):
+            raise ValueError(f"rule {self.purpose!r}: a packet is TCP or UDP, not both")
         if self.uid is not None and self.chain is not Chain.OUT:
             raise ValueError(f"rule {self.purpose!r}: a packet has an owner in {Chain.OUT} only")
         if (self.verdict is Verdict.DNAT) != (self.to is not None):
@@ -146,6 +149,7 @@ class Rule:
             "source": self.source,
             "destination": self.destination,
             "tcp": self.tcp_ports,
+            "udp": self.udp_ports,
             "uid": self.uid,
             "above": f"{self.above.per_second}/s" if self.above else None,
         }

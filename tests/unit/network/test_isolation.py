@@ -25,6 +25,18 @@ def test_each_range_is_forwarded_on_both_families() -> None:
     ]
 
 
+def test_tunnels_are_forwarded_when_they_are_asked_for() -> None:
+    """UDP ports come besides the TCP ports, for both families, and TCP of the same number is not forwarded."""
+    udp = (PortRange.one(500), PortRange.one(4500))
+    added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))
+    assert {(str(rule.udp_ports), rule.tcp_ports, rule.to) for rule in added} == {
+        ("500", None, "10.111.0.2"),
+        ("4500", None, "10.111.0.2"),
+        ("500", None, "fd52::2"),
+        ("4500", None, "fd52::2"),
+    }
+
+
 def test_a_host_that_routed_before_is_not_cut_off() -> None:
     """The refusal to route for others is left out for the families for which the host was a router."""
     purposes = [rule.purpose for rule in isolation_rules(SETTINGS, ENDS, (4,)) if rule.chain is Chain.FORWARD]

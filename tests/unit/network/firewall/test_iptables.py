@@ -56,3 +56,11 @@ def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
         assert rendered.family == 6
         assert rendered.attributes == (("src", "fd77::1"),)
         assert rendered.matches[0] == ("policy", (("dir", direction), ("pol", "none")))
+
+
+def test_ports_of_udp_are_matched_as_udp() -> None:
+    """The protocol and the match are those of UDP."""
+    rule = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP, udp_ports=PortRange(500, 501))
+    rendered = render_rule(rule)[0]
+    assert ("protocol", "udp") in rendered.attributes
+    assert rendered.matches[0] == ("udp", (("dport", "500:501"),))

@@ -160,3 +160,17 @@ def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
         (Verdict.RETURN, PortRange(50000, 50000)),
         (Verdict.RETURN, PortRange(40000, 40099)),
     ]
+
+
+def test_a_rule_is_for_tcp_or_for_udp() -> None:
+    """A packet cannot be both; a port of UDP is named in the words of the rule."""
+    with pytest.raises(ValueError, match="TCP or UDP"):
+        Rule(
+            chain=Chain.IN,
+            purpose="both",
+            verdict=Verdict.DROP,
+            tcp_ports=PortRange.one(500),
+            udp_ports=PortRange.one(500),
+        )
+    rule = Rule(chain=Chain.IN, purpose="one", verdict=Verdict.DROP, udp_ports=PortRange.one(500))
+    assert rule.describe() == "udp 500 -> DROP"

@@ -1,0 +1,48 @@
+"""A tunnel to an appliance in a namespace of its own on a bare host, which forwards IKE and ESP to it."""
+
+from pathlib import Path
+
+from appliance.network.lab import Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.requirements import need_root
+from tests.support.tunnels import JoinedHost, need_strongswan
+
+ROBOT, OCU, BARE = "10.89.0.10", "10.89.0.20", "10.89.0.2"
+POLICY = f"""\
+[Groups]
+trusted = host:ocu-1, {ROBOT}
+[Nodes]
+default = trusted
+[Publishers]
+default = trusted
+[Subscribers]
+default = trusted
+[Commands]
+default = trusted
+"""
+
+
+def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
+    """Nodes behind the tunnel and in clear text hear each other; what is told to the tunnelled one is in the tunnel."""
+    need_root()
+    need_strongswan()
+    with Lab("rosrv-ipsecn") as lab:
+        # A default route, as real hosts have one: it also leads to the virtual addresses, and must not be taken.
+        bare = lab.host("bare", f"{BARE}/24", gateway="10.89.0.1")
+        robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
+        with Appliance(bare, policy=POLICY, isolation="netns") as appliance:
+            kit = tmp_path / "kit.tar.gz"
+            appliance.rosrv("host", "add", "ocu-1", "--appliance", BARE, "--out", str(kit))
+            with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
+                joined.wait_until_up()
+                with (
+                    RosSession(f"http://{BARE}:11311", tmp_path, robot) as on_robot,
+                    RosSession(joined.master, tmp_path, joined) as on_ocu,
+                ):
+                    on_robot.talker("rospy", "/chatter", name="voice")
+                    on_ocu.listener("rospy", "/chatter", name="ear").wait_for(event="received")
+                    told = on_ocu.run("/usr/bin/rosnode", "info", "/voice", check=False).stdout
+                    assert "contacting node http://10.113.11.1:" in told
+            rules = [rule["purpose"] for rule in appliance.status()["firewall"]["forwarding"]]
+            assert "UDP 4500 to the appliance, IPv4" in rules
