@@ -37,7 +37,7 @@ class MonitorRecords:
 
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
-        detail: dict[str, Any] = {"monitor": event.monitor, **event.detail}
+        detail: dict[str, Any] = {"monitor": event.monitor}
         detail["happened"] = datetime.datetime.fromtimestamp(event.time / 1e9, datetime.UTC).isoformat()
         if event.kind == "log":
             severity = _LEVELS.get(str(event.detail.get("level")), severity)
@@ -51,5 +51,11 @@ class MonitorRecords:
             detail["count"] = event.count
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")
         self._recorder.happened(
-            name, text, severity=severity, category="monitor", resource=event.resource, **detail
+            name,
+            text,
+            severity=severity,
+            category="monitor",
+            resource=event.resource,
+            more=event.detail,
+            **detail,
         )

@@ -1,6 +1,7 @@
 """Makes audit records of what happens in control, and says when nothing may be answered because none can be made."""
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from appliance.audit.log import AuditLog
@@ -86,9 +87,10 @@ class Recorder:
         resource: str | None = None,
         rule: Rule | None = None,
         decision: str | None = None,
+        more: Mapping[str, Any] | None = None,
         **detail: Any,
     ) -> str:
-        """Record an event that is no decision; its id."""
+        """Record an event that is no decision; its id. `more` is detail whose names others choose."""
         record_id = self._ids.next()
         self._log.record(
             Record(
@@ -104,7 +106,7 @@ class Recorder:
                 rule=rule_reference(rule),
                 revision=self.revision,
                 reason=reason,
-                detail=detail,
+                detail={**(more or {}), **detail},
             )
         )
         return record_id
