@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from appliance.channel.admin import (
     MonitorLoad,
@@ -37,16 +37,18 @@ def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     if body["refused"]:
         say(f"the relay does not take them: {body['refused'][0]}", "red")
     table = Table(
-        "monitor", "state", "listens to", "events", "verdicts", "drops", "changes", "faults",
+        "monitor", "state", Column("listens to", overflow="fold"), "events", "verdicts", "drops", "changes", "faults",
         box=None, padding=(0, 2, 0, 0), header_style="dim",
     )  # fmt: skip
     for row in body["monitors"]:
         counts = [str(row[name]) for name in ("events", "verdicts", "drops", "changes", "faults")]
-        table.add_row(row["name"], _state(row), " ".join(row["topics"] + row["services"]), *counts)
+        table.add_row(row["name"], _state(row), "\n".join(row["topics"] + row["services"]), *counts)
     Console(highlight=False).print(table)
     source = f" ({body['folder']})" if body["folder"] else ""
     differs = (
-        "; not what the folder has: rosrv monitor reload takes it" if body["differs_from_folder"] else ""
+        "; not what the folder has: rosrv monitor reload takes it"
+        if body["folder"] and body["differs_from_folder"]
+        else ""
     )
     say(f"revision {body['revision']} of the specifications{source}, by {body['who']}{differs}")
 
