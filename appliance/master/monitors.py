@@ -94,7 +94,7 @@ class Monitors:
         self.refused: list[str] = []
         self.held: set[str] = set()
         self.rows: dict[str, messages.MonitorRow] = {}
-        self.records = MonitorRecords(recorder)
+        self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data))  # noqa: PLW0108 - of whatever is in force then
         self.send: Callable[[messages.Message], bool] = lambda message: False  # noqa: ARG005 - set when wired
         self.published: Callable[[], None] = lambda: None
 

@@ -2,6 +2,7 @@
 
 import datetime
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from appliance.audit.record import Severity
@@ -20,10 +21,18 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 
 class MonitorRecords:
-    """Makes records of reports; `counts` has how often each kind happened, by monitor."""
+    """Makes records of reports; `fields(topic, data)` reads a message.
 
-    def __init__(self, recorder: Recorder) -> None:
+    `counts` has how often each kind happened, by monitor.
+    """
+
+    def __init__(
+        self,
+        recorder: Recorder,
+        fields: Callable[[str, bytes], dict[str, Any] | None] = lambda _topic, _data: None,
+    ) -> None:
         self._recorder = recorder
+        self._fields = fields
         self.counts: Counter[tuple[str, str]] = Counter()
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
@@ -44,6 +53,9 @@ class MonitorRecords:
         for word, data in (("before", event.before), ("after", event.after)):
             if data:
                 detail[word] = data.hex()
+                read = self._fields(event.resource, data)
+                if read is not None:
+                    detail[f"{word}_fields"] = read
         if event.size:
             detail["size"] = event.size
         text = event.text

@@ -6,11 +6,13 @@ What is checked here is compiled again in the relay; nothing comes into force th
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
+from appliance.ros.reading import read_fields
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -56,6 +58,13 @@ class Checked:
     services: dict[str, frozenset[str]] = field(default_factory=dict)
     publications: dict[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    types: dict[str, str] = field(default_factory=dict)
+    definitions: Definitions = field(default_factory=lambda: Definitions({}))
+
+    def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
+        """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
+        name = self.types.get(topic)
+        return read_fields(self.definitions, name, data) if name is not None else None
 
     def of_topic(self, topic: str) -> bool:
         """Whether a monitor has an event on a topic."""
@@ -102,6 +111,8 @@ def check(sources: Sources) -> Checked:
         },
         dict(monitors.publications),
         tuple(str(one) for one in monitors.warnings),
+        dict(monitors.topics) | dict(monitors.publications),
+        definitions,
     )
 
 

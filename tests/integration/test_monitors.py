@@ -82,6 +82,7 @@ def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
     assert appliance.audit(event="message dropped", resource="/chatter")
     changed = appliance.audit(event="message changed", resource="/chatter")[0]
     assert bytes.fromhex(changed["detail"]["before"])[4:].startswith(b"good")
+    assert changed["detail"]["before_fields"]["data"].startswith("good")
     assert bytes.fromhex(changed["detail"]["after"])[4:].startswith(b"checked good")
     assert appliance.audit(event="monitor log")[0]["reason"] == "a bad word"
 
