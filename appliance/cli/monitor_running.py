@@ -20,6 +20,8 @@ from appliance.channel.admin import (
 from appliance.cli.policy_output import counted, say
 from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
 
+_WIDE = 200  # columns where nobody looks at them through a window
+
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
 
@@ -43,7 +45,7 @@ def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     for row in body["monitors"]:
         counts = [str(row[name]) for name in ("events", "verdicts", "drops", "changes", "faults")]
         table.add_row(row["name"], _state(row), "\n".join(row["topics"] + row["services"]), *counts)
-    Console(highlight=False).print(table)
+    Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
     source = f" ({body['folder']})" if body["folder"] else ""
     differs = (
         "; not what the folder has: rosrv monitor reload takes it"

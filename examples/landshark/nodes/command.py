@@ -2,7 +2,7 @@
 
 Speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON object, `drove` (with
 the position at the end), `aimed` (with the angle reached) or `fired` (with the number of shots so far). What is said
-once is latched, as `rostopic pub -1` does: a driver that connects a moment later hears it, too.
+once is latched for a while, as `rostopic pub -1` does: a driver or recorder that connects a moment later hears it, too.
 """
 
 import sys
@@ -19,6 +19,7 @@ from std_msgs.msg import UInt32
 HERTZ = 10
 SECONDS = 10.0  # a driver that is not there by then is not coming
 SETTLED = 1.0
+LATCHED = 1.5
 
 
 class Display:
@@ -101,6 +102,7 @@ def main():
         sys.exit("usage: command.py drive FORWARD TURN SECONDS | aim PAN TILT | fire")
     rospy.init_node("ocu")
     actions[what][0](*map(float, values))
+    rospy.sleep(LATCHED)
 
 
 if __name__ == "__main__":
