@@ -60,6 +60,7 @@ class Graph:
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         """A registration is gone at ROSMaster."""
         if not self._registry.unregister(incarnation, kind, resource):
+            self._registry.unshelve(incarnation, kind, resource)
             return
         self._relay.withdrawn(incarnation, kind, resource)
         if kind is Kind.PUBLICATION:
@@ -85,9 +86,16 @@ class Graph:
             rule=decision.rule,
         )
         self.unregistered(incarnation, registration.kind, registration.resource)
+        self._registry.shelve(incarnation, registration)
         if registration.kind is Kind.SUBSCRIPTION:
             # Neither client library drops a publisher for anything but a list without it.
             self._delivery.push(incarnation, NodeCall("publisherUpdate", (registration.resource, [])))
+
+    def granted_again(self, incarnation: Incarnation, registration: Registration) -> None:
+        """What the policy took back is at ROSMaster again."""
+        self.registered(incarnation, registration.kind, registration.resource, registration.detail)
+        if registration.kind is Kind.SUBSCRIPTION:
+            self.remind(incarnation, registration.resource)
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
         """Another incarnation took the name; ROSMaster tells the old one to shut down."""
@@ -169,6 +177,13 @@ class Graph:
     def remind(self, subscriber: Incarnation, topic: str) -> None:
         """Give a subscriber its list of a topic once more."""
         self._tell_one(subscriber, topic, always=True)
+
+    def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
+        """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""
+        gone = {one.outer_uri(subscriber.told) for one in absent}
+        without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
+        self._delivery.push(subscriber, NodeCall("publisherUpdate", (topic, list(without))))
+        self.remind(subscriber, topic)
 
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
         """The list that answers a registration: what the subscriber is told from here on is relative to it."""

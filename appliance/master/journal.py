@@ -6,6 +6,8 @@ from appliance.master.registry import Incarnation, Kind, Life, Registration, Reg
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
 
+_SHELVED = "revoked "  # before the kind of a registration that the policy took back
+
 
 class StoreJournal:
     """The registry's `Journal` on the state store."""
@@ -39,6 +41,17 @@ class StoreJournal:
         """A registration is gone."""
         self._store.remove_registration(key, kind.value, resource)
 
+    def registration_shelved(self, key: str, registration: Registration) -> None:
+        """A registration was taken back by the policy and is remembered."""
+        kind = f"{_SHELVED}{registration.kind.value}"
+        self._store.save_registration(
+            RegistrationRow(key, kind, registration.resource, registration.detail, registration.order)
+        )
+
+    def registration_unshelved(self, key: str, kind: Kind, resource: str) -> None:
+        """A registration that was taken back is remembered no longer."""
+        self._store.remove_registration(key, f"{_SHELVED}{kind.value}", resource)
+
 
 def restore(registry: Registry, store: StateStore) -> int:
     """Fill `registry` with what the store kept; the number of incarnations."""
@@ -62,10 +75,9 @@ def restore(registry: Registry, store: StateStore) -> int:
     for row in registrations:
         owner = by_key.get(row.key)
         if owner is not None:
-            kind = Kind(row.kind)
-            owner.registrations[kind, row.resource] = Registration(
-                kind, row.resource, row.detail, row.ordinal
-            )
+            kind = Kind(row.kind.removeprefix(_SHELVED))
+            place = owner.shelf if row.kind.startswith(_SHELVED) else owner.registrations
+            place[kind, row.resource] = Registration(kind, row.resource, row.detail, row.ordinal)
     for incarnation in by_key.values():
         registry.restore(incarnation)
     return len(by_key)

@@ -82,6 +82,7 @@ class Policies:
         self._current: Policy | None = None
         self._revert: asyncio.Task[None] | None = None
         self.confirm_by: float | None = None
+        self._back_to = 0  # the last revision that needed no confirmation
         self.revision = 0
         self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
         self.changed: Callable[[Policy], int] = lambda policy: 0  # noqa: ARG005 - set by control when it is wired
@@ -285,15 +286,17 @@ class Policies:
         return self.changed(policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
+        back_to = self._back_to if self.confirm_by is not None else before
         self._end_confirmation()
         if confirm_within is not None:
-            self._await_confirmation(before, time.time() + confirm_within)
+            self._await_confirmation(back_to, time.time() + confirm_within)
         return Loaded(self.revision, before, [str(one) for one in policy.warnings], revoked, self.confirm_by)
 
     # --- back by itself unless confirmed ---
 
     def _await_confirmation(self, back_to: int, deadline: float) -> None:
         self.confirm_by = deadline
+        self._back_to = back_to
         self._store.save_setting("confirm", f"{back_to} {deadline}")
         self._revert = asyncio.get_running_loop().create_task(self._go_back(back_to, deadline))
 

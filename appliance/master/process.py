@@ -8,6 +8,7 @@ import asyncio
 import os
 import re
 import socket
+import sys
 import uuid
 from pathlib import Path
 
@@ -70,6 +71,8 @@ _SAVE_SECONDS = 1.0
 def main(lifeline_fd: int, config_path: Path) -> None:
     """Run control until the supervisor stops it."""
     settings = load_resolved(config_path)
+    # The loop waits this long at most for a thread (audit log, store) that is in the middle of Python code.
+    sys.setswitchinterval(0.0005)
     uvloop.run(_Control(settings, lifeline_fd).run())
 
 
@@ -338,7 +341,7 @@ class _Control:
         self._pipeline = Pipeline(
             self._master, limits=self._limits, offload=int(settings.limits.offload_bytes)
         )
-        self._revocation = Revocation(self._master)
+        self._revocation = Revocation(self._master, put_back=self._reconciler.put_back)
         self._hosts.changed = self._policies.hosts_changed
         self._hosts.expel = self._revocation.expel
         self._policies.changed = lambda policy: self._policy_changed(policy.ports)

@@ -176,12 +176,11 @@ class Reconciler:
         }
 
     async def _inner_uris(self, nodes: set[str]) -> dict[str, str]:
-        uris = {}
-        for name in sorted(nodes):
-            answer = await self._rosmaster.call_now("lookupNode", _NAME, name)
-            if answer[0] == 1:
-                uris[name] = str(answer[2])
-        return uris
+        names = sorted(nodes)
+        answers = await asyncio.gather(
+            *(self._rosmaster.call_now("lookupNode", _NAME, name) for name in names)
+        )
+        return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
 
     async def _settle(self, kind: Kind, resource: str, name: str, inner: str | None) -> None:
         incarnation = self._faces.by_inner_uri(inner) if inner is not None else None

@@ -76,6 +76,7 @@ class Incarnation:
     changed: float = 0.0  # wall-clock seconds when `life` changed
     touched: float = 0.0  # monotonic seconds of its last registering call
     registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
+    shelf: dict[tuple[Kind, str], Registration] = field(default_factory=dict)  # what the policy took back
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
@@ -116,6 +117,12 @@ class Journal(Protocol):
 
     def registration_removed(self, key: str, kind: Kind, resource: str) -> None:
         """A registration is gone."""
+
+    def registration_shelved(self, key: str, registration: Registration) -> None:
+        """A registration was taken back by the policy and is remembered."""
+
+    def registration_unshelved(self, key: str, kind: Kind, resource: str) -> None:
+        """A registration that was taken back is remembered no longer."""
 
 
 class Registry:
@@ -224,7 +231,18 @@ class Registry:
             incarnation.registrations[kind, resource] = registration
             self._journal.registration_saved(incarnation.key, registration)
         self._index(incarnation, registration)
+        self.unshelve(incarnation, kind, resource)
         return registration
+
+    def shelve(self, incarnation: Incarnation, registration: Registration) -> None:
+        """Remember what the policy took back: should it be granted again, the node would not ask for it."""
+        incarnation.shelf[registration.kind, registration.resource] = registration
+        self._journal.registration_shelved(incarnation.key, registration)
+
+    def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        """It is registered again, or the node gave it up."""
+        if incarnation.shelf.pop((kind, resource), None) is not None:
+            self._journal.registration_unshelved(incarnation.key, kind, resource)
 
     def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         """Record that a registration is gone; whether there was one."""

@@ -2,7 +2,9 @@
 
 rospy forgets a connection that broke and opens another only for a list that arrives *after* it saw the break; a list
 that overtakes the break (the machine is busy, the relay hung before it died) changes nothing, and there would never
-be another. roscpp comes back by itself and takes a list it knows for no news, so reminding it costs nothing.
+be another. roscpp comes back by itself to a port that stayed open; where it was shut for a while (the whole appliance
+was restarted) it gives up, and takes a list it knows for no news. So who is still away after the first reminders is
+told to drop the publisher and to take it again.
 """
 
 import asyncio
@@ -11,6 +13,7 @@ from appliance.master.graph import Graph
 from appliance.master.registry import Incarnation, Kind, Registry
 from appliance.master.relays import RelayControl
 
+_GENTLE = 2  # reminders before the publisher is to be dropped and taken again
 _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look
 
 
@@ -34,19 +37,25 @@ class Reminders:
             self._round.cancel()
 
     async def _remind(self) -> None:
-        for pause in _PAUSES:
+        for number, pause in enumerate(_PAUSES):
             await asyncio.sleep(pause)
             absent = self.absent()
             if not absent:
                 return
-            for subscriber, topic in absent:
-                self._graph.remind(subscriber, topic)
+            for subscriber, topic, publishers in absent:
+                if number < _GENTLE:
+                    self._graph.remind(subscriber, topic)
+                else:
+                    self._graph.renew(subscriber, topic, publishers)
 
-    def absent(self) -> list[tuple[Incarnation, str]]:
-        """Subscribers, and their topics, that hold a grant and are not connected."""
-        found = {}
+    def absent(self) -> list[tuple[Incarnation, str, list[Incarnation]]]:
+        """Subscribers, topics, and the publishers they hold a grant for and are not connected to."""
+        found: dict[tuple[str, str], tuple[Incarnation, str, list[Incarnation]]] = {}
         for row in self._relay.unconnected():
+            publisher = self._registry.by_key(row.key)
             for subscriber in self._registry.registered(Kind.SUBSCRIPTION, row.resource):
-                if subscriber.name == row.caller_id and str(subscriber.host) == row.host:
-                    found[subscriber.key, row.resource] = subscriber
-        return [(subscriber, topic) for (_key, topic), subscriber in found.items()]
+                if publisher is None or (subscriber.name, str(subscriber.host)) != (row.caller_id, row.host):
+                    continue
+                entry = found.setdefault((subscriber.key, row.resource), (subscriber, row.resource, []))
+                entry[2].append(publisher)
+        return list(found.values())

@@ -1,7 +1,13 @@
-"""After a change of the policy, everything that is live is decided again; what is no longer allowed is taken back."""
+"""After a change of the policy, everything that is live is decided again.
+
+What is no longer allowed is taken back, and remembered: what is allowed again (a rollback, a change that was not
+confirmed in time) is put back, because a ROS 1 node never registers twice.
+"""
 
 import asyncio
 import ipaddress
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
 
 import structlog
 
@@ -23,11 +29,17 @@ _CATEGORIES = {
 
 
 class Revocation:
-    """Decides again what the registry and the relay's grants hold."""
+    """Decides again what the registry and the relay's grants hold. `put_back(…)` tells ROSMaster."""
 
-    def __init__(self, master: Master) -> None:
+    def __init__(
+        self,
+        master: Master,
+        *,
+        put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+    ) -> None:
         self._master = master
-        self._telling: set[asyncio.Task[None]] = set()
+        self._put_back = put_back
+        self._last: asyncio.Task[None] | None = None
 
     def redecide(self) -> int:
         """Take back what the running policy no longer allows; how much that was."""
@@ -44,6 +56,7 @@ class Revocation:
                 self._master.relay.revoke(row)
                 self._record(row, decision)
                 count += 1
+        self._grant_again()
         return count
 
     def expel(self, host: Address, reason: str) -> int:
@@ -60,6 +73,21 @@ class Revocation:
                 self._record(row, decision)
                 count += 1
         return count
+
+    def _grant_again(self) -> None:
+        """Put back what an earlier policy took from running nodes and this one grants: they never register twice."""
+        registry = self._master.registry
+        for incarnation in registry.live():
+            if registry.holder(incarnation.name) not in (None, incarnation):
+                continue
+            back = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
+            if back:
+                self._in_background(self._put_back_now(incarnation, sorted(back, key=lambda one: one.order)))
+
+    async def _put_back_now(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
+        await self._told(self._put_back(incarnation, registrations), incarnation)
+        for registration in registrations:
+            self._master.graph.granted_again(incarnation, registration)
 
     def _decide(self, incarnation: Incarnation, registration: Registration) -> Decision:
         if incarnation.own:
@@ -88,17 +116,28 @@ class Revocation:
         return decision
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
-        async def tell() -> None:
-            try:
-                await withdraw(self._master, incarnation, registration.kind, registration.resource)
-            except CallFailedError as error:
-                _log.warning(
-                    "ROSMaster was not told", node=incarnation.name, error=str(error)
-                )  # reconcile will
+        self._in_background(
+            self._told(
+                withdraw(self._master, incarnation, registration.kind, registration.resource), incarnation
+            )
+        )
 
-        task = asyncio.get_running_loop().create_task(tell())
-        self._telling.add(task)
-        task.add_done_callback(self._telling.discard)
+    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        """After what is under way: ROSMaster hears of changes in the order they were made."""
+        before = self._last
+
+        async def in_turn() -> None:
+            if before is not None:
+                await asyncio.wait([before])
+            await work
+
+        self._last = asyncio.get_running_loop().create_task(in_turn())
+
+    async def _told(self, telling: Awaitable[None], incarnation: Incarnation) -> None:
+        try:
+            await telling
+        except CallFailedError as error:
+            _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
 
     def _record(self, row: PermissionRow, decision: Decision) -> None:
         self._master.recorder.happened(

@@ -177,16 +177,21 @@ def test_reloads_under_load(working: Field) -> None:
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:
     """`rosrv up` again on the same state, nodes alive: they go on without being restarted, with their parameters."""
     field = battlefield
-    heard = field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear")
-    heard.wait_for(event="received")
+    ears = [
+        field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear"),
+        field.ros.on(field.ocu).listener("roscpp", "/chatter", name="cpp_ear"),
+    ]
+    for heard in ears:
+        heard.wait_for(event="received")
     with Burst(field, "/burst_restart", 20) as burst:
         burst.finish()
         field.call(field.robot, "setParam", "/looker", "/kept/over", {"a": [1, 2.5, "x"]})
         field.appliance.stop()
-        before = heard.mark()
+        before = [heard.mark() for heard in ears]
         field.appliance.start()
-        heard.wait_for(event="received", since=before)
+        for heard, mark in zip(ears, before, strict=True):
+            heard.wait_for(event="received", since=mark)
         burst.all_there()
         assert field.call(field.robot, "getParam", "/looker", "/kept/over")[2] == {"a": [1, 2.5, "x"]}
         nodes = field.ros.run("rosnode", "list").stdout.split()
-        assert {"/voice", "/ear", "/python_ear", "/burst_restart_0"} <= set(nodes)
+        assert {"/voice", "/ear", "/python_ear", "/cpp_ear", "/burst_restart_0"} <= set(nodes)

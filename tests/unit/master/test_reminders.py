@@ -28,6 +28,7 @@ class Told:
     def __init__(self, row: PermissionRow, absent_for: int) -> None:
         self.row, self.absent_for = row, absent_for
         self.reminded: list[tuple[str, str]] = []
+        self.renewed: list[tuple[str, str, list[str]]] = []
 
     def unconnected(self) -> list[PermissionRow]:
         """As `RelayControl`."""
@@ -38,24 +39,31 @@ class Told:
         """As `Graph`."""
         self.reminded.append((subscriber.name, topic))
 
+    def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
+        """As `Graph`."""
+        self.renewed.append((subscriber.name, topic, [one.key for one in absent]))
 
-def subscriber(registry: Registry, name: str) -> Incarnation:
-    """A live subscriber of /chatter."""
+
+def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
+    """A live subscriber or publisher of /chatter."""
     uri = "http://10.0.0.5:4000/"
     node = Incarnation(f"key of {name}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
     registry.add(node)
-    registry.register(node, Kind.SUBSCRIPTION, "/chatter", "std_msgs/String")
+    registry.register(node, kind, "/chatter", "std_msgs/String")
     return node
 
 
-@pytest.mark.parametrize(("absent_for", "times"), [(0, 0), (2, 2), (99, 8)])
-def test_reminded_until_back(monkeypatch: pytest.MonkeyPatch, absent_for: int, times: int) -> None:
-    """Nobody is told who is back, the others at each look, and nobody for ever."""
+@pytest.mark.parametrize(("absent_for", "reminded", "renewed"), [(0, 0, 0), (2, 2, 0), (99, 2, 6)])
+def test_reminded_until_back(
+    monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
+) -> None:
+    """Nobody is told who is back; who stays away is told to take the publisher anew, and nobody for ever."""
     monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
     registry = Registry(NoJournal())
-    subscriber(registry, "/ear")
-    subscriber(registry, "/other")
-    told = Told(PermissionRow("key of a publisher", "topic", "/chatter", str(HOST), "/ear"), absent_for)
+    node(registry, "/ear", Kind.SUBSCRIPTION)
+    node(registry, "/other", Kind.SUBSCRIPTION)
+    node(registry, "/mouth", Kind.PUBLICATION)
+    told = Told(PermissionRow("key of /mouth", "topic", "/chatter", str(HOST), "/ear"), absent_for)
 
     async def run() -> None:
         looks = Reminders(registry, cast(Any, told), cast(Any, told))
@@ -64,4 +72,5 @@ def test_reminded_until_back(monkeypatch: pytest.MonkeyPatch, absent_for: int, t
         await looks._round
 
     asyncio.run(run())
-    assert told.reminded == [("/ear", "/chatter")] * times
+    assert told.reminded == [("/ear", "/chatter")] * reminded
+    assert told.renewed == [("/ear", "/chatter", ["key of /mouth"])] * renewed

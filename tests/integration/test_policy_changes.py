@@ -1,0 +1,58 @@
+"""The policy changes while a robot works: what is taken back stops at once, what is granted again goes on by itself."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.requirements import needs
+
+NO_CHATTER = OPEN_POLICY.replace("[Subscribers]", "/chatter =\n[Subscribers]", 1)
+NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
+
+
+@pytest.fixture
+def ros(appliance: Appliance, robot: Host, tmp_path: Path) -> Iterator[RosSession]:
+    """The robot's nodes behind the appliance."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with RosSession(appliance.master_uri, tmp_path, robot) as session:
+        yield session
+
+
+@pytest.mark.parametrize("without", [NO_CHATTER, NO_EARS], ids=["publication", "subscription"])
+@pytest.mark.parametrize("client", ["rospy", "roscpp"])
+def test_a_rollback_gives_running_nodes_back_what_a_bad_policy_took(
+    appliance: Appliance, ros: RosSession, client: Client, without: str
+) -> None:
+    """Messages stop with the bad revision and come again with the rollback; no node is started again."""
+    listener = ros.listener(client, "/chatter")
+    ros.talker(client, "/chatter", name="voice")
+    listener.wait_for(event="received")
+    appliance.reload(without)
+    revoked = appliance.audit("--event", "revoked")
+    assert {record["resource"] for record in revoked} == {"/chatter"}
+    assert all(record["rule"]["key"] == "/chatter" for record in revoked)
+    assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0] or (
+        without is NO_EARS
+    )
+    appliance.rosrv("policy", "rollback")
+    after = listener.mark()
+    listener.wait_for(event="received", publisher="/voice", since=after)
+
+
+@pytest.mark.parametrize("client", ["rospy", "roscpp"])
+def test_what_was_taken_is_remembered_over_a_crash_of_control(
+    appliance: Appliance, ros: RosSession, client: Client
+) -> None:
+    """Control is killed between the bad revision and the rollback: it makes no difference."""
+    listener = ros.listener(client, "/chatter")
+    ros.talker(client, "/chatter", name="voice")
+    listener.wait_for(event="received")
+    appliance.reload(NO_CHATTER)
+    appliance.kill("control")
+    appliance.rosrv("policy", "rollback")
+    after = listener.mark()
+    listener.wait_for(event="received", publisher="/voice", since=after)
