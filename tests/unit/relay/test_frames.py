@@ -109,12 +109,13 @@ def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None
     assert budget.used == 0
 
 
-def test_a_kept_large_frame_is_not_overwritten_by_the_next() -> None:
-    """A queue that holds a frame keeps its bytes, whatever comes after."""
-    one, _budget = receiver()
+@pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 9 << 20])
+def test_a_kept_large_frame_is_not_overwritten_by_the_next(size: int) -> None:
+    """A queue that holds a frame keeps its bytes, whatever comes after; also beyond the areas that are kept."""
+    one, _budget = receiver(limit=16 << 20)
     kept = []
     for fill in (1, 2, 3):
-        data, position = frame(2 * LARGE, fill), 0
+        data, position = frame(size, fill), 0
         while position < len(data):
             buffer = one.buffer()
             count = min(len(buffer), len(data) - position)
