@@ -102,7 +102,10 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
     def value(one: Result) -> float:
         return one.p50 if mode == "paced" else one.rate
 
-    ratio = statistics.median(value(one) / value(other) for one, other in zip(runs, base, strict=True))
+    ratio = statistics.median(
+        value(one) / value(other) if value(other) else float("nan")
+        for one, other in zip(runs, base, strict=True)
+    )
     loss = statistics.median(one.loss for one in runs)
     cpu = statistics.median(one.cpu for one in runs)
     text = f"{statistics.median(map(value, runs)):,.0f} x{ratio:.2f}"

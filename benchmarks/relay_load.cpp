@@ -216,7 +216,7 @@ int main(int argc, char** argv) try {
   std::sort(load.delays.begin(), load.delays.end());
   const auto delay = [&](double part) { return load.delays.empty() ? 0.0 : load.delays[size_t(part * (load.delays.size() - 1))] / 1e3; };
   std::printf("{\"messages_per_s\": %.0f, \"sent\": %llu, \"lost\": %llu, \"disordered\": %llu, \"p50_us\": %.1f, \"p99_us\": %.1f}\n",
-              load.received / ((load.last - load.first) / 1e9), (unsigned long long)load.sent,
+              load.last > load.first ? load.received / ((load.last - load.first) / 1e9) : 0.0, (unsigned long long)load.sent,
               (unsigned long long)(load.sent - load.received), (unsigned long long)load.disordered, delay(.5), delay(.99));
 } catch (const std::exception& error) {
   std::cerr << "relay_load: " << error.what() << std::endl;
