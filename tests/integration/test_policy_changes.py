@@ -1,6 +1,8 @@
 """The policy changes while a robot works: what is taken back stops at once, what is granted again goes on by itself."""
 
-from collections.abc import Iterator
+import signal
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -56,3 +58,22 @@ def test_what_was_taken_is_remembered_over_a_crash_of_control(
     appliance.rosrv("policy", "rollback")
     after = listener.mark()
     listener.wait_for(event="received", publisher="/voice", since=after)
+
+
+def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
+    """As `rosrv policy reload` does; a file with errors changes nothing, and the log says what is wrong."""
+    assert appliance.process is not None
+    appliance.policy_file.write_text(NO_CHATTER)
+    appliance.process.popen.send_signal(signal.SIGHUP)
+    wait_until(lambda: appliance.status()["policy"]["revision"] == 2)
+    appliance.policy_file.write_text("[Nonsense]\n")
+    appliance.process.popen.send_signal(signal.SIGHUP)
+    wait_until(lambda: appliance.audit("--event", "policy refused"))
+    assert appliance.status()["policy"]["revision"] == 2
+
+
+def wait_until(happened: Callable[[], object]) -> None:
+    """Wait for something that the appliance does on its own, at most a minute."""
+    deadline = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < deadline, "it did not happen"

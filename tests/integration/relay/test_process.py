@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import NodePlaced, NodeWithdrawn, StateEnded
+from appliance.relay.limits import Limits
 from tests.support.relay_driver import LOOPBACK, RelayProcess
 
 
@@ -31,7 +32,7 @@ def test_it_says_that_it_is_ready_and_how_it_sends(relay: RelayProcess) -> None:
     """The status shows which congestion control it got and how many connections it may have."""
     assert relay.ready.detail["index"] == 0
     assert relay.ready.detail["congestion"].startswith(("cubic", "bbr", "reno"))
-    assert relay.ready.detail["connections"] == 4096
+    assert relay.ready.detail["connections"] == Limits().connections
 
 
 def test_it_answers_pings_from_its_main_loop(relay: RelayProcess) -> None:

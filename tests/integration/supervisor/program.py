@@ -45,7 +45,7 @@ def main() -> None:
             continue
         role, _, entry = one.partition("=")
         actors[role] = entry
-    settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0, api="off")
+    settings = Settings(state=state, listen="127.0.0.1:0", rosmaster_port=0, api="off", isolation="none")
     try:
         run.run_appliance(
             settings,

@@ -23,6 +23,7 @@ from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
+PLACE = ("--listen", "127.0.0.1:0", "--rosmaster-port", "0", "--isolation", "none")
 POLICY = (
     "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Subscribers]\ndefault = *\n[Commands]\ndefault = *\n"
 )
@@ -43,7 +44,7 @@ def directory() -> Iterator[Path]:
 def command(directory: Path, *more: str) -> list[str]:
     """`rosrv up` on free loopback ports."""
     fixed = ["--state", str(directory / "state"), "--policy", str(directory / "policy.ini")]
-    return [ROSRV, "up", *fixed, "--listen", "127.0.0.1:0", "--rosmaster-port", "0", *more]
+    return [ROSRV, "up", *fixed, *PLACE, *more]  # of a flag given twice the second counts
 
 
 @contextlib.contextmanager
@@ -94,7 +95,7 @@ def test_a_person_gets_a_sentence(directory: Path) -> None:
     assert str(directory / "state") in line
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_it_ends_cleanly_in_time(directory: Path, number: signal.Signals) -> None:
     """Exit status 0 within five seconds, and the next start on the same state is served."""
     with up(directory, "--json") as running:
