@@ -15,6 +15,7 @@ from appliance.cli.policy_input import (
     compile_file,
     find_host,
     read_text,
+    registrations_now,
     requests_of_audit_log,
     requests_of_file,
     usage_error,
@@ -228,6 +229,7 @@ def _requests(file: Path | None, state: Path | None) -> Iterator[Request]:
         yield from requests_of_file(file)
     if state is not None and file is None:
         yield from requests_of_audit_log(state)
+        yield from registrations_now(state)
 
 
 def _difference_lines(difference: Difference) -> Iterator[str]:

@@ -11,6 +11,8 @@ import typer
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import export
+from appliance.channel.admin import RegistrationsWanted
+from appliance.cli.running import NotRunningError, ask
 from appliance.policy import Address, Category, Policy, Request, compile_policy
 from appliance.policy.actions import find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
@@ -87,6 +89,16 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
     """A request from the strings it was written as; raises ValueError."""
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
+
+
+def registrations_now(state: Path) -> Iterator[Request]:
+    """What is registered at the running appliance; nothing when none runs with this state directory."""
+    try:
+        answer = ask(state, RegistrationsWanted())
+    except NotRunningError:
+        return
+    for row in answer.body.get("registrations", ()):
+        yield request_of(row["host"], row["caller_id"], row["category"], row["resource"])
 
 
 def requests_of_audit_log(state: Path) -> Iterator[Request]:

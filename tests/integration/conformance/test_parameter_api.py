@@ -39,7 +39,7 @@ def compare(both: BothMasters, *steps: Step) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    "value", VALUES, ids=lambda value: "binary" if isinstance(value, Binary) else str(value)
+    "value", VALUES, ids=[f"{type(value).__name__} {number}" for number, value in enumerate(VALUES)]
 )
 def test_value(both: BothMasters, value: Any) -> None:
     """Every kind of value is kept and comes back as it was, by itself and within its tree."""
