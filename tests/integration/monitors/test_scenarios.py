@@ -189,7 +189,7 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
     for tilt, shots in ((0.2, 1), (-0.7, 1), (0.3, 2)):
         assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
         assert told(robot, "fire")["shots"] == shots
-    [dropped] = appliance.audit(event="message dropped", resource=TRIGGERED)
+    [dropped] = appliance.audit("--event", "message dropped", resource=TRIGGERED)
     assert "safeTrigger" in json.dumps(dropped)
 
 
@@ -203,4 +203,21 @@ def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot
     assert again["x"] < 6.9
     back = told(robot, "drive", "-1.0", "0", "1")
     assert back["x"] < again["x"]
-    assert appliance.audit(event="message changed", resource=VELOCITY)
+    assert appliance.audit("--event", "message changed", resource=VELOCITY)
+
+
+def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path: Path) -> None:
+    """The tutorial's lock, loaded while the robot runs: warned, locked, and every verdict in the audit log."""
+    page = (ROOT / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
+    text = page.rpartition("```cpp\n")[2].partition("```")[0]
+    (tmp_path / "gun.rv").write_text(text)
+    appliance.rosrv("monitor", "load", str(tmp_path / "gun.rv"), "--msg", str(MONITORS / "msg"))
+    told(robot, "aim", "0", "-0.7")
+    shots = [told(robot, "fire")["shots"] for _ in range(2)]
+    told(robot, "aim", "0", "0.3")
+    shots.append(told(robot, "fire")["shots"])
+    assert len(set(shots)) == 1
+    verdicts = appliance.audit("--event", "monitor verdict")
+    assert [one["detail"]["category"] for one in reversed(verdicts)] == ["warned", "locked", "locked"]
+    appliance.rosrv("monitor", "remove", "gun.rv")
+    assert told(robot, "fire")["shots"] == shots[0] + 1
