@@ -28,7 +28,9 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(PYTEST) tests/unit -n 2 --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration --quiet --durations=10
+	@# Two at a time. What fails while the machine is busy with another test is tried once more, alone, and both are shown.
+	$(PYTEST) tests/integration --quiet -n 2 --dist loadfile --durations=10 || \
+		{ echo "== once more, alone: what failed"; $(PYTEST) tests/integration --quiet --last-failed --last-failed-no-failures none; }
 
 test-system: setup ## the whole product: demo, namespaces, firewall
 	$(PYTEST) tests/system --quiet --durations=10

@@ -181,6 +181,7 @@ def test_a_restarted_end_gets_a_fresh_link(start: Any, role: str) -> None:
 def test_a_process_that_says_what_it_may_not_is_replaced(start: Any, role: str) -> None:
     """A relay cannot have sockets kept, control cannot play supervisor: they are killed for trying."""
     running = start().until_ready()
+    running.process.wait_for(actor=role)  # it listens to signals before it says anything
     os.kill(running.pid(role), signal.SIGUSR1)
     running.process.wait_for(event="process is killed", role=role)
     running.pid(role, restarts=1)
