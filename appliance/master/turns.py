@@ -44,22 +44,27 @@ class Turns:
         self._taken[host] -= 1
         if not self._taken[host]:
             del self._taken[host]
-        following = next((one for one in self._waiting if self._taken[one] < self._per_host), None)
-        if following is None:
-            return
-        queue = self._waiting.pop(following)
-        turn = queue.popleft()
-        if queue:
-            self._waiting[following] = queue  # to the end of the line: its next request waits a round
-        self._take(following)
-        turn.set_result(None)
+        while (following := self._next()) is not None:
+            queue = self._waiting.pop(following)
+            turn = queue.popleft()
+            if queue:
+                self._waiting[following] = queue  # to the end of the line: its next request waits a round
+            if not turn.done():  # else its task was cancelled, and has not run since to give up its place
+                self._take(following)
+                turn.set_result(None)
+                return
+
+    def _next(self) -> Address | None:
+        return next((one for one in self._waiting if self._taken[one] < self._per_host), None)
 
     def _take(self, host: Address) -> None:
         self._free -= 1
         self._taken[host] += 1
 
     def _give_up(self, host: Address, turn: asyncio.Future[None]) -> None:
-        queue = self._waiting[host]
+        queue = self._waiting.get(host)
+        if queue is None or turn not in queue:
+            return
         queue.remove(turn)
         if not queue:
             del self._waiting[host]

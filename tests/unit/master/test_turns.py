@@ -77,3 +77,22 @@ def test_turns_balance() -> None:
         assert (turns._free, dict(turns._taken), dict(turns._waiting)) == (3, {}, {})
 
     asyncio.run(test())
+
+
+def test_who_was_cancelled_and_has_not_run_since_gets_no_turn() -> None:
+    """A peer goes in the very moment in which a slot is free: the slot goes to the next, and is not lost."""
+
+    async def test() -> None:
+        turns = Turns(1, 1)
+        await turns.enter(HOST)
+        gone, following = (asyncio.create_task(turns.enter(HOST)) for _ in range(2))
+        await asyncio.sleep(0)
+        gone.cancel()
+        turns.leave(HOST)
+        async with asyncio.timeout(WAIT):
+            await following
+        turns.leave(HOST)
+        assert gone.cancelled()
+        assert (turns._free, dict(turns._taken), dict(turns._waiting)) == (1, {}, {})
+
+    asyncio.run(test())
