@@ -18,7 +18,7 @@ import msgspec
 from appliance.store.ahead import Parameters, WriteAhead
 
 _GROUP = 2_000
-_GATHER_SECONDS = 0.002  # a statement that nobody awaits waits this long for company
+_GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for company: it is safe in `ahead`
 
 
 class _Queued(NamedTuple):
