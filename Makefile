@@ -33,7 +33,8 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 		{ echo "== once more, alone: what failed"; $(PYTEST) tests/integration --quiet --last-failed --last-failed-no-failures none; }
 
 test-system: setup ## the whole product: demo, namespaces, firewall
-	$(PYTEST) tests/system --quiet --durations=10
+	$(PYTEST) tests/system --quiet --durations=10 || \
+		{ echo "== once more: what failed"; $(PYTEST) tests/system --quiet --last-failed --last-failed-no-failures none; }
 
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done

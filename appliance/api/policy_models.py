@@ -92,7 +92,7 @@ class Loaded(Model):
 class Rollback(Model):
     """Where to go back to; null: the revision before the present one."""
 
-    revision: int | None = Field(default=None, ge=1, le=LONGEST_REVISION)
+    revision: int | None = Field(default=None, ge=1, le=LONGEST_REVISION, strict=True)
 
 
 class Confirmed(Model):
