@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 
 from appliance.rosmop.compile import calls, initializers, members, operators, storing, vector_members
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
-from appliance.rosmop.compile.library import CONSTANTS
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
+from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compile import conversion, cursors, library, members, operators, output, storing
+from appliance.rosmop.compile import conversion, cursors, members, operators, output, provided, storing
 from appliance.rosmop.compile.events import EventCode, compile_event
 from appliance.rosmop.compile.functions import (
     compile_function,
@@ -113,7 +113,7 @@ def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None
         storing.FUNCTIONS,
         operators.FUNCTIONS,
         members.FUNCTIONS,
-        library.FUNCTIONS,
+        provided.FUNCTIONS,
         output.FUNCTIONS,
         cursors.FUNCTIONS,
     ):
