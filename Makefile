@@ -32,7 +32,8 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 	$(PYTEST) tests/integration --quiet -n 2 --dist loadfile --durations=10 || \
 		{ echo "== once more, alone: what failed"; $(PYTEST) tests/integration --quiet --last-failed --last-failed-no-failures none; }
 
-test-system: setup ## the whole product: demo, namespaces, firewall
+test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
+	@scripts/setup --system
 	$(PYTEST) tests/system --quiet --durations=10 || \
 		{ echo "== once more: what failed"; $(PYTEST) tests/system --quiet --last-failed --last-failed-no-failures none; }
 
