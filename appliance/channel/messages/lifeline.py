@@ -1,0 +1,140 @@
+"""The lifeline: supervisor <-> any child."""
+
+from typing import Any, ClassVar
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+from appliance.channel.messages.signer import SignatureMade, SignatureWanted
+from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
+
+
+class Ping(Message):
+    """Supervisor asks a child whether it is alive; unanswered for 5 s, the child is killed and restarted."""
+
+    number: int
+
+
+class Pong(Message):
+    """A child's answer to `Ping`, sent from its main loop."""
+
+    number: int
+
+
+class Stop(Message):
+    """Supervisor asks a child to end cleanly; it has 3 s."""
+
+
+class Ready(Message):
+    """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports).
+
+    Control's `detail` has `master` (the URI nodes are told), `revision` (of the policy), `rosout_master` (the URI
+    of the loopback listener for the appliance's own nodes), `inner_port` (of the inner faces) and `token` (the
+    first access token of REST, if it was made at this start).
+    """
+
+    detail: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class Failed(Message):
+    """A child cannot serve and says why; the supervisor shows it and stops the appliance."""
+
+    reason: str
+
+
+class LinkOpened(Message):
+    """Supervisor hands a child its end of a new link to another process (replaces an earlier one)."""
+
+    descriptors: ClassVar[int] = 1
+    role: str
+    index: int
+
+
+class SocketKept(Message):
+    """Control gives the supervisor a listening socket to keep over control's death (name is unique)."""
+
+    descriptors: ClassVar[int] = 1
+    name: str
+
+
+class SocketDropped(Message):
+    """Control no longer needs a kept socket."""
+
+    name: str
+
+
+class SocketRestored(Message):
+    """Supervisor gives a restarted control one kept socket back, or the api the one it serves (`api`)."""
+
+    descriptors: ClassVar[int] = 1
+    name: str
+
+
+class SocketsRestored(Message):
+    """All kept sockets have been given back; sent at every start of control, also when there are none."""
+
+    count: int
+
+
+class ProcessInfo(msgspec.Struct, frozen=True):
+    """One process of the appliance as `rosrv status` shows it; `since` is RFC 3339 UTC."""
+
+    role: str
+    pid: int
+    since: str
+    restarts: int
+
+
+class ProcessesChanged(Message):
+    """Supervisor tells control which processes run; sent at start and after every start or death."""
+
+    processes: list[ProcessInfo]
+
+
+class FirewallReported(Message):
+    """Supervisor tells control the state of isolation and firewall for `rosrv status`."""
+
+    isolation: str
+    report: dict[str, Any]
+
+
+class ProbeFailed(Message):
+    """The ROSMaster port could be reached by another user: control stops serving nodes and says why."""
+
+    reason: str
+
+
+class ProbePassed(Message):
+    """The ROSMaster port is hidden (again)."""
+
+
+class PolicyReloadRequested(Message):
+    """Supervisor got SIGHUP: control reads the policy file again, as `rosrv policy reload` would."""
+
+
+class RouteWanted(Message):
+    """Control asks which address of the machine a host uses to reach the appliance (netns isolation)."""
+
+    host: str
+
+
+class RouteFound(Message):
+    """Supervisor's answer to `RouteWanted`; `address` is None where the peer's own route is the right one."""
+
+    host: str
+    address: str | None
+
+
+class ApplianceStopRequested(Message):
+    """Control asks the supervisor to end the appliance (the `shutdown` call of the Master API, granted)."""
+
+    reason: str
+
+
+Lifeline = (
+    Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
+    | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | PolicyReloadRequested
+    | RouteWanted
+    | TunnelsWanted | TunnelsEnclosed
+    | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
+)  # fmt: skip

@@ -1,0 +1,295 @@
+"""The link control <-> relay. Control states what is wanted; the relay reports what it sees.
+
+`key` is the key of an incarnation.
+"""
+
+from typing import Any, ClassVar, Literal
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+
+
+class StateBegan(Message):
+    """Control restates everything: what is not said again before `StateEnded` is gone."""
+
+    epoch: int
+
+
+class StateEnded(Message):
+    """End of the restatement that began with the same epoch."""
+
+    epoch: int
+
+
+class NodePlaced(Message):
+    """An incarnation and the listening socket that stands for its TCPROS port.
+
+    `host` is the address the node is called at, `name` the node's name (its `callerid`). `monitors`: it is the
+    appliance's own publisher; what goes out of its port is what monitors publish.
+    """
+
+    descriptors: ClassVar[int] = 1
+    key: str
+    name: str
+    host: str
+    monitors: bool = False
+
+
+class NodeWithdrawn(Message):
+    """An incarnation is gone: its port is closed, its connections are cut."""
+
+    key: str
+
+
+class PublicationPlaced(Message):
+    """The incarnation publishes this topic (type as registered, `*` when unknown)."""
+
+    key: str
+    topic: str
+    type: str
+
+
+class PublicationWithdrawn(Message):
+    """The incarnation publishes this topic no longer: its connections are cut."""
+
+    key: str
+    topic: str
+
+
+class ServicePlaced(Message):
+    """The incarnation offers this service at `host:port` (TCPROS)."""
+
+    key: str
+    service: str
+    host: str
+    port: int
+
+
+class ServiceWithdrawn(Message):
+    """The incarnation offers this service no longer: its connections are cut."""
+
+    key: str
+    service: str
+
+
+class GrantInstalled(Message):
+    """This subscriber (host, caller_id) may have this topic of that incarnation."""
+
+    key: str
+    topic: str
+    host: str
+    caller_id: str
+
+
+class GrantRevoked(Message):
+    """The grant is gone; a connection that stands on it is cut."""
+
+    key: str
+    topic: str
+    host: str
+    caller_id: str
+
+
+class ClientGranted(Message):
+    """This host may call this service of that incarnation."""
+
+    key: str
+    service: str
+    host: str
+
+
+class ClientRevoked(Message):
+    """The host may no longer call the service; connections that stand on it are cut."""
+
+    key: str
+    service: str
+    host: str
+
+
+class UpstreamWanted(Message):
+    """The relay needs the publisher's TCPROS address for a topic: control calls `requestTopic` there."""
+
+    key: str
+    topic: str
+
+
+class UpstreamFound(Message):
+    """Answer to `UpstreamWanted`: connect here."""
+
+    key: str
+    topic: str
+    host: str
+    port: int
+
+
+class UpstreamRefused(Message):
+    """Answer to `UpstreamWanted`: the publisher cannot be asked or said no; the relay asks again later."""
+
+    key: str
+    topic: str
+    reason: str
+
+
+class UpstreamLost(Message):
+    """A connection to a publisher broke or could not be made: control looks at the node at once."""
+
+    key: str
+    topic: str
+    reason: str
+
+
+class ConnectionOpened(Message):
+    """A subscriber (`topic` set) or a client (`service` set) is connected through the relay."""
+
+    number: int
+    key: str
+    resource: str
+    kind: str  # "topic" or "service"
+    host: str
+    caller_id: str
+
+
+class ConnectionClosed(Message):
+    """A connection that was reported open is closed; `reason` is empty for an orderly end."""
+
+    number: int
+    reason: str
+
+
+class ConnectionRefused(Message):
+    """Somebody connected to a relay port and was refused; `resource` is what the header asked for."""
+
+    key: str
+    resource: str
+    host: str
+    caller_id: str
+    reason: str
+    count: int  # repeated identical refusals are folded
+
+
+class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
+    """What went through one relayed topic since the last report."""
+
+    key: str
+    resource: str
+    messages: int
+    bytes: int
+    dropped: int  # at slow subscribers
+    subscribers: int
+
+
+class TrafficReported(Message):
+    """Counters of all relayed topics and services that changed; once a second at most."""
+
+    rows: list[TopicTraffic]
+
+
+class SpecificationsStated(Message):
+    """Control states the specifications in force: before anything is placed, and at every change.
+
+    `files` are pairs of name and text, in order; `definitions` are `.msg` and `.srv` files by name, besides ROS's own.
+    `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
+    takes the place of one that died, so monitors with the modifier `hold` block their topics.
+    """
+
+    revision: int
+    files: list[tuple[str, str]]
+    definitions: dict[str, str]
+    enabled: dict[str, bool]
+    restarted: bool
+    on_fault: Literal["drop", "pass"] = "drop"
+
+
+class MonitorSwitched(Message):
+    """From now on the events of this monitor happen, or do not."""
+
+    name: str
+    enabled: bool
+
+
+class MonitorResumed(Message):
+    """A monitor that holds its topics lets them go on."""
+
+    name: str
+
+
+class SpecificationsTaken(Message):
+    """The relay has these specifications in force. `began` are the monitors that started in their initial state."""
+
+    revision: int
+    began: list[str]
+    held: list[str]
+
+
+class SpecificationsRefused(Message):
+    """The relay could not take them: what it had stays in force; without any, everything is blocked."""
+
+    revision: int
+    findings: list[str]
+
+
+class PublicationRefused(Message):
+    """A publisher (or service) is not carried: its definition is another than the specifications'."""
+
+    key: str
+    resource: str
+    reason: str
+
+
+class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
+    """Something a monitor did: the first of its kind and second in full, the others as a count.
+
+    `kind` is verdict, drop, change, fault, log or publish; `time` is nanoseconds since the epoch; `before` and
+    `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
+    else how many more there were.
+    """
+
+    kind: str
+    monitor: str
+    key: str
+    resource: str
+    time: int
+    text: str
+    detail: dict[str, Any]
+    before: bytes = b""
+    after: bytes = b""
+    size: int = 0
+    count: int = 0
+
+
+class MonitorsReported(Message):
+    """What monitors did; batches, a few a second at most. `lost` could not be kept while there was no control."""
+
+    events: list[MonitorEvent]
+    lost: int = 0
+
+
+class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
+    """The state and counters of one running monitor; counters since it was loaded or the relay started."""
+
+    name: str
+    file: str
+    enabled: bool
+    held: bool
+    failing: bool
+    events: int
+    verdicts: int
+    drops: int
+    changes: int
+    faults: int
+
+
+class MonitorsCounted(Message):
+    """All monitors; once a second at most, when something has changed."""
+
+    rows: list[MonitorRow]
+
+
+RelayLink = (
+    StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
+    | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
+    | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | ConnectionOpened | ConnectionClosed
+    | ConnectionRefused | TrafficReported | SpecificationsStated | MonitorSwitched | MonitorResumed
+    | SpecificationsTaken | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted
+)  # fmt: skip

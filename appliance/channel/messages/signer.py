@@ -1,0 +1,94 @@
+"""The link control <-> signer: signatures of audit checkpoints, certificates."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+
+
+class SignatureWanted(Message):
+    """Control asks the signer to sign an audit checkpoint."""
+
+    number: int
+    text: bytes
+
+
+class SignatureMade(Message):
+    """The signer's Ed25519 signature (64 bytes) over `SignatureWanted.text`, and its raw public key (32)."""
+
+    number: int
+    signature: bytes
+    public_key: bytes
+
+
+class SignatureRefused(Message):
+    """The signer will not sign this checkpoint (it does not follow what was signed before) and says why."""
+
+    number: int
+    reason: str
+
+
+class AuthorityWanted(Message):
+    """Control asks the signer for the certificate of the appliance's authority; `number` pairs all these."""
+
+    number: int
+
+
+class AuthorityStated(Message):
+    """The authority's certificate, in PEM."""
+
+    number: int
+    certificate: bytes
+
+
+class CertificateWanted(Message):
+    """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM)."""
+
+    number: int
+    request: bytes
+    name: str
+    days: float
+
+
+class CertificateMade(Message):
+    """The certificate (PEM), its serial number in hexadecimal, and its end in seconds since the epoch."""
+
+    number: int
+    certificate: bytes
+    serial: str
+    expires: float
+
+
+class CertificateRefused(Message):
+    """The signer makes no certificate for this request and says why."""
+
+    number: int
+    reason: str
+
+
+class RevokedCertificate(msgspec.Struct, frozen=True):
+    """A serial number in hexadecimal, at most 160 bits, and since when (seconds since the epoch)."""
+
+    serial: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{1,40}$")]
+    moment: Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
+
+
+class RevocationsWanted(Message):
+    """Control asks for the signed list of exactly these revoked certificates."""
+
+    number: int
+    revoked: list[RevokedCertificate]
+
+
+class RevocationsMade(Message):
+    """The list of revoked certificates (CRL, PEM)."""
+
+    number: int
+    revocations: bytes
+
+
+SignerLink = (
+    SignatureWanted | SignatureMade | SignatureRefused | AuthorityWanted | AuthorityStated | CertificateWanted
+    | CertificateMade | CertificateRefused | RevocationsWanted | RevocationsMade
+)  # fmt: skip
