@@ -105,12 +105,14 @@ class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
 
     names: list[str]
     enabled: bool
+    expected: int | None = None
 
 
 class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
     names: list[str]
+    expected: int | None = None
 
 
 MonitorChange = MonitorLoad | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume

@@ -13,11 +13,11 @@ from rosbags.rosbag1 import Reader
 from appliance.cli.monitor_bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor_input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor_output import lines, record, say_finding
-from appliance.cli.monitor_picture import dot_of, svg_of
 from appliance.cli.policy_output import counted, printable, say, say_json
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import CompiledProperty
+from appliance.rosmop.logics.picture import dot_of, svg_of
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
 

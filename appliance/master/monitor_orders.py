@@ -17,10 +17,11 @@ async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who:
             return _replaced(await monitors.reload(who=who, expected=expected))
         case admin.MonitorRemove(names, expected):
             return _replaced(await monitors.remove(names, who=who, expected=expected))
-        case admin.MonitorSwitch(names, enabled):
-            return {"names": await monitors.switch(names, enabled, who=who), "enabled": enabled}
-        case admin.MonitorResume(names):
-            return {"names": await monitors.resume(names, who=who)}
+        case admin.MonitorSwitch(names, enabled, expected):
+            changed = await monitors.switch(names, enabled, who=who, expected=expected)
+            return {"names": changed, "enabled": enabled}
+        case admin.MonitorResume(names, expected):
+            return {"names": await monitors.resume(names, who=who, expected=expected)}
 
 
 def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:

@@ -197,9 +197,12 @@ class Monitors:
                 self.sources.without(files), who, who, f"removed {', '.join(sorted(files))}"
             )
 
-    async def switch(self, names: list[str], enabled: bool, *, who: str) -> list[str]:
+    async def switch(
+        self, names: list[str], enabled: bool, *, who: str, expected: int | None = None
+    ) -> list[str]:
         """Enable or disable monitors; those that were not so already. Raises `UnknownMonitorError`."""
         async with self._changing:
+            self._expect(expected)
             self._all_known(names)
             changed = [name for name in dict.fromkeys(names) if self.enabled(name) is not enabled]
             for name in changed:
@@ -219,8 +222,9 @@ class Monitors:
                 await self._store.settled()
             return changed
 
-    async def resume(self, names: list[str], *, who: str) -> list[str]:
+    async def resume(self, names: list[str], *, who: str, expected: int | None = None) -> list[str]:
         """Let the topics of held monitors go on; which were held. Raises `UnknownMonitorError`."""
+        self._expect(expected)
         self._all_known(names)
         held = [name for name in dict.fromkeys(names) if name in self.held]
         for name in held:
@@ -332,7 +336,7 @@ class Monitors:
         self.send(self._statement(False))  # a relay that came in between was told the revision before
         await self._store.settled()
         self.published()
-        added, changed, removed = _difference(previous, sources)
+        added, changed, removed = sources.difference(previous)
         return Replaced(self.revision, before, added, changed, removed, list(checked.warnings))
 
     async def _try(self, sources: Sources, checked: Checked) -> None:
@@ -379,7 +383,7 @@ class Monitors:
             before = Sources(**json.loads(last.sources))
         self._store.save_monitor_revision(row)
         self._enforce(sources, checked, row)
-        added, changed, removed = _difference(before or Sources(), sources)
+        added, changed, removed = sources.difference(before or Sources())
         self._recorder.happened(
             "specifications loaded",
             f"revision {row.revision} of the specifications is in force: {note}",
@@ -398,14 +402,3 @@ class Monitors:
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.revision = sources, checked, row.revision
         self.who, self.note, self.loaded = row.who, row.note, row.loaded
-
-
-def _difference(before: Sources, after: Sources) -> tuple[list[str], list[str], list[str]]:
-    """The names of files that are added, changed and removed."""
-    old = before.files | {f"msg/{name}": text for name, text in before.definitions.items()}
-    new = after.files | {f"msg/{name}": text for name, text in after.definitions.items()}
-    return (
-        [name for name in new if name not in old],
-        [name for name in new if name in old and old[name] != new[name]],
-        [name for name in old if name not in new],
-    )

@@ -48,6 +48,18 @@ class Sources(msgspec.Struct, frozen=True):
             {name: text for name, text in self.files.items() if name not in files}, self.definitions
         )
 
+    def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
+        """The names of files that these add, change and remove; definitions as `msg/package/Type.msg`."""
+        old, new = before._all(), self._all()
+        return (
+            [name for name in new if name not in old],
+            [name for name in new if name in old and old[name] != new[name]],
+            [name for name in old if name not in new],
+        )
+
+    def _all(self) -> dict[str, str]:
+        return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
+
 
 @dataclass(frozen=True, slots=True)
 class Checked:

@@ -1,7 +1,7 @@
-"""The automata of properties as pictures: for Graphviz (`--dot`), and drawn here (`--svg`), so that nothing needs
-to be installed.
+"""The automata of properties as pictures: for Graphviz, and drawn here (SVG), so that nothing needs to be installed.
 
-The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve
+Colours and sizes are attributes, not styles: a page whose content security policy forbids styles shows them too, and
+one that has a style sheet can give the classes `title`, `event`, `state` and `edge` its own. The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve
 for each pair of states with all events that lead from one to the other.
 """
 
@@ -17,6 +17,10 @@ _STATE = re.compile(r'^  (\d+) \[label="((?:\\.|[^"\\])*)"(, peripheries=2)?\];$
 _EDGE = re.compile(r'^  (\w+) -> (\d+)(?: \[label="((?:\\.|[^"\\])*)"\])?;$', re.MULTILINE)
 _WIDTH, _HEIGHT = 150, 44  # of a state
 _COLUMN, _ROW, _MARGIN = 300, 120, 60
+_TITLE = 'text-anchor="start" font-weight="bold"'
+_EVENT = 'font-size="11" fill="#135"'
+_BOX = 'fill="#fff" stroke="#345" stroke-width="1.5"'
+_LINE = 'fill="none" stroke="#678" stroke-width="1.3" marker-end="url(#arrow)"'
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
         if graph is None:
             continue
         title = f"{compiled.logic}: {' '.join(compiled.formula.split())[:120]}"
-        parts.append(f'<text class="title" x="{_MARGIN}" y="{top + 30}">{escape(title)}</text>')
+        parts.append(f'<text class="title" x="{_MARGIN}" y="{top + 30}" {_TITLE}>{escape(title)}</text>')
         states = _placed(graph, top + _MARGIN)
         parts += [_edge(states, *found) for found in _EDGE.findall(graph)]
         parts += [_drawn(state) for state in states.values()]
@@ -58,12 +62,11 @@ def _document(parts: Sequence[str], width: int, height: int) -> str:
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
             f'viewBox="0 0 {width} {height}">',
-            "<style>text{font:13px sans-serif;fill:#222;text-anchor:middle}.title{text-anchor:start;font-weight:bold}"
-            "rect{fill:#fff;stroke:#345;stroke-width:1.5}path{fill:none;stroke:#678;stroke-width:1.3}"
-            ".event{font-size:11px;fill:#135}</style>",
             '<defs><marker id="arrow" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" '
-            'orient="auto"><path d="M0 0L8 4L0 8z" style="fill:#678;stroke:none"/></marker></defs>',
+            'orient="auto"><path d="M0 0L8 4L0 8z" fill="#678"/></marker></defs>',
+            '<g font-family="sans-serif" font-size="13" fill="#222" text-anchor="middle">',
             *parts,
+            "</g>",
             "</svg>",
             "",
         ]
@@ -99,12 +102,13 @@ def _drawn(state: _State) -> str:
     inner = ""
     if state.double:
         inner = (
-            f'<rect x="{state.x + 4}" y="{state.y + 4}" width="{_WIDTH - 8}" height="{_HEIGHT - 8}" rx="7"/>'
+            f'<rect class="state" x="{state.x + 4}" y="{state.y + 4}" width="{_WIDTH - 8}" '
+            f'height="{_HEIGHT - 8}" rx="7" {_BOX}/>'
         )
     middle = f'x="{state.x + _WIDTH // 2}" y="{state.y + _HEIGHT // 2 + 5}"'
     shown = state.name if len(state.name) <= 22 else state.name[:21] + "…"
     return (
-        f'<rect x="{state.x}" y="{state.y}" width="{_WIDTH}" height="{_HEIGHT}" rx="10"/>{inner}'
+        f'<rect class="state" x="{state.x}" y="{state.y}" width="{_WIDTH}" height="{_HEIGHT}" rx="10" {_BOX}/>{inner}'
         f"<text {middle}><title>{escape(state.name)}</title>{escape(shown)}</text>"
     )
 
@@ -113,7 +117,7 @@ def _edge(states: dict[str, _State], source: str, target: str, label: str) -> st
     to = states[target]
     middle = to.y + _HEIGHT // 2
     if source == "start":
-        return f'<path d="M{to.x - 30} {middle}H{to.x}" marker-end="url(#arrow)"/>'
+        return f'<path class="edge" d="M{to.x - 30} {middle}H{to.x}" {_LINE}/>'
     shown = escape(_plain(label))
     at = states[source]
     if source == target:
@@ -130,4 +134,5 @@ def _edge(states: dict[str, _State], source: str, target: str, label: str) -> st
 
 
 def _labelled(path: str, x: int, y: int, label: str) -> str:
-    return f'<path d="{path}" marker-end="url(#arrow)"/><text class="event" x="{x}" y="{y}">{label}</text>'
+    text = f'<text class="event" x="{x}" y="{y}" {_EVENT}>{label}</text>'
+    return f'<path class="edge" d="{path}" {_LINE}/>{text}'
