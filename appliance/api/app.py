@@ -9,7 +9,18 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Match, Route
 
 import appliance
-from appliance.api import audit, explaining, graph, health, metrics, policy
+from appliance.api import (
+    audit,
+    console,
+    console_live,
+    console_session,
+    console_tests,
+    explaining,
+    graph,
+    health,
+    metrics,
+    policy,
+)
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
 from appliance.api.problems import REASON, BadInput, ProblemError, defect
@@ -39,8 +50,11 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    for part in (health, policy, explaining, audit, graph, metrics):
+    for part in (health, policy, explaining, console_tests, audit, graph, metrics):
         app.include_router(part.routes(services))
+    app.include_router(console_live.routes(services, services.history))
+    for page in (console_session, console):
+        app.include_router(page.routes())
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:

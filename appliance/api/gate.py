@@ -4,10 +4,12 @@ Order: rate → Host → Origin → size of the body → token. Invariants:
 
 1. A request that does not pass costs no more than its headers, and no route, no parser of bodies and no question to
    control sees it.
-2. Only `PUBLIC` answers without a token; a path that does not exist is no different from one that does.
+2. Only `PUBLIC` and the console's own files answer without a token; any other path that does not exist is no
+   different from one that does.
 3. A page of another site cannot use the browser of somebody who can reach the appliance: a Host that is a foreign
    name (DNS rebinding) and an Origin that is not the appliance's own are refused, and no CORS header is ever sent.
-4. Every answer but those of the health probes is recorded (equal reads folded, see `Journal`).
+4. Every answer but those of the health probes and the console's own files is recorded (equal reads folded, see
+   `Journal`).
 5. A client that does not take its answer is cut off.
 """
 
@@ -21,6 +23,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from appliance.api.access import Bearer, Doorkeeper
+from appliance.api.console import is_console
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect
 from appliance.api.rates import Buckets
@@ -92,7 +95,7 @@ class Gate:
         self._check_host(headers)
         _check_origin(scope, headers)
         bearer = None
-        if scope["path"] not in PUBLIC:
+        if scope["path"] not in PUBLIC and not is_console(scope["path"]):
             bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
         limit = int(self._limits.body_bytes) if bearer is not None else _NOBODYS_BODY
         return bearer, await _read(headers, receive, limit)
@@ -140,7 +143,8 @@ class _Answer:
         await problem.response()(self._scope, receive, self.send)
 
     def _report(self, status: int) -> None:
-        if self._scope["path"] in _NOT_RECORDED and status < 400:
+        path = self._scope["path"]
+        if (path in _NOT_RECORDED or is_console(path)) and status < 400:
             return
         self._journal.answered(
             host=self._scope["client"][0],

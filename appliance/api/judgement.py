@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from appliance.api.problems import Finding, ProblemError
 from appliance.policy import (
+    CaseResult,
     Category,
     Difference,
     Explanation,
@@ -53,6 +54,19 @@ def judge(text: str, current: Mapping[str, Any], registrations: Iterable[Mapping
         for one in registrations
     ]
     return Judgement(findings_of(policy.warnings), diff(before, policy, live))
+
+
+def tested(text: str | None, current: Mapping[str, Any]) -> list[CaseResult]:
+    """The cases beside the policy file on a text (None: the one in force); empty when there is no such file.
+
+    Raises `ProblemError` with every finding when the text or the cases cannot be understood.
+    """
+    policy = (
+        _compile(current["text"], current["file"], current)
+        if text is None
+        else _compile(text, "policy", current)
+    )
+    return _cases(policy, current)
 
 
 def explanation(
@@ -108,16 +122,20 @@ def _compile(text: str, file: str, current: Mapping[str, Any]) -> Policy:
         raise _refused(findings_of(error.findings)) from error
 
 
-def _test(policy: Policy, current: Mapping[str, Any]) -> None:
+def _cases(policy: Policy, current: Mapping[str, Any]) -> list[CaseResult]:
     file = current["cases_file"]
     if current["cases_error"] is not None:
         raise _refused([Finding(file=file, line=1, column=1, severity="error", text=current["cases_error"])])
     if current["cases"] is None:
-        return
+        return []
     try:
-        failed = [one for one in run_cases(policy, current["cases"], file) if not one.passed]
+        return run_cases(policy, current["cases"], file)
     except PolicyError as error:
         raise _refused(findings_of(error.findings)) from error
+
+
+def _test(policy: Policy, current: Mapping[str, Any]) -> None:
+    failed = [one for one in _cases(policy, current) if not one.passed]
     if failed:
         raise _refused(
             [

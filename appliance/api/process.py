@@ -19,6 +19,7 @@ import uvloop
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
 from appliance.api.certificate import tls_context
+from appliance.api.console_history import History, measures_of
 from appliance.api.control import ControlLink
 from appliance.api.gate import Gate
 from appliance.api.journal import FOLD_SECONDS, Journal
@@ -59,7 +60,10 @@ class _Api:
         # More than all that is done in threads at once: no verification of the log keeps a token from being checked.
         loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
         self._lifeline.attach(loop, self._received, self._end)
-        services = Services(self._settings, self._control, self._doorkeeper, self._journal, self._stopping)
+        history = History(lambda: measures_of(self._control))
+        services = Services(
+            self._settings, self._control, self._doorkeeper, self._journal, self._stopping, history
+        )
         app = build_app(services)
         gate = Gate(
             app,
@@ -81,9 +85,10 @@ class _Api:
             return
         self._await_control()
         self._say(messages.Ready({"tls": self._settings.api_tls}))
-        flushing = asyncio.get_running_loop().create_task(self._flush())
+        running = [loop.create_task(self._flush()), loop.create_task(history.run())]
         await self._stopping.wait()
-        flushing.cancel()
+        for task in running:
+            task.cancel()
         await listener.stop()
         self._journal.flush()
         self._control.close()

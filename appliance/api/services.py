@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.api.access import Doorkeeper
+from appliance.api.console_history import History
 from appliance.api.control import ControlLink
 from appliance.api.journal import Journal
 from appliance.config import Settings
@@ -21,6 +22,7 @@ class Services:
     doorkeeper: Doorkeeper
     journal: Journal
     stopping: asyncio.Event
+    history: History
     judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
     @property

@@ -1,0 +1,101 @@
+"""The console: one page for operators, served with all it needs by the appliance itself.
+
+Invariants:
+
+1. What is served here is part of the program and the same for everybody: it needs no token and knows no secret. What
+   the page shows it asks of `/v1`, with the token its reader brings.
+2. Only files that were there at start are served, by an exact name: a path never reaches the file system.
+3. Its headers let the page load and connect to nothing but this origin, run no script but these files, and let no
+   string become markup (Trusted Types).
+"""
+
+import hashlib
+import mimetypes
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import NamedTuple
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from appliance.api.problems import ProblemError
+
+VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts")
+_PREFIX = "/console/static/"
+_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self';"
+        " font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none';"
+        " require-trusted-types-for 'script'; trusted-types 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
+    "X-Frame-Options": "DENY",
+    "Cache-Control": "no-cache",  # kept, and asked for again with its ETag: an update is seen at once
+}
+
+
+class _File(NamedTuple):
+    body: bytes
+    media_type: str
+    etag: str
+
+
+def is_console(path: str) -> bool:
+    """Whether a path is one of the console's, which is served without a token."""
+    return path in ("/", "/console") or path.startswith("/console/")
+
+
+def routes() -> APIRouter:
+    """The routes; none is of the contract."""
+    router = APIRouter(include_in_schema=False)
+    served = _collect(files("appliance.api") / "console", "")
+    page = served["index.html"]
+
+    async def index(request: Request) -> Response:
+        """The page; which view it shows is said by its address."""
+        return _answer(request, page)
+
+    async def file(request: Request, name: str) -> Response:
+        """One of the page's files."""
+        found = served.get(name)
+        if found is None:
+            raise ProblemError(404, "unknown-path", "the console has no such file")
+        return _answer(request, found)
+
+    methods = ["GET", "HEAD"]
+    router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
+    for path in ("/", "/console", "/console/"):
+        router.add_api_route(path, index, methods=methods)
+    for view in VIEWS:
+        router.add_api_route(f"/console/{view}", index, methods=methods)
+        router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
+    return router
+
+
+def _answer(request: Request, found: _File) -> Response:
+    headers = {**_HEADERS, "ETag": found.etag}
+    if request.headers.get("if-none-match") == found.etag:
+        return Response(status_code=304, headers=headers)
+    return Response(found.body, headers=headers, media_type=found.media_type)
+
+
+def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
+    """All files under a folder, by their path in it."""
+    found: dict[str, _File] = {}
+    for one in folder.iterdir():
+        if one.is_dir():
+            found |= _collect(one, f"{prefix}{one.name}/")
+            continue
+        body = one.read_bytes()
+        found[prefix + one.name] = _File(
+            body, _media_type(one.name), f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+        )
+    return found
+
+
+def _media_type(name: str) -> str:
+    ending = name[name.rfind(".") :]
+    return _TYPES.get(ending) or mimetypes.guess_type(name)[0] or "application/octet-stream"

@@ -1,0 +1,140 @@
+"""What the appliance did over the last hour, in samples: counters that only grow, for whoever draws their rates.
+
+Control is asked for its measures every `BUSY_SECONDS` while somebody follows and every `IDLE_SECONDS` otherwise, once
+for everybody: how many look at it costs RVMaster nothing. What is kept is bounded by time and number.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from appliance.api.control import ControlAwayError, ControlLink
+from appliance.channel.admin import MetricsWanted
+
+BUSY_SECONDS = 2.0
+IDLE_SECONDS = 10.0
+_KEPT_SECONDS = 3600.0
+_MOST = 1800
+_KINDS = ("verdict", "drop", "change", "fault")
+_AWAY = "RVMaster does not answer"
+
+
+class Sample(BaseModel):
+    """Counters at one moment, since RVMaster started; after its restart they begin anew."""
+
+    model_config = ConfigDict(extra="forbid")
+    time: float = Field(description="seconds since the epoch")
+    allowed: int = Field(description="decisions of the policy")
+    denied: int = Field(description="decisions of the policy, `would deny` included")
+    messages: int = Field(description="relayed")
+    bytes: int = Field(description="relayed")
+    dropped: int = Field(description="messages that slow subscribers did not get")
+    nodes: int
+    monitors: dict[str, list[int]] = Field(description="of each monitor: verdicts, drops, changes, faults")
+
+
+class Seen(NamedTuple):
+    """What control said last: its status, or why there is none."""
+
+    number: int
+    status: dict[str, Any] | None
+    sample: Sample | None
+    away: str | None
+
+
+class History:
+    """Takes the samples. `measures()` is control's answer to `MetricsWanted`."""
+
+    def __init__(self, measures: Callable[[], Awaitable[dict[str, Any]]]) -> None:
+        self._measures = measures
+        self._samples: deque[Sample] = deque(maxlen=_MOST)
+        self._followers = 0
+        self._sooner = asyncio.Event()
+        self._news = asyncio.Condition()
+        self.seen = Seen(0, None, None, _AWAY)
+
+    def samples(self, most: int) -> list[Sample]:
+        """The samples of the last hour, at most so many, evenly taken, the newest last."""
+        kept = list(self._samples)
+        step = -(-len(kept) // most)
+        return kept[::-1][::step][::-1] if step > 1 else kept
+
+    @contextlib.contextmanager
+    def following(self) -> Iterator[None]:
+        """Samples come more often while this lasts."""
+        self._followers += 1
+        self._sooner.set()
+        try:
+            yield
+        finally:
+            self._followers -= 1
+
+    async def after(self, number: int) -> Seen:
+        """What was seen, as soon as it is something newer than this number."""
+        async with self._news:
+            await self._news.wait_for(lambda: self.seen.number > number)
+            return self.seen
+
+    async def run(self) -> None:
+        """Sample until cancelled."""
+        while True:
+            await self._look()
+            self._sooner.clear()
+            with contextlib.suppress(TimeoutError):
+                if self._followers:
+                    await asyncio.sleep(BUSY_SECONDS)
+                else:
+                    await asyncio.wait_for(self._sooner.wait(), IDLE_SECONDS)
+
+    async def _look(self) -> None:
+        status, sample, away = None, None, None
+        try:
+            body = await self._measures()
+            status, sample = body["status"], sample_of(body, time.time())
+        except ControlAwayError as error:
+            away = str(error)
+        if sample is not None:
+            self._keep(sample)
+        async with self._news:
+            self.seen = Seen(self.seen.number + 1, status, sample, away)
+            self._news.notify_all()
+
+    def _keep(self, sample: Sample) -> None:
+        while self._samples and self._samples[0].time < sample.time - _KEPT_SECONDS:
+            self._samples.popleft()
+        self._samples.append(sample)
+
+
+async def measures_of(control: ControlLink) -> dict[str, Any]:
+    """Control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
+    answer = await control.ask(MetricsWanted(), "history")
+    if not answer.ok:
+        raise ControlAwayError(answer.error)
+    return answer.body
+
+
+def sample_of(body: Mapping[str, Any], now: float) -> Sample:
+    """A sample out of control's answer to `MetricsWanted`."""
+    decided = {"allow": 0, "deny": 0, "would deny": 0}
+    for _category, outcome, count in body["decisions"]:
+        decided[outcome] = decided.get(outcome, 0) + count
+    rows = list(body["relayed"].values())
+    monitors: dict[str, list[int]] = {}
+    for kind, name, count in body["monitors"]:
+        if kind in _KINDS:
+            monitors.setdefault(name, [0] * len(_KINDS))[_KINDS.index(kind)] = count
+    return Sample(
+        time=now,
+        allowed=decided["allow"],
+        denied=decided["deny"] + decided["would deny"],
+        messages=sum(row[0] for row in rows),
+        bytes=sum(row[1] for row in rows),
+        dropped=sum(row[2] for row in rows),
+        nodes=body["nodes"]["live"],
+        monitors=monitors,
+    )

@@ -1,0 +1,112 @@
+"""`/v1/history` and `/v1/live`: the last hour, and what the appliance does now, as it happens.
+
+A page that follows asks once and is told; the audit log has one record of it, not one for every look.
+"""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, ConfigDict
+from sse_starlette import EventSourceResponse, ServerSentEvent
+
+from appliance.api.access import Bearer
+from appliance.api.console_alarms import open_alarms
+from appliance.api.console_history import BUSY_SECONDS, History, Sample, Seen
+from appliance.api.control import ControlAwayError
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.channel.admin import GraphWanted
+
+_PING_SECONDS = 15
+_SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next
+_TEXT: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Events `now`, `graph`, `away`, `end`.",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    }
+}
+
+
+class Hour(BaseModel):
+    """The last hour's samples, the newest last."""
+
+    model_config = ConfigDict(extra="forbid")
+    samples: list[Sample]
+
+
+def routes(services: Services, history: History) -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix="/v1", tags=["status"])
+    streams = asyncio.Semaphore(services.settings.api_limits.streams)
+
+    @router.get("/history", operation_id="history")
+    async def last_hour(
+        bearer: Viewer,  # noqa: ARG001  asked for its role
+        points: Annotated[int, Query(ge=2, le=1800, description="at most so many samples")] = 360,
+    ) -> Hour:
+        """Decisions, relayed messages and what monitors did over the last hour, as counters."""
+        return Hour(samples=history.samples(points))
+
+    @router.get("/live", operation_id="live_state", responses=_TEXT)
+    async def live(
+        bearer: Viewer,
+        graph: Annotated[bool, Query(description="the graph too, as `/v1/graph` has it")] = False,
+    ) -> EventSourceResponse:
+        """Status, open alarms and a sample every two seconds (server-sent events).
+
+        `now`: `{status, alarms, sample}`; `graph`: as `/v1/graph`; `away`: `{reason}` while RVMaster does not answer.
+        Ends when the token does.
+        """
+        if streams.locked():
+            raise ProblemError(503, "busy", "too many clients follow already", headers={"Retry-After": "10"})
+        return EventSourceResponse(_follow(services, history, streams, bearer, graph), ping=_PING_SECONDS)
+
+    return router
+
+
+async def _follow(
+    services: Services, history: History, streams: asyncio.Semaphore, bearer: Bearer, graph: bool
+) -> AsyncIterator[ServerSentEvent]:
+    number = max(0, history.seen.number - 1)  # what was seen last is told at once
+    graph_due = 0.0
+    async with streams:
+        with history.following():
+            while not services.stopping.is_set():
+                if not services.doorkeeper.still_good(bearer):
+                    yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+                    return
+                try:
+                    async with asyncio.timeout(BUSY_SECONDS * 2):
+                        seen = await history.after(number)
+                except TimeoutError:
+                    continue  # control takes its time; look whether the token is still good
+                number = seen.number
+                yield _told(seen)
+                if graph and seen.away is None and time.monotonic() >= graph_due:
+                    began = time.monotonic()
+                    drawn = await _graph(services, bearer)
+                    graph_due = time.monotonic() + (time.monotonic() - began) * _SHARE
+                    if drawn is not None:
+                        yield drawn
+
+
+def _told(seen: Seen) -> ServerSentEvent:
+    if seen.status is None or seen.sample is None:
+        return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
+    alarms = [one.model_dump() for one in open_alarms(seen.status)]
+    body = {"status": seen.status, "alarms": alarms, "sample": seen.sample.model_dump()}
+    return ServerSentEvent(event="now", data=json.dumps(body))
+
+
+async def _graph(services: Services, bearer: Bearer) -> ServerSentEvent | None:
+    try:
+        return ServerSentEvent(
+            event="graph", data=json.dumps(await ask(services.control, GraphWanted(), bearer))
+        )
+    except (ProblemError, ControlAwayError):
+        return None  # said by the next `away`
