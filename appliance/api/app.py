@@ -19,6 +19,8 @@ from appliance.api import (
     graph,
     health,
     metrics,
+    monitor_changes,
+    monitors,
     policy,
 )
 from appliance.api.contract import contract_of
@@ -50,7 +52,7 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    for part in (health, policy, explaining, console_tests, audit, graph, metrics):
+    for part in (health, policy, explaining, console_tests, monitors, monitor_changes, audit, graph, metrics):
         app.include_router(part.routes(services))
     app.include_router(console_live.routes(services, services.history))
     for page in (console_session, console):

@@ -14,7 +14,7 @@ IfMatch = Annotated[
     Header(
         alias="If-Match",
         max_length=100,
-        description="The ETag of the policy the change is meant for, or `*` for whichever is in force.",
+        description="The ETag of what the change is meant for, or `*` for whatever is in force.",
     ),
 ]
 
@@ -24,17 +24,20 @@ def etag(revision: int) -> str:
     return f'"{revision}"'
 
 
-def expected_revision(if_match: str | None) -> int | None:
-    """The revision that `If-Match` names; None for `*`. Raises `ProblemError` (428, 412)."""
+def expected_revision(if_match: str | None, what: str = "policy", where: str = "/v1/policy") -> int | None:
+    """The revision that `If-Match` names; None for `*`. Raises `ProblemError` (428, 412).
+
+    `what` is changed, and `where` GET says its ETag.
+    """
     if if_match is None:
         raise ProblemError(
             428,
             "precondition-required",
-            "say which policy you have seen: If-Match with the ETag of GET /v1/policy",
+            f"say which {what} you have seen: If-Match with the ETag of GET {where}",
         )
     if if_match.strip() == "*":
         return None
     found = _TAG.fullmatch(if_match.strip())
     if found is None:
-        raise ProblemError(412, "changed-meanwhile", f'{if_match[:80]!r} is no ETag of a policy, such as "7"')
+        raise ProblemError(412, "changed-meanwhile", f'{if_match[:80]!r} is no ETag of {where}, such as "7"')
     return int(found[1])

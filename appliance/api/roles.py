@@ -9,7 +9,7 @@ from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
-from appliance.channel.admin import AdminRequest
+from appliance.channel.admin import AdminAnswer, AdminRequest
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 
@@ -33,6 +33,7 @@ class _Requires:
 
 Viewer = Annotated[Bearer, Depends(_Requires(Role.VIEWER))]
 Operator = Annotated[Bearer, Depends(_Requires(Role.OPERATOR))]
+Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
 
 _PROBLEMS = {
     "request": (422, "bad-input"),
@@ -46,7 +47,11 @@ _PROBLEMS = {
 
 async def ask(control: ControlLink, request: AdminRequest, bearer: Bearer) -> dict[str, Any]:
     """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
-    answer = await control.ask(request, bearer.name)
+    return answered(await control.ask(request, bearer.name))
+
+
+def answered(answer: AdminAnswer) -> dict[str, Any]:
+    """The body of an answer. Raises `ProblemError` for a refusal."""
     if answer.ok:
         return answer.body
     status, kind = _PROBLEMS.get(answer.trouble, (503, "not-available"))

@@ -19,9 +19,10 @@ async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who:
             return _replaced(await monitors.remove(names, who=who, expected=expected))
         case admin.MonitorSwitch(names, enabled, expected):
             changed = await monitors.switch(names, enabled, who=who, expected=expected)
-            return {"names": changed, "enabled": enabled}
+            return {"names": changed, "enabled": enabled, "revision": monitors.revision}
         case admin.MonitorResume(names, expected):
-            return {"names": await monitors.resume(names, who=who, expected=expected)}
+            held = await monitors.resume(names, who=who, expected=expected)
+            return {"names": held, "revision": monitors.revision}
 
 
 def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:

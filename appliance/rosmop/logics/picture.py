@@ -1,8 +1,10 @@
 """The automata of properties as pictures: for Graphviz, and drawn here (SVG), so that nothing needs to be installed.
 
 Colours and sizes are attributes, not styles: a page whose content security policy forbids styles shows them too, and
-one that has a style sheet can give the classes `title`, `event`, `state` and `edge` its own. The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve
-for each pair of states with all events that lead from one to the other.
+one that has a style sheet can give the classes `title`, `event`, `state` and `edge` its own.
+
+The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve for
+each pair of states with all events that lead from one to the other.
 """
 
 import re

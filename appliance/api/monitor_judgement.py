@@ -1,0 +1,136 @@
+"""What specifications are and what new ones would do, found out here without asking RVMaster.
+
+Everything is a pure function of texts; it runs in a thread. The compiler is imported when it is first needed: an
+api that nobody asks about monitors starts without it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from appliance.api.monitor_models import EventShown, PropertyShown
+from appliance.api.problems import Finding, ProblemError
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet
+    from appliance.rosmop.monitor import Monitor
+
+_PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """Specifications without errors: files added, changed and removed, the lint, the monitors there would be."""
+
+    added: list[str]
+    changed: list[str]
+    removed: list[str]
+    warnings: list[Finding]
+    monitors: list[str]
+
+
+def judge(
+    before: Mapping[str, dict[str, str]], files: dict[str, str], definitions: dict[str, str], revision: int
+) -> Draft:
+    """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
+    from appliance.master.specifications import Sources, SpecificationsRefusedError, check  # noqa: PLC0415
+
+    present = Sources(before["files"], before["definitions"])
+    following = present.with_files(files, definitions)
+    try:
+        checked = check(following)
+    except SpecificationsRefusedError as error:
+        raise refusal(
+            f"refused; revision {revision} of the specifications stays in force", error.findings
+        ) from error
+    added, changed, removed = following.difference(present)
+    return Draft(added, changed, removed, findings_of(list(checked.warnings)), list(checked.monitors))
+
+
+def findings_of(texts: list[str]) -> list[Finding]:
+    """Findings as structures; one without a place (`file:line:column: error: text`) is left out."""
+    return [
+        Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
+        for file, line, column, severity, text in (
+            found.groups() for found in map(_PLACE.fullmatch, texts) if found is not None
+        )
+    ]
+
+
+def refusal(error: str, findings: list[str]) -> ProblemError:
+    """A refusal of specifications as a problem; its detail has every finding on a line of its own."""
+    return ProblemError(
+        422,
+        "specifications-refused",
+        "\n".join([error, *findings[:200]]),
+        findings=findings_of(findings) or None,
+    )
+
+
+class Compiler:
+    """Compiles what is in force, and remembers the last: a page that looks at one monitor after the other costs one."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, MonitorSet] | None = None
+
+    def monitor(
+        self, revision: int, files: dict[str, str], definitions: dict[str, str], name: str
+    ) -> Monitor:
+        """A monitor of the specifications with this revision. Raises KeyError."""
+        if self._last is None or self._last[0] != revision:
+            self._last = (revision, _compiled(files, definitions))
+        return self._last[1].monitor(name)
+
+    def warnings(self, file: str) -> list[Finding]:
+        """The lint of a file of what was compiled last."""
+        assert self._last is not None  # noqa: S101  asked after `monitor`
+        return findings_of([str(one) for one in self._last[1].warnings if one.position.file == file])
+
+
+def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
+    from appliance.ros.definitions import Definitions  # noqa: PLC0415
+    from appliance.ros.standard import standard_definitions  # noqa: PLC0415
+    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415
+
+    return MonitorSet.load(files, standard_definitions().extended(Definitions.from_files(definitions)))
+
+
+def events_of(monitor: Monitor) -> list[EventShown]:
+    """The events of a monitor."""
+    return [
+        EventShown(
+            name=event.name,
+            line=event.position.line,
+            topic=event.topic,
+            type=event.service_type or event.type,
+            part=event.part,
+            every=None if event.period_ns is None else event.period_ns / 1e9,
+        )
+        for event in monitor.code.events
+    ]
+
+
+def properties_of(monitor: Monitor) -> list[PropertyShown]:
+    """The properties of a monitor."""
+    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415
+
+    return [
+        PropertyShown(
+            logic=each.property.logic,
+            formula=each.property.formula.strip(),
+            categories=list(each.property.categories),
+            handled=list(each.order),
+            drawn=dot_of([each.property]) is not None,
+        )
+        for each in monitor.code.properties
+    ]
+
+
+def picture_of(monitor: Monitor) -> str | None:
+    """The automata of a monitor's properties (SVG); None when none is finite."""
+    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415
+
+    return svg_of([each.property for each in monitor.code.properties])

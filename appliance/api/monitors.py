@@ -1,0 +1,144 @@
+"""`/v1/monitors`: look at the monitors, the specifications they are made of, and what they did."""
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Response
+
+from appliance.api.access import Bearer
+from appliance.api.audit import Desk
+from appliance.api.monitor_judgement import Compiler, events_of, picture_of, properties_of
+from appliance.api.monitor_models import Happened, History, Monitor, Monitors
+from appliance.api.preconditions import etag
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.audit.output import Entry, rfc3339
+from appliance.audit.query import Filter
+from appliance.audit.search import Page, search
+from appliance.channel.admin import MonitorsWanted
+
+TAGGED: dict[int | str, dict[str, Any]] = {
+    200: {
+        "headers": {"ETag": {"description": "of the specifications in force", "schema": {"type": "string"}}}
+    }
+}
+UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"description": "There is no such monitor."}}
+_PICTURE: dict[int | str, dict[str, Any]] = {
+    200: {"description": "OK", "content": {"image/svg+xml": {"schema": {"type": "string"}}}}
+}
+OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor")]
+
+
+class _Looking:
+    """Reads what is in force and compiles it, so many texts at once."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._compiler = Compiler()
+        self.desk = Desk(services)
+
+    async def state(self, bearer: Bearer, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What is in force, with texts, and the row of a monitor. Raises `ProblemError` (404)."""
+        body = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
+        row = next((one for one in body["monitors"] if one["name"] == name), None)
+        if row is None:
+            known = ", ".join(one["name"] for one in body["monitors"]) or "none is loaded"
+            raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+        return body, row
+
+    async def compiled(self, body: dict[str, Any], name: str) -> Any:
+        """A monitor, compiled here."""
+        async with self._services.judging:
+            return await asyncio.to_thread(
+                self._compiler.monitor, body["revision"], body["files"], body["definitions"], name
+            )
+
+    def warnings(self, file: str) -> Any:
+        """The lint of a file of what was compiled last."""
+        return self._compiler.warnings(file)
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix="/v1/monitors", tags=["monitors"])
+    looking = _Looking(services)
+
+    @router.get("", operation_id="monitors", responses=TAGGED)
+    async def monitors(
+        bearer: Viewer,
+        response: Response,
+        texts: Annotated[bool, Query(description="with the texts of the specifications")] = False,
+    ) -> Monitors:
+        """All monitors with state and counters, and whether they are what the folder has."""
+        body = await ask(services.control, MonitorsWanted(texts=texts), bearer)
+        response.headers["ETag"] = etag(body["revision"])
+        return Monitors.model_validate(body)
+
+    @router.get("/{name}", operation_id="monitor", responses=TAGGED | UNKNOWN)
+    async def monitor(name: OneName, bearer: Viewer, response: Response) -> Monitor:
+        """One monitor: state, counters, the text of its file, its events and properties."""
+        body, row = await looking.state(bearer, name)
+        found = await looking.compiled(body, name)
+        response.headers["ETag"] = etag(body["revision"])
+        return Monitor.model_validate(
+            row
+            | {
+                "revision": body["revision"],
+                "text": body["files"][row["file"]],
+                "alphabet": events_of(found),
+                "properties": properties_of(found),
+                "warnings": looking.warnings(row["file"]),
+                "uses": sorted(found.code.uses),
+                "hold": found.code.hold,
+            }
+        )
+
+    @router.get("/{name}/picture", operation_id="monitor_picture", responses=_PICTURE | UNKNOWN)
+    async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
+        """The automata of its properties (SVG); 404 when it has none that is finite."""
+        body, _row = await looking.state(bearer, name)
+        drawn = await asyncio.to_thread(picture_of, await looking.compiled(body, name))
+        if drawn is None:
+            raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
+        return Response(drawn, media_type="image/svg+xml")
+
+    @router.get("/{name}/history", operation_id="monitor_history")
+    async def monitor_history(
+        name: OneName,
+        bearer: Viewer,  # noqa: ARG001  asked for its role
+        cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    ) -> History:
+        """What it did last: verdicts, drops, changes, faults, output, switches; from the audit log.
+
+        A monitor that is no longer there has its history, too.
+        """
+        wanted = Filter(category="monitor", text=name)
+        page: Page = await looking.desk.read(search, looking.desk.path, wanted, cursor, limit)
+        happened = [_happened(one) for one in page.entries if _of(one, name)]
+        return History(name=name, happened=happened, cursor=page.cursor)
+
+    return router
+
+
+def _of(entry: Entry, name: str) -> bool:
+    """Whether a record is about this monitor, and not about one whose name or topic has that word in it."""
+    record = entry.record
+    return record.detail.get("monitor") == name or (
+        record.event.startswith("monitor ") and record.resource == name
+    )
+
+
+def _happened(entry: Entry) -> Happened:
+    record, detail = entry.record, entry.record.detail
+    category, count = detail.get("category"), detail.get("count")
+    return Happened(
+        sequence=entry.sequence,
+        time=rfc3339(record.time),
+        event=record.event,
+        resource=record.resource,
+        reason=record.reason,
+        category=category if isinstance(category, str) else None,
+        count=count if isinstance(count, int) else None,
+    )

@@ -1,0 +1,217 @@
+"""Monitors over REST: loaded, tried, replaced, switched and removed while the appliance runs."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.rest import Answer, Rest
+
+LIMIT = """\
+speed() {
+    int seen;
+    event said(std::string text) /chatter std_msgs/String '{data:text}' { seen = seen + 1; }
+    event never() /quiet std_msgs/String '{}' { }
+    ere: said* never
+    @fail { ROS_WARN("said after never"); }
+}
+"""
+WRONG = "speed() {\n    event said() /chatter std_msgs/Strong '{}' { }\n}\n"
+OTHER = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
+DROPPING = "speed() { event said() /chatter std_msgs/String '{}' { return; } }\n"
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with an empty folder of specifications."""
+    appliance = Appliance()
+    folder = appliance.directory / "monitors"
+    folder.mkdir()
+    appliance.options = ("--api", "127.0.0.1:0", "--api-tls", "off", "--monitors", str(folder))
+    with appliance as running:
+        yield running
+
+
+def send(rest: Rest, method: str, path: str, body: object, match: str | None = None) -> Answer:
+    """A request with JSON (a text: as text/plain) and If-Match."""
+    headers = {} if match is None else {"If-Match": match}
+    kind = "text/plain" if isinstance(body, str) else "application/json"
+    data = body.encode() if isinstance(body, str) else json.dumps(body).encode()
+    return rest.request(method, path, None if body is None else data, headers | {"Content-Type": kind})
+
+
+def load(rest: Rest, files: dict[str, str], match: str | None = "*", query: str = "") -> Answer:
+    """POST specifications."""
+    return send(rest, "POST", f"/v1/monitors{query}", {"files": files}, match)
+
+
+def test_a_specification_is_tried_loaded_replaced_and_removed(appliance: Appliance) -> None:
+    """Dry run, load, new text, removal: each says what it did, and the ETag follows the revision."""
+    rest = appliance.rest()
+    empty = rest.get("/v1/monitors")
+    assert (empty.json["monitors"], empty.json["differs_from_folder"]) == ([], False)
+    tried = load(rest, {"speed.rv": LIMIT}, None, "?dry_run=1").json
+    assert (tried["loaded"], tried["added"], tried["monitors"]) == (False, ["speed.rv"], ["speed"])
+    assert rest.get("/v1/monitors").json["monitors"] == []
+    loaded = load(rest, {"speed.rv": LIMIT, "count.rv": OTHER}, empty.etag)
+    assert loaded.status == 200, loaded.body
+    assert (loaded.json["added"], loaded.json["monitors"]) == (["count.rv", "speed.rv"], ["count", "speed"])
+    shown = rest.get("/v1/monitors?texts=1")
+    assert shown.etag == loaded.etag != empty.etag
+    assert shown.json["differs_from_folder"] is True
+    assert shown.json["who"] == "first"
+    assert shown.json["files"] == {"count.rv": OTHER, "speed.rv": LIMIT}
+    replaced = send(rest, "PUT", "/v1/monitors/speed", LIMIT.replace("seen + 1", "seen + 2"), shown.etag)
+    assert replaced.json["changed"] == ["speed.rv"]
+    removed = send(rest, "DELETE", "/v1/monitors/speed", None, replaced.etag)
+    assert (removed.json["removed"], removed.json["monitors"]) == (["speed.rv"], ["count"])
+    reloaded = send(rest, "POST", "/v1/monitors/reload", None, removed.etag)
+    assert (reloaded.json["removed"], reloaded.json["monitors"]) == (["count.rv"], [])
+    assert rest.get("/v1/monitors").json["who"] == "disk"
+    records = appliance.audit("--event", "specifications loaded", "--oldest-first")
+    assert [one["detail"]["who"] for one in records] == ["first"] * 4
+
+
+def test_one_monitor_is_shown_with_what_it_is_made_of(appliance: Appliance) -> None:
+    """Text, events, properties, lint, counters; its automaton is a picture; an unknown one is 404."""
+    rest = appliance.rest()
+    load(rest, {"speed.rv": LIMIT, "count.rv": OTHER})
+    shown = rest.get("/v1/monitors/speed").json
+    assert shown["text"] == LIMIT
+    assert [(one["name"], one["line"], one["topic"], one["type"]) for one in shown["alphabet"]] == [
+        ("said", 3, "/chatter", "std_msgs/String"), ("never", 4, "/quiet", "std_msgs/String"),
+    ]  # fmt: skip
+    (one,) = shown["properties"]
+    assert (one["logic"], one["formula"], one["handled"], one["drawn"]) == (
+        "ere", "said* never", ["fail"], True,
+    )  # fmt: skip
+    assert (shown["enabled"], shown["held"], shown["failing"], shown["verdicts"]) == (True, False, False, 0)
+    picture = rest.get("/v1/monitors/speed/picture")
+    assert picture.headers["content-type"].startswith("image/svg+xml")
+    assert picture.body.startswith(b"<svg ")
+    assert rest.get("/v1/monitors/count/picture").status == 404
+    unknown = rest.get("/v1/monitors/nobody")
+    assert unknown.status == 404
+    assert "there are: count, speed" in unknown.json["detail"]
+
+
+def test_a_wrong_specification_changes_nothing_and_says_where(appliance: Appliance) -> None:
+    """Tried or loaded, an error is 422 with file, line and column; what was in force stays."""
+    rest = appliance.rest()
+    load(rest, {"speed.rv": LIMIT})
+    for query, match in (("?dry_run=1", None), ("", "*")):
+        refused = load(rest, {"speed.rv": WRONG, "count.rv": OTHER}, match, query)
+        assert refused.status == 422
+        assert refused.json["type"] == "urn:rosrv:problem:specifications-refused"
+        (finding,) = refused.json["findings"]
+        assert (finding["file"], finding["line"], finding["severity"]) == ("speed.rv", 2, "error")
+        assert refused.json["column"] == finding["column"] > 1
+        assert "std_msgs/String" in finding["text"]
+    assert send(rest, "PUT", "/v1/monitors/speed", WRONG, "*").status == 422
+    assert rest.get("/v1/monitors").json["revision"] == 1
+    assert rest.get("/v1/monitors/speed").json["text"] == LIMIT
+
+
+def test_two_engineers_do_not_overwrite_each_other(appliance: Appliance) -> None:
+    """Without If-Match a change is 428, with the ETag of an older revision 412, and nothing happens."""
+    rest = appliance.rest()
+    seen = rest.get("/v1/monitors").etag
+    load(rest, {"speed.rv": LIMIT})
+    changes = (
+        ("POST", "", {"files": {"count.rv": OTHER}}), ("PUT", "/speed", OTHER), ("POST", "/reload", None),
+        ("DELETE", "/speed", None), ("DELETE", "?name=speed", None), ("PATCH", "/speed", {"enabled": False}),
+        ("PATCH", "", {"names": ["speed"], "held": False}),
+    )  # fmt: skip
+    for method, path, body in changes:
+        assert send(rest, method, f"/v1/monitors{path}", body).status == 428, (method, path)
+        assert send(rest, method, f"/v1/monitors{path}", body, seen).status == 412, (method, path)
+    assert load(rest, {"count.rv": OTHER}, seen, "?dry_run=1").status == 412
+    state = rest.get("/v1/monitors").json
+    assert [(one["name"], one["enabled"]) for one in state["monitors"]] == [("speed", True)]
+
+
+def test_monitors_are_switched_together_or_not_at_all(appliance: Appliance) -> None:
+    """PATCH says which were not so already; with an unknown name none is switched; what makes no sense is 422."""
+    rest = appliance.rest()
+    load(rest, {"speed.rv": LIMIT, "count.rv": OTHER})
+    assert send(rest, "PATCH", "/v1/monitors/speed", {"enabled": False}, "*").json["names"] == ["speed"]
+    both = {"names": ["speed", "count"], "enabled": False}
+    assert send(rest, "PATCH", "/v1/monitors", both, "*").json["names"] == ["count"]
+    unknown = {"names": ["speed", "nobody"], "enabled": True}
+    assert send(rest, "PATCH", "/v1/monitors", unknown, "*").status == 404
+    assert not any(one["enabled"] for one in rest.get("/v1/monitors").json["monitors"])
+    assert send(rest, "PATCH", "/v1/monitors/speed", {"held": False}, "*").json["names"] == []
+    for wrong in ({}, {"held": True}, {"enabled": True, "held": False}, {"enabled": "yes"}):
+        assert send(rest, "PATCH", "/v1/monitors/speed", wrong, "*").status == 422, wrong
+
+
+def test_each_role_may_what_it_is_for(appliance: Appliance) -> None:
+    """A viewer looks; an operator tries, switches and goes back to the folder; an admin loads and removes."""
+    rest = appliance.rest()
+    load(rest, {"speed.rv": LIMIT})
+    tokens = {
+        role: json.loads(appliance.rosrv("token", "add", f"one-{role}", "--role", role, "--json").stdout)[
+            "token"
+        ]
+        for role in ("viewer", "operator")
+    }
+    viewer, operator = rest.with_token(tokens["viewer"]), rest.with_token(tokens["operator"])
+    for path in ("", "/speed", "/speed/picture", "/speed/history"):
+        assert viewer.get(f"/v1/monitors{path}").status == 200
+    for both in (viewer, operator):
+        assert load(both, {"count.rv": OTHER}).status == 403
+        assert send(both, "PUT", "/v1/monitors/speed", LIMIT, "*").status == 403
+        assert send(both, "DELETE", "/v1/monitors/speed", None, "*").status == 403
+    assert load(viewer, {"count.rv": OTHER}, None, "?dry_run=1").status == 403
+    assert load(operator, {"count.rv": OTHER}, None, "?dry_run=1").status == 200
+    switch = {"enabled": False}
+    assert send(viewer, "PATCH", "/v1/monitors/speed", switch, "*").status == 403
+    assert send(operator, "PATCH", "/v1/monitors/speed", switch, "*").status == 200
+    assert send(operator, "POST", "/v1/monitors/reload", None, "*").status == 200
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"files": {}}, {"files": {"../up.rv": LIMIT}}, {"files": {"speed.txt": LIMIT}}, {"files": {".rv": LIMIT}},
+        {"files": {"a.rv": LIMIT}, "definitions": {"../T.msg": "int8 a"}}, {"files": {"a.rv": 7}}, {"text": LIMIT},
+        {"files": {"a.rv": LIMIT}, "note": "x" * 201},
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(shared: Rest, body: object) -> None:
+    """No file, a name that is a path or no `.rv`, a definition that is none, a note without end: 422 in words."""
+    answer = send(shared, "POST", "/v1/monitors", body, "*")
+    assert answer.status == 422, answer.body
+    assert answer.json["errors"]
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Rest]:
+    """REST of an appliance that several tests share."""
+    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as running:
+        yield running.rest()
+
+
+def test_what_a_monitor_does_is_counted_and_remembered(appliance: Appliance, tmp_path: Path) -> None:
+    """A monitor that drops every message of a real talker: its counters rise, its history has the drops."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    rest = appliance.rest()
+    load(rest, {"speed.rv": DROPPING, "count.rv": OTHER})
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        ros.talker("rospy", "/chatter", name="talker")
+        events = rest.events("/v1/audit/stream?event=message%20dropped&after=0")
+        next(events)
+        dropped = json.loads(next(one for one in events if one.get("event") == "record")["data"])
+        events.close()
+    assert dropped["detail"]["monitor"] == "speed"
+    happened = rest.get("/v1/monitors/speed/history").json["happened"]
+    assert "message dropped" in {one["event"] for one in happened}
+    assert {one["resource"] for one in happened if one["event"] == "message dropped"} == {"/chatter"}
+    assert rest.get("/v1/monitors/count/history").json["happened"] == []
+    row = next(one for one in rest.get("/v1/monitors").json["monitors"] if one["name"] == "speed")
+    assert row["drops"] >= 1
+    assert row["events"] >= row["drops"]
