@@ -1,0 +1,301 @@
+"""Makes the parts of RVMaster and connects them.
+
+Parts need each other in circles (who delivers calls to nodes reports the dead ones to who looks after the living, and
+that one delivers calls). Each builder makes some parts from those before it; what a part calls of a later one goes
+through `Wires`, the one place where the circles are.
+"""
+
+import asyncio
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import structlog
+
+from appliance.channel import messages
+from appliance.config import Settings
+from appliance.master.addresses import Addresses
+from appliance.master.core import Master
+from appliance.master.delivery import Delivery
+from appliance.master.doors import Doors, value_limits
+from appliance.master.faces import Faces
+from appliance.master.gate import Gate, HostLimits
+from appliance.master.graph import Graph
+from appliance.master.hosts import Hosts
+from appliance.master.http import Handler
+from appliance.master.inner import InnerFace
+from appliance.master.journal import StoreJournal
+from appliance.master.later import Later
+from appliance.master.lifeline import ControlLifeline
+from appliance.master.liveness import Liveness, LivenessSettings
+from appliance.master.mediation import Mediation
+from appliance.master.monitors import Monitors
+from appliance.master.node_calls import NODE_CALLS
+from appliance.master.parameters import ParameterMirror
+from appliance.master.pipeline import Pipeline
+from appliance.master.places import Places
+from appliance.master.policies import Policies
+from appliance.master.publisher import OwnPublisher
+from appliance.master.reconcile import Reconciler
+from appliance.master.recorder import Recorder
+from appliance.master.registration import withdraw
+from appliance.master.registry import Incarnation, Registration, Registry
+from appliance.master.relays import RelayControl
+from appliance.master.reminders import Reminders
+from appliance.master.revocation import Revocation
+from appliance.master.roscore import own_parameters
+from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.store.state import StateStore
+
+RVMASTER, INNER = "rvmaster", "inner"
+
+_log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Foundation:
+    """What is there before the parts: settings, durable state, policy, specifications, and the listeners.
+
+    `parameters_dirty` is set when the mirror of the parameters has changed.
+    """
+
+    settings: Settings
+    lifeline: ControlLifeline
+    store: StateStore
+    recorder: Recorder
+    policies: Policies
+    monitors: Monitors
+    hosts: Hosts
+    doors: Doors
+    sockets: Mapping[str, socket.socket]
+    parameters_dirty: asyncio.Event
+
+    def port(self, name: str) -> int:
+        """The port of a listener."""
+        return int(self.sockets[name].getsockname()[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The parts that control itself starts, restores and ends; `master` has what a call is performed with."""
+
+    master: Master
+    places: Places
+    delivery: Delivery
+    reminders: Reminders
+    reconciler: Reconciler
+    publisher: OwnPublisher
+    pipeline: Pipeline
+    inner: InnerFace
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """How nodes are known, found, told and carried."""
+
+    registry: Registry
+    places: Places
+    addresses: Addresses
+    delivery: Delivery
+    relay: RelayControl
+    mediation: Mediation
+    graph: Graph
+
+
+class _Wires:
+    """What earlier parts call of later ones."""
+
+    def __init__(self) -> None:
+        self.liveness: Later[Liveness] = Later("liveness")
+        self.faces: Later[Faces] = Later("faces")
+        self.reconciler: Later[Reconciler] = Later("the reconcile loop")
+        self.pipeline: Later[Pipeline] = Later("the pipeline")
+        self.master: Later[Master] = Later("the master")
+
+    def node_troubled(self, incarnation: Incarnation, why: str) -> None:
+        _log.info("a node could not be told", node=incarnation.name, why=why)
+        self.liveness().look_at(incarnation)
+
+    def look_at(self, incarnation: Incarnation) -> None:
+        self.liveness().look_at(incarnation)
+
+    def close_faces(self, incarnation: Incarnation) -> None:
+        self.faces().close(incarnation)
+
+    async def revive(self, incarnation: Incarnation) -> None:
+        await self.liveness().revive(incarnation)
+
+    def rosmaster_lost(self) -> None:
+        self.master().rosmaster.shut()
+        self.reconciler().wake()
+
+    async def withdraw(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
+        for registration in registrations:
+            await withdraw(self.master(), incarnation, registration.kind, registration.resource)
+
+    def node_handler(self, incarnation: Incarnation) -> Handler:
+        return self.pipeline().handler(NODE_CALLS, target=incarnation)
+
+
+def assemble(base: Foundation) -> Parts:
+    """All parts, connected; nothing serves yet."""
+    wires = _Wires()
+    reach = _make_reach(base, wires)
+    faces = wires.faces.fill(_make_faces(base, wires, reach))
+    rosmaster = RosMaster(
+        base.settings.rosmaster_port,
+        lost=wires.rosmaster_lost,
+        limits=limits_of_answers(value_limits(base.settings), int(base.settings.limits.parameter_bytes)),
+    )
+    parameters = ParameterMirror(
+        base.store.load_parameters(),
+        base.parameters_dirty.set,
+        bytes_limit=int(base.settings.limits.parameter_bytes),
+        depth_limit=base.settings.limits.nesting,
+    )
+    reconciler = wires.reconciler.fill(
+        Reconciler(
+            rosmaster,
+            reach.registry,
+            faces,
+            reach.graph,
+            parameters,
+            base.recorder,
+            own_parameters=own_parameters,
+        )
+    )
+    wires.liveness.fill(_make_liveness(base, wires, reach, reconciler))
+    master = wires.master.fill(_make_master(base, wires, reach, rosmaster, parameters))
+    return _finish(base, wires, reach, master)
+
+
+def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
+    settings = base.settings
+    registry = Registry(StoreJournal(base.store))
+    places = Places(
+        settings.listen_address[0],
+        base.policies.current.ports,
+        keep=base.lifeline.keep,
+        drop=base.lifeline.drop,
+    )
+    addresses = Addresses(
+        [(one.network, one.address) for one in settings.advertise],
+        base.lifeline.route_to if settings.isolation == "netns" else None,
+    )
+    delivery = Delivery(
+        timeout=settings.limits.node_call_seconds,
+        limits=value_limits(settings),
+        troubled=wires.node_troubled,
+    )
+    relay = RelayControl(registry, places, base.store, delivery, base.recorder, broken=wires.look_at)
+    mediation = Mediation(
+        lambda: base.policies.current,
+        lambda: base.monitors.checked,
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
+    )
+    graph = Graph(registry, relay, delivery, base.recorder, mediation, closed=wires.close_faces)
+    return _Reach(registry, places, addresses, delivery, relay, mediation, graph)
+
+
+def _make_faces(base: Foundation, wires: _Wires, reach: _Reach) -> Faces:
+    return Faces(
+        reach.registry,
+        reach.places,
+        inner_port=base.port(INNER),
+        serve=wires.node_handler,
+        address_for=reach.addresses.told_to,
+        limits=base.doors.http,
+        visitors=base.doors.visitors,
+        turns=base.doors.turns,
+        refuse=base.doors.refuse,
+        troubled=base.doors.troubled,
+        revive=wires.revive,
+        forget=reach.graph.forgotten,
+    )
+
+
+def _make_liveness(base: Foundation, wires: _Wires, reach: _Reach, reconciler: Reconciler) -> Liveness:
+    settings = base.settings
+    return Liveness(
+        reach.registry,
+        reach.graph,
+        LivenessSettings(
+            settings.liveness.interval,
+            settings.liveness.silent,
+            settings.liveness.shadow,
+            settings.limits.node_call_seconds,
+        ),
+        value_limits(settings),
+        withdraw=wires.withdraw,
+        put_back=reconciler.put_back,
+    )
+
+
+def _make_master(
+    base: Foundation, wires: _Wires, reach: _Reach, rosmaster: RosMaster, parameters: ParameterMirror
+) -> Master:
+    settings = base.settings
+    gate = Gate(
+        lambda: base.policies.current,
+        reach.registry,
+        HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host),
+        is_namespace=parameters.is_namespace,
+    )
+    return Master(
+        port=base.port(RVMASTER),
+        registry=reach.registry,
+        gate=gate,
+        recorder=base.recorder,
+        rosmaster=rosmaster,
+        relay=reach.relay,
+        graph=reach.graph,
+        faces=wires.faces(),
+        liveness=wires.liveness(),
+        parameters=parameters,
+        mediation=reach.mediation,
+        monitors=base.monitors,
+        publish_as=settings.publish_as,
+        hide_publisher=settings.hide_publisher,
+        addresses=reach.addresses,
+        policy=lambda: base.policies.current,
+        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
+    )
+
+
+def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> Parts:
+    """The parts on top, and what policy, hosts and specifications call when they change."""
+    base.monitors.send = reach.relay.send
+    reach.relay.statement, reach.relay.heard = base.monitors.statement, base.monitors.received
+    publisher = OwnPublisher(
+        master,
+        base.settings.publish_as,
+        base.port(INNER),
+        lambda: base.monitors.checked.publications,
+    )
+    base.monitors.published = publisher.wake
+    reconciler = wires.reconciler()
+    revocation = Revocation(master, put_back=reconciler.put_back)
+    base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
+
+    def policy_changed(ports: range) -> int:
+        reach.places.set_range(ports)
+        return revocation.redecide()
+
+    base.policies.changed = lambda policy: policy_changed(policy.ports)
+    return Parts(
+        master=master,
+        places=reach.places,
+        delivery=reach.delivery,
+        reminders=Reminders(reach.registry, reach.relay, reach.graph),
+        reconciler=reconciler,
+        publisher=publisher,
+        pipeline=wires.pipeline.fill(
+            Pipeline(
+                master,
+                limits=value_limits(base.settings),
+                offload=int(base.settings.limits.offload_bytes),
+            )
+        ),
+        inner=InnerFace(reach.registry, reach.delivery, value_limits(base.settings)),
+    )
