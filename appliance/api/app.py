@@ -22,6 +22,7 @@ from appliance.api import (
     monitor_changes,
     monitors,
     policy,
+    policy_changes,
 )
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
@@ -52,7 +53,18 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    for part in (health, policy, explaining, console_tests, monitors, monitor_changes, audit, graph, metrics):
+    for part in (
+        health,
+        policy,
+        policy_changes,
+        explaining,
+        console_tests,
+        monitors,
+        monitor_changes,
+        audit,
+        graph,
+        metrics,
+    ):
         app.include_router(part.routes(services))
     app.include_router(console_live.routes(services, services.history))
     for page in (console_session, console):

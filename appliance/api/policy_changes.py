@@ -1,0 +1,162 @@
+"""`/v1/policy`: try and load another policy, take the file's, go back, confirm.
+
+Loading is for admins, the rest for operators. Every change needs `If-Match` with the ETag of `GET /v1/policy`.
+"""
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+
+from appliance.api.access import Bearer, Role
+from appliance.api.bodies import read_body
+from appliance.api.judgement import Judgement, judge, word_of
+from appliance.api.policy import TAGGED
+from appliance.api.policy_models import Change, Confirmed, Loaded, PolicyText, Report, Rollback
+from appliance.api.preconditions import IfMatch, etag, expected_revision
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Operator, ask
+from appliance.api.services import Services
+from appliance.channel.admin import (
+    AdminRequest,
+    PolicyConfirm,
+    PolicyLoad,
+    PolicyReload,
+    PolicyRollback,
+    PolicyWanted,
+    RegistrationsWanted,
+)
+
+_CHANGES: dict[int | str, dict[str, Any]] = {
+    **TAGGED,
+    412: {"description": "Another policy is in force than If-Match names."},
+    428: {"description": "If-Match is missing."},
+}
+_TOO: dict[int | str, dict[str, Any]] = {415: {"description": "The body is neither text/plain nor JSON."}}
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": PolicyText.model_json_schema()},
+            "text/plain": {"schema": {"type": "string", "minLength": 1}},
+        },
+    }
+}
+Confirm = Annotated[
+    float | None,
+    Query(
+        gt=0,
+        le=86_400,
+        allow_inf_nan=False,
+        description="seconds after which it goes back by itself unless confirmed",
+    ),
+]
+DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(prefix="/v1/policy", tags=["policy"])
+    changing = _Changing(services)
+
+    @router.post("", operation_id="load_policy", responses=_CHANGES | _TOO, openapi_extra=_BODY)
+    async def load_policy(
+        *,
+        request: Request,
+        response: Response,
+        bearer: Operator,
+        if_match: IfMatch = None,
+        dry_run: DryRun = False,
+        confirm_within: Confirm = None,
+    ) -> Report:
+        """Check, test and load a new text, decide again what is live, and report; for admins.
+
+        A text with an error changes nothing: the answer (422) has every finding with its line and column.
+        """
+        if not dry_run and bearer.role < Role.ADMIN:
+            raise ProblemError(
+                403, "not-for-this-role", "loading a policy is for admins; operators may use dry_run=1"
+            )
+        content_type = request.headers.get("content-type", "")
+        posted = read_body(content_type, await request.body(), PolicyText, "the policy")
+        expected = None if dry_run and if_match is None else expected_revision(if_match)
+        order = PolicyLoad(posted.text, posted.note, confirm_within, expected)
+        return await changing.load(order, bearer, response, dry_run=dry_run)
+
+    @router.post("/rollback", operation_id="roll_back_policy", responses=_CHANGES)
+    async def rollback(
+        to: Rollback, response: Response, bearer: Operator, if_match: IfMatch = None
+    ) -> Loaded:
+        """Bring a kept revision into force again, as a new one."""
+        order = PolicyRollback(to.revision, expected_revision(if_match))
+        return Loaded.model_validate(await changing.order(order, bearer, response))
+
+    @router.post("/reload", operation_id="reload_policy", responses=_CHANGES)
+    async def reload(
+        response: Response, bearer: Operator, if_match: IfMatch = None, confirm_within: Confirm = None
+    ) -> Loaded:
+        """Read the policy file again."""
+        order = PolicyReload(confirm_within, expected_revision(if_match))
+        return Loaded.model_validate(await changing.order(order, bearer, response))
+
+    @router.post("/confirm", operation_id="confirm_policy", responses=_CHANGES)
+    async def confirm(response: Response, bearer: Operator, if_match: IfMatch = None) -> Confirmed:
+        """Keep a policy that was loaded with `confirm_within`."""
+        order = PolicyConfirm(expected_revision(if_match))
+        return Confirmed.model_validate(await changing.order(order, bearer, response))
+
+    return router
+
+
+class _Changing:
+    """What the routes of changes have in common."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._control = services.control
+
+    async def order(self, order: AdminRequest, bearer: Bearer, response: Response) -> dict[str, Any]:
+        body = await ask(self._control, order, bearer)
+        response.headers["ETag"] = etag(body["revision"])
+        return body
+
+    async def load(self, order: PolicyLoad, bearer: Bearer, response: Response, *, dry_run: bool) -> Report:
+        current = await ask(self._control, PolicyWanted(), bearer)
+        if order.expected not in (None, current["revision"]):
+            raise ProblemError(
+                412,
+                "changed-meanwhile",
+                f"revision {current['revision']} is in force, not {order.expected}",
+            )
+        live = (await ask(self._control, RegistrationsWanted(), bearer))["registrations"]
+        async with self._services.judging:
+            judgement = await asyncio.to_thread(judge, order.text, current, live)
+        if not dry_run:
+            return _report(judgement, await self.order(order, bearer, response), loaded=True)
+        response.headers["ETag"] = etag(current["revision"])
+        nothing = {"replaced": None, "revoked": None, "confirm_by": None}
+        return _report(judgement, {"revision": current["revision"], **nothing}, loaded=False)
+
+
+def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Report:
+    changes = [
+        Change(
+            host=str(one.request.host),
+            caller_id=one.request.caller_id,
+            category=one.request.category.value,
+            resource=one.request.resource,
+            now=word_of(one.old),
+            then=word_of(one.new),
+            reason=one.new.reason,
+        )
+        for one in judgement.changes
+    ]
+    return Report(
+        loaded=loaded,
+        revision=known["revision"],
+        replaced=known["replaced"],
+        revoked=known["revoked"],
+        confirm_by=known["confirm_by"],
+        warnings=judgement.warnings,
+        changes=changes,
+    )
