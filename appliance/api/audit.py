@@ -21,6 +21,7 @@ from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Operator, Viewer
 from appliance.api.services import Services
+from appliance.audit.copies import signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import Entry, as_json, as_object
@@ -72,6 +73,37 @@ class LogFinding(BaseModel):
     message: str
 
 
+class LogElsewhere(BaseModel):
+    """What checkpoints kept on another machine prove; null over REST, which is not given any."""
+
+    model_config = ConfigDict(extra="forbid")
+    checkpoints: int
+    through: int
+    time: int
+    other_logs: list[str]
+
+
+class LogCheckpoint(BaseModel):
+    """A signed checkpoint; `time` is nanoseconds since the epoch, hashes, signature and key are hexadecimal."""
+
+    model_config = ConfigDict(extra="forbid")
+    log: str
+    number: int
+    sequence: int
+    hash: str
+    time: int
+    previous: str
+    signature: str
+    key: str
+
+
+class LogCheckpoints(BaseModel):
+    """Signed checkpoints in order; ask again after the last number for more."""
+
+    model_config = ConfigDict(extra="forbid")
+    checkpoints: list[LogCheckpoint]
+
+
 class Verified(BaseModel):
     """Whether the log is complete and unchanged; the fields are those of `rosrv audit verify --json`."""
 
@@ -88,6 +120,7 @@ class Verified(BaseModel):
     unsealed: int
     key: str | None
     findings: list[LogFinding]
+    elsewhere: LogElsewhere | None
 
 
 def _wanted(
@@ -217,6 +250,16 @@ def routes(services: Services) -> APIRouter:
         """
         async with desk.turn(desk.verification, "verifications"):
             return JSONResponse(msgspec.to_builtins(await desk.in_thread(verify, desk.path)))
+
+    @router.get("/checkpoints", operation_id="audit_checkpoints", response_model=LogCheckpoints)
+    async def audit_checkpoints(
+        bearer: Viewer,  # noqa: ARG001  asked for its role
+        after: Annotated[int, Query(ge=0, le=10**18, description="only those with a greater number")] = 0,
+        limit: Limit = 1000,
+    ) -> JSONResponse:
+        """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
+        found = await desk.read(signed_checkpoints, desk.path, after, limit)
+        return JSONResponse({"checkpoints": msgspec.to_builtins(found)})
 
     @router.get(
         "/export", operation_id="export_audit", responses=_text("application/x-ndjson", "A record a line.")

@@ -21,6 +21,8 @@ class Kind(enum.StrEnum):
     SIGNATURE_MISSING = "signature missing"
     WRONG_KEY = "wrong key"
     NO_KEY = "no key"
+    REWRITTEN = "rewritten"
+    LOG_REPLACED = "log replaced"
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -32,13 +34,26 @@ class Finding(msgspec.Struct, frozen=True):
     message: str
 
 
+class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
+    """What checkpoints kept on another machine prove: how many agree with the chain, and how far.
+
+    `through` is the sequence of the last one that agrees, `time` when it was made (nanoseconds since the epoch);
+    `other_logs` are the ids of logs that the others are of.
+    """
+
+    checkpoints: int
+    through: int
+    time: int
+    other_logs: list[str]
+
+
 class Verification(msgspec.Struct, frozen=True, kw_only=True):
     """The result: `ok` when nothing is wrong.
 
     `first` and `last` are the sequences of the first and last record; `records` how many there are; `removed`
     how many retention removed before them; `signed_through` is the sequence up to which the chain is
     proven by a signature, `unsealed` how many records come after it; `key` the public key it was held
-    against.
+    against; `elsewhere` what another machine's checkpoints prove, when they were given.
     """
 
     ok: bool
@@ -53,3 +68,4 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     unsealed: int
     key: str | None
     findings: list[Finding]
+    elsewhere: Elsewhere | None = None

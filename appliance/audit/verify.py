@@ -5,11 +5,12 @@ before it, the records around it are tried in other places to tell a change from
 reordering. The checkpoints are then held against the chain, the key, and what the signer remembers.
 
 What no reading of the log can show: that records after the last signed checkpoint were cut off or written
-anew. `Verification.unsealed` says how many records that concerns.
+anew. `Verification.unsealed` says how many records that concerns. What root can forge (a history that is signed anew,
+the signer's memory with it) only checkpoints kept on another machine can show.
 """
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +20,9 @@ import msgspec
 from appliance.audit import database
 from appliance.audit.chain import NO_CHECKPOINT, StoredColumns, genesis, record_hash
 from appliance.audit.checkpoints import CheckpointAudit, checkpoint_rows, read_remembered
+from appliance.audit.copies import CopiesAudit, SignedCheckpoint
 from appliance.audit.database import LogUnreadableError, open_for_reading
-from appliance.audit.findings import Finding, Kind, Verification
+from appliance.audit.findings import Elsewhere, Finding, Kind, Verification
 from appliance.audit.signatures import pinned_key_path, read_public_key
 from appliance.audit.writer import RemovedRange
 
@@ -32,11 +34,17 @@ _DISTANCES = tuple(distance for one in range(1, 1000) for distance in (one, -one
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
 
 
-def verify(path: Path, public_key: bytes | None = None, signer: Path | None = None) -> Verification:
+def verify(
+    path: Path,
+    public_key: bytes | None = None,
+    signer: Path | None = None,
+    copies: Sequence[SignedCheckpoint] | None = None,
+) -> Verification:
     """Check the log at `path` from end to end.
 
     `public_key` (raw, 32 bytes) is the key the checkpoints must be signed with; by default the one pinned
-    beside the log. `signer` is the signer's directory, whose memory the checkpoints are held against. Raises
+    beside the log. `signer` is the signer's directory, whose memory the checkpoints are held against. `copies` are
+    checkpoints that were kept on another machine, which the chain is held against as well. Raises
     `LogUnreadableError` if there is no log, and `KeyUnreadableError` if the pinned key is no key.
     """
     if public_key is None and pinned_key_path(path).exists():
@@ -45,7 +53,7 @@ def verify(path: Path, public_key: bytes | None = None, signer: Path | None = No
         with closing(open_for_reading(path)) as connection:
             connection.text_factory = _undecoded
             connection.execute("BEGIN")
-            return _Verifier(connection, public_key, signer).run()
+            return _Verifier(connection, public_key, signer, copies).run()
     except sqlite3.Error as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
 
@@ -71,12 +79,19 @@ class _Row(NamedTuple):
 class _Verifier:
     """One walk over one log."""
 
-    def __init__(self, connection: sqlite3.Connection, key: bytes | None, signer: Path | None) -> None:
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        key: bytes | None,
+        signer: Path | None,
+        copies: Sequence[SignedCheckpoint] | None,
+    ) -> None:
         self._connection = connection
         self._key = key
         (self._log,) = connection.execute("SELECT id FROM log").fetchone()
         remembered = None if signer is None else read_remembered(signer, self._log)
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
+        self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
         self._findings: list[Finding] = []
         self._sealed: dict[int, bytes] = {}
         self._reported: dict[int, str] = {}
@@ -89,8 +104,11 @@ class _Verifier:
         removed = self._last_removal()
         sequences = self._connection.execute("SELECT sequence FROM checkpoint")
         self._sealed = {sequence: b"" for (sequence,) in sequences}
+        if self._copies is not None:
+            self._sealed |= dict.fromkeys(self._copies.sequences, b"")
         self._walk(removed)
         self._check_checkpoints(removed)
+        elsewhere = self._check_copies(removed)
         audit = self._checkpoints
         self._findings.sort(key=lambda one: one.first)
         return Verification(
@@ -98,8 +116,20 @@ class _Verifier:
             removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
-            findings=self._findings,
+            findings=self._findings, elsewhere=elsewhere,
         )  # fmt: skip
+
+    def _check_copies(self, removed: RemovedRange | None) -> Elsewhere | None:
+        if self._copies is None:
+            return None
+        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
+        gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
+        try:
+            stored = {row[0]: row[2].hex() for row in checkpoint_rows(self._connection)}
+        except sqlite3.DatabaseError:
+            stored = {}  # which is reported where the checkpoints themselves are checked
+        self._findings += self._copies.check(chain, gone, last, stored)
+        return self._copies.result()
 
     def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
         if len(self._findings) < _MOST_FINDINGS:

@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from appliance.audit.copies import CopiesUnreadableError, read_copies, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import Entry, as_json, as_object, printable
@@ -156,27 +157,61 @@ def verify(
     key: Annotated[
         Path | None, typer.Option("--key", help="Public key (PEM) that the checkpoints must be signed with")
     ] = None,
+    checkpoints: Annotated[
+        Path | None,
+        typer.Option("--checkpoints", help="Checkpoints kept on another machine: NDJSON, or a syslog file"),
+    ] = None,
     as_json_lines: _Json = False,
 ) -> None:
     """Prove that the log is complete and unchanged: exit status 0, else 1; 2 if it cannot be read.
 
     The key is the one pinned beside the log, unless --key gives one that was kept elsewhere. The checkpoints
-    are also held against what the signer remembers, if its directory can be read.
+    are also held against what the signer remembers, if its directory can be read; with --checkpoints, the log against
+    what another machine was given, which nobody here can change, root neither.
 
-    Example: rosrv audit verify --key /media/safe/audit.pub
+    Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
     with _Errors():
         path = _log(state)
+        copies = None if checkpoints is None else read_copies(checkpoints)
         public_key = None if key is None else read_public_key(key)
         signer = path.parent.parent / "signer"
         with _progress("checking the chain"):
-            result = verify_log(path, public_key, signer if os.access(signer, os.R_OK | os.X_OK) else None)
+            result = verify_log(
+                path, public_key, signer if os.access(signer, os.R_OK | os.X_OK) else None, copies
+            )
         if as_json_lines:
             write(json.dumps(msgspec.to_builtins(result)))
         else:
             print_verification(result)
         if not result.ok:
             raise typer.Exit(1)
+
+
+@app.command()
+def checkpoints(
+    state: _State = DEFAULT_STATE,
+    after: Annotated[int, typer.Option("--after", min=0, help="Only those with a greater number")] = 0,
+    follow: Annotated[bool, typer.Option("--follow", help="Wait for more, until interrupted")] = False,
+    as_json_lines: Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")] = True,  # noqa: ARG001  every verb takes --json
+) -> None:
+    """Write the signed checkpoints as NDJSON: keep them on another machine, for `verify --checkpoints`.
+
+    Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
+    """
+    with _Errors():
+        path = _log(state)
+        pause = threading.Event()
+        while True:
+            found = signed_checkpoints(path, after)
+            for one in found:
+                write(one.as_json())
+                after = one.number
+            sys.stdout.flush()
+            if not found:
+                if not follow:
+                    break
+                pause.wait(_POLL_SECONDS)
 
 
 @app.command()
@@ -218,7 +253,7 @@ class _Errors:
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         match error:
-            case LogUnreadableError() | KeyUnreadableError():
+            case LogUnreadableError() | KeyUnreadableError() | CopiesUnreadableError():
                 _fail(str(error), CANNOT_READ)
             case FilterError() | MomentError():
                 _fail(str(error), CANNOT_READ)

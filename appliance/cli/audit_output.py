@@ -4,13 +4,14 @@ Strangers' text is escaped (`printable`) and handed to the terminal as text, nev
 """
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.audit.findings import Verification
+from appliance.audit.findings import Elsewhere, Verification
 from appliance.audit.output import Entry, printable, rfc3339
 from appliance.audit.record import Record, Severity
 from appliance.audit.search import Shown
@@ -88,8 +89,23 @@ def print_verification(result: Verification) -> None:
         f"{result.signed_checkpoints} of {result.checkpoints} checkpoints are signed; records up to"
         f" {result.signed_through} are proven by a signature, {result.unsealed} after it by the chain only"
     )
+    if result.elsewhere is not None:
+        for text in _elsewhere(result.elsewhere):
+            write(text)
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
     write("The log is complete and unchanged." if result.ok else "The log was tampered with or is damaged.")
+
+
+def _elsewhere(found: Elsewhere) -> Iterator[str]:
+    if found.checkpoints:
+        yield (
+            f"{found.checkpoints} checkpoints kept elsewhere agree: records up to {found.through} are as they were"
+            f" at {rfc3339(found.time)}"
+        )
+    else:
+        yield "no checkpoint kept elsewhere proves anything of this log"
+    if found.other_logs:
+        yield f"checkpoints of other logs: {', '.join(found.other_logs)}"
 
 
 def write(text: str) -> None:

@@ -12,6 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
 from tests.support.audit import decision, settle
@@ -245,3 +246,40 @@ def test_reader_that_stops_early(state: Path) -> None:
     )
     assert done.stderr == ""
     assert done.stdout.count("\n") == 1
+
+
+def test_checkpoints_kept_elsewhere(tmp_path: Path) -> None:
+    """What `checkpoints` writes is what `verify --checkpoints` takes; a log that was cut does not agree with it."""
+    (tmp_path / "control").mkdir()
+    key = Ed25519PrivateKey.generate()
+    public = key.public_key().public_bytes_raw()
+    log = AuditLog(
+        tmp_path / "control" / "audit.db",
+        checkpoint_every=10,
+        signer=lambda number, text: log.signed(number, key.sign(text), public),
+    )
+    for number in range(40):
+        log.record(decision(log, number))
+        assert settle(log) is None
+    log.close()
+    written = rosrv("checkpoints", state=tmp_path)
+    kept = tmp_path / "kept.ndjson"
+    kept.write_text(written.stdout)
+    numbers = [one["number"] for one in lines(written)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert [one["number"] for one in lines(rosrv("checkpoints", "--after", "2", state=tmp_path))] == numbers[
+        2:
+    ]
+    whole = rosrv("verify", "--checkpoints", str(kept), state=tmp_path)
+    assert whole.returncode == 0
+    assert f"{len(numbers)} checkpoints kept elsewhere agree" in whole.stdout
+    with closing(sqlite3.connect(tmp_path / "control" / "audit.db")) as attacker:
+        attacker.execute("DELETE FROM record WHERE sequence > 15")
+        attacker.execute("DELETE FROM checkpoint WHERE sequence > 15")
+        attacker.commit()
+    cut = rosrv("verify", "--checkpoints", str(kept), state=tmp_path)
+    assert cut.returncode == 1
+    assert "TRUNCATED: records 16 to" in cut.stdout
+    none = rosrv("verify", "--checkpoints", str(tmp_path / "nothing"), state=tmp_path)
+    assert none.returncode == 2
+    assert "nothing: No such file" in none.stderr

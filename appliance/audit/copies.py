@@ -1,0 +1,196 @@
+"""Checkpoints on their way to another machine, and what its copies prove about the log that is here.
+
+Who is root on the appliance owns the signer's key and its memory, and can write the whole history anew with right
+signatures throughout. He cannot change what another machine was given before. So:
+
+1. A copy carries all that was signed, and the signature; it is proof wherever it lies.
+2. A log agrees with a copy when its chain has, at the copy's sequence, the hash that the copy names.
+3. A copy whose signature does not fit proves nothing and is told; copies of other logs are counted, and if there are
+   no others, the log that is here took the place of the one they are of.
+"""
+
+import json
+import re
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit.chain import Checkpoint, parse_checkpoint
+from appliance.audit.database import LogUnreadableError, open_for_reading
+from appliance.audit.findings import Elsewhere, Finding, Kind
+from appliance.audit.signatures import signature_is_right
+
+SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
+_LONGEST_LINE = 65_536
+_ELEMENT = re.compile(rf"\[{re.escape(SYSLOG_ELEMENT)}((?: [a-z]+=\"[0-9a-f]*\")+)\]")
+_PARAMETER = re.compile(r' ([a-z]+)="([0-9a-f]*)"')
+
+
+class CopiesUnreadableError(Exception):
+    """The file with checkpoints kept elsewhere is missing, or has none; the message says which."""
+
+
+class SignedCheckpoint(msgspec.Struct, frozen=True):
+    """A checkpoint with its signature, as it leaves the machine; hashes, signature and key in hexadecimal.
+
+    `time` is nanoseconds since the epoch. The names are those of the JSON and of the syslog message.
+    """
+
+    log: str
+    number: int
+    sequence: int
+    hash: str
+    time: int
+    previous: str
+    signature: str
+    key: str
+
+    def text(self) -> bytes:
+        """What was signed."""
+        return Checkpoint(self.log, self.number, self.sequence, self.hash, self.time, self.previous).text()
+
+    def as_json(self) -> str:
+        """One line of NDJSON, without the newline."""
+        return msgspec.json.encode(self).decode("ascii")
+
+
+def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[SignedCheckpoint]:
+    """At most `limit` signed checkpoints of the log with numbers above `after`, in order.
+
+    Raises `LogUnreadableError`.
+    """
+    query = (
+        "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND signature IS NOT NULL"
+        " AND public_key IS NOT NULL ORDER BY number LIMIT ?"
+    )
+    try:
+        with closing(open_for_reading(log)) as connection:
+            rows = connection.execute(query, (after, limit)).fetchall()
+        return [
+            SignedCheckpoint(*parse_checkpoint(text), signature.hex(), key.hex())
+            for text, signature, key in rows
+        ]
+    except (sqlite3.Error, ValueError) as error:
+        raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
+
+
+def read_copies(file: Path) -> list[SignedCheckpoint]:
+    """The checkpoints in a file: NDJSON (`rosrv audit checkpoints`), or what a syslog receiver wrote.
+
+    Other lines are passed over. Raises `CopiesUnreadableError` when there is no checkpoint in it.
+    """
+    found = []
+    try:
+        with file.open("rb") as lines:
+            for line in lines:
+                copy = _parse(line[:_LONGEST_LINE].decode("utf-8", "replace"))
+                if copy is not None:
+                    found.append(copy)
+    except OSError as error:
+        raise CopiesUnreadableError(f"{file}: {error.strerror}") from error
+    if not found:
+        raise CopiesUnreadableError(
+            f"{file}: no checkpoint in it; it takes lines of 'rosrv audit checkpoints', or of a syslog receiver"
+        )
+    return found
+
+
+def _parse(line: str) -> SignedCheckpoint | None:
+    fields: object = None
+    element = _ELEMENT.search(line)
+    if element is not None:
+        fields = dict(_PARAMETER.findall(element[1]))
+    elif line.lstrip().startswith("{"):
+        try:
+            fields = json.loads(line)
+        except (ValueError, RecursionError):
+            return None
+    try:
+        copy = msgspec.convert(fields, SignedCheckpoint, strict=False)
+        bytes.fromhex(copy.signature + copy.key)
+        parse_checkpoint(copy.text())
+    except (msgspec.ValidationError, ValueError):
+        return None
+    return copy
+
+
+class CopiesAudit:
+    """Holds the copies against the chain of the log with the id `log`; `key` is the key they must be signed with."""
+
+    def __init__(self, log: str, key: bytes | None, copies: Iterable[SignedCheckpoint]) -> None:
+        copies = list(copies)
+        self._log = log
+        self._key = key
+        self._others = sorted({one.log for one in copies if one.log != log})
+        self._copies = sorted({one for one in copies if one.log == log}, key=lambda one: one.number)
+        self.sequences = {one.sequence for one in self._copies}
+        self._agreeing: list[SignedCheckpoint] = []
+
+    def result(self) -> Elsewhere:
+        """What the copies prove."""
+        last = self._agreeing[-1] if self._agreeing else None
+        return Elsewhere(
+            checkpoints=len(self._agreeing),
+            through=last.sequence if last else 0,
+            time=last.time if last else 0,
+            other_logs=self._others,
+        )
+
+    def check(
+        self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
+    ) -> Iterator[Finding]:
+        """Compare; `chain` has the hash at each of `sequences` that is there, `removed` is how far retention went.
+
+        `last` is the sequence of the last record; `stored` the hashes of the log's own checkpoints by number.
+        """
+        if not self._copies:
+            names = ", ".join(self._others)
+            message = (
+                f"the checkpoints kept elsewhere are of log {names}; this one, {self._log}, took its place"
+            )
+            yield Finding(Kind.LOG_REPLACED, 0, 0, message)
+        proven = removed
+        for copy in self._copies:
+            wrong = self._wrong_signature(copy)
+            if wrong is not None:
+                yield wrong
+                continue
+            if copy.sequence <= removed:
+                continue
+            if copy.sequence > last:
+                message = (
+                    f"records {last + 1} to {copy.sequence} are gone from the end: checkpoint {copy.number},"
+                    " kept elsewhere, has sealed them"
+                )
+                yield Finding(Kind.TRUNCATED, last + 1, copy.sequence, message)
+                return
+            here = chain.get(copy.sequence)
+            if here is None:
+                continue  # the record it seals is missing, which is reported for the record
+            if here.hex() != copy.hash:
+                yield self._rewritten(copy, proven)
+                return
+            proven = copy.sequence
+            self._agreeing.append(copy)
+            if stored.get(copy.number, copy.text().hex()) != copy.text().hex():
+                message = f"checkpoint {copy.number}: another one than was given to the other machine"
+                yield Finding(Kind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
+
+    def _rewritten(self, copy: SignedCheckpoint, proven: int) -> Finding:
+        message = (
+            f"records {proven + 1} to {copy.sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
+            " sealed: history was written anew, by somebody who could sign"
+        )
+        return Finding(Kind.REWRITTEN, proven + 1, copy.sequence, message)
+
+    def _wrong_signature(self, copy: SignedCheckpoint) -> Finding | None:
+        name, number = f"checkpoint {copy.number}, kept elsewhere", copy.number
+        if self._key is not None and copy.key != self._key.hex():
+            message = f"{name}: signed with {copy.key}, expected is {self._key.hex()}"
+            return Finding(Kind.WRONG_KEY, number, number, message)
+        if not signature_is_right(bytes.fromhex(copy.key), bytes.fromhex(copy.signature), copy.text()):
+            return Finding(Kind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it")
+        return None

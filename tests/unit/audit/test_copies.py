@@ -1,0 +1,221 @@
+"""Tests of checkpoints kept on another machine. The attacker is root: he has the signer's key too."""
+
+import hashlib
+import json
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.chain import NO_CHECKPOINT, checkpoint_hash, genesis, parse_checkpoint, record_hash
+from appliance.audit.copies import (
+    SYSLOG_ELEMENT,
+    CopiesUnreadableError,
+    SignedCheckpoint,
+    read_copies,
+    signed_checkpoints,
+)
+from appliance.audit.database import COLUMNS
+from appliance.audit.findings import Kind, Verification
+from appliance.audit.retention import Retention
+from appliance.audit.verify import verify
+from tests.support.audit import decision, settle
+
+# ruff: noqa: S608  the attacker's statements are put together from names of columns
+
+_FIELDS = COLUMNS.split(", ")
+_EVENT, _DETAIL = _FIELDS.index("event"), _FIELDS.index("detail")
+
+
+@pytest.fixture
+def log(make_log, path: Path) -> Path:
+    """A closed log of two hundred records with signed checkpoints."""
+    log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
+    for number in range(200):
+        log.record(decision(log, number))
+        if number % 25 == 24:
+            assert settle(log) is None
+    log.close()
+    assert verify(path).ok
+    return path
+
+
+def write_anew(path: Path, key: Ed25519PrivateKey, signer: Path, change: str) -> None:
+    """As root can: change records, make every hash, checkpoint and signature anew, and the signer's memory."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(change)
+        rows = connection.execute(f"SELECT {COLUMNS} FROM record ORDER BY sequence").fetchall()
+        stored = connection.execute("SELECT number, text FROM checkpoint ORDER BY number").fetchall()
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
+        waiting = [parse_checkpoint(text) for _number, text in stored]
+        connection.execute("DELETE FROM record")
+        connection.execute("DELETE FROM checkpoint")
+        digest, hashes, previous, sealed, memory = genesis(log_id), {}, NO_CHECKPOINT, {}, b""
+        for place, row in enumerate(rows, 1):
+            columns = [place, *row[1:]]
+            if columns[_EVENT] == "checkpoint":
+                old = waiting.pop(0)
+                new = old._replace(sequence=place - 1, hash=digest.hex(), previous=previous)
+                text = new.text()
+                previous, sealed[old.number] = checkpoint_hash(text), text
+                detail = {"number": new.number, "sequence": new.sequence, "hash": new.hash}
+                columns[_DETAIL] = msgspec.json.encode(detail, order="deterministic")
+                public = key.public_key().public_bytes_raw()
+                connection.execute(
+                    "INSERT INTO checkpoint VALUES (?, ?, ?, ?, ?)",
+                    (new.number, new.sequence, text, key.sign(text), public),
+                )
+                memory += hashlib.sha256(text).digest()
+            digest = record_hash(digest, tuple(columns))
+            hashes[place] = digest
+            marks = ", ".join("?" * (len(columns) + 1))
+            connection.execute(f"INSERT INTO record VALUES ({marks})", (*columns, digest))
+        connection.commit()
+    signer.mkdir(exist_ok=True)
+    (signer / f"{log_id}.signed").write_bytes((1).to_bytes(8, "big") + memory)
+
+
+def kinds(result: Verification) -> set[Kind]:
+    """What was found."""
+    assert result.ok == (not result.findings)
+    return {one.kind for one in result.findings}
+
+
+def test_untouched(log: Path) -> None:
+    """A log that nobody touched agrees with every checkpoint that was kept elsewhere, and it is said how far."""
+    copies = signed_checkpoints(log)
+    assert len(copies) >= 4
+    result = verify(log, copies=copies)
+    assert result.ok
+    assert result.elsewhere is not None
+    assert (result.elsewhere.checkpoints, result.elsewhere.through) == (len(copies), copies[-1].sequence)
+    assert result.elsewhere.other_logs == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE record SET decision = 'deny' WHERE sequence = 60",
+        "DELETE FROM record WHERE sequence BETWEEN 60 AND 70 AND event = 'decision'",
+        "UPDATE record SET host = '10.0.0.1' WHERE sequence = 2",
+    ],
+)
+def test_history_signed_anew_by_root(log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str) -> None:
+    """A history written and signed anew with the real key passes every check here, and not the other machine's copy."""
+    copies = signed_checkpoints(log)
+    write_anew(log, key, tmp_path / "signer", change)
+    public = key.public_key().public_bytes_raw()
+    assert verify(log, public, tmp_path / "signer").ok
+    result = verify(log, public, tmp_path / "signer", copies)
+    assert Kind.REWRITTEN in kinds(result)
+
+
+def test_the_place_is_bounded_by_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """The range that is named begins after the last checkpoint that agrees and ends at the first that does not."""
+    copies = signed_checkpoints(log)
+    write_anew(log, key, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 110")
+    result = verify(log, copies=copies)
+    finding = next(one for one in result.findings if one.kind is Kind.REWRITTEN)
+    assert finding.first <= 110 <= finding.last
+    assert finding.last in {one.sequence for one in copies}
+    assert finding.first - 1 in {one.sequence for one in copies}
+
+
+def test_the_end_cut_off_by_root(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """Records cut off from the end, checkpoints and the signer's memory with them, are found by the copy."""
+    copies = signed_checkpoints(log)
+    with closing(sqlite3.connect(log)) as connection:
+        connection.execute("DELETE FROM record WHERE sequence > 90")
+        connection.execute("DELETE FROM checkpoint WHERE sequence > 90")
+        connection.commit()
+    result = verify(log, copies=copies)
+    cut = [one for one in result.findings if one.kind is Kind.TRUNCATED]
+    assert [(one.first, one.last) for one in cut] == [(91, copies[1].sequence)]
+
+
+def test_another_log_in_its_place(log: Path, make_log, path: Path) -> None:
+    """A new log, however well signed, is not the one that the other machine's checkpoints are of."""
+    copies = signed_checkpoints(log)
+    for one in path.parent.glob("audit.db*"):
+        one.unlink()
+    fresh = make_log(checkpoint_every=10)
+    fresh.record(decision(fresh))
+    assert settle(fresh) is None
+    fresh.close()
+    assert kinds(verify(path, copies=copies)) == {Kind.LOG_REPLACED}
+
+
+def test_a_forged_copy_proves_nothing(log: Path) -> None:
+    """A copy that the key did not sign is told, and is not held against the log."""
+    copies = signed_checkpoints(log)
+    forged = msgspec.structs.replace(copies[0], hash="0" * 64)
+    result = verify(log, copies=[forged, *copies[1:]])
+    assert kinds(result) == {Kind.SIGNATURE_WRONG}
+    assert result.elsewhere is not None
+    assert result.elsewhere.checkpoints == len(copies) - 1
+
+
+def test_all_signed_with_a_new_key(log: Path, tmp_path: Path) -> None:
+    """Root who replaces the key, its pin and every signature is found by the key of the copies."""
+    copies = signed_checkpoints(log)
+    other = Ed25519PrivateKey.generate()
+    write_anew(log, other, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 60")
+    public = other.public_key().public_bytes_raw()
+    assert verify(log, public, tmp_path / "signer").ok
+    assert kinds(verify(log, public, tmp_path / "signer", copies)) == {Kind.WRONG_KEY}
+
+
+def test_records_that_retention_removed(make_log, path: Path) -> None:
+    """Checkpoints of records that retention removed since are no contradiction."""
+    log = make_log(checkpoint_every=20, clock=lambda: 1)
+    for number in range(60):
+        log.record(decision(log, number, time=1))
+        settle(log)
+    log.close()
+    copies = signed_checkpoints(path)
+    log = make_log(checkpoint_every=20, retention=Retention(days=1))
+    deadline = time.monotonic() + 30
+    while not verify(path).removed and time.monotonic() < deadline:
+        log.record(decision(log))
+        settle(log)
+    log.close()
+    result = verify(path, copies=copies)
+    assert result.ok, result.findings
+    assert copies[0].sequence <= result.removed
+
+
+def test_what_a_file_may_look_like(log: Path, tmp_path: Path) -> None:
+    """NDJSON and lines of a syslog receiver are read alike; other lines, and one that was cut, are passed over."""
+    copies = signed_checkpoints(log)
+    fields = json.loads(copies[1].as_json())
+    element = " ".join(f'{name}="{value}"' for name, value in fields.items())
+    file = tmp_path / "kept"
+    file.write_text(
+        f"{copies[0].as_json()}\n"
+        '<110>1 2026-03-01T00:00:00Z robot rosrv - decision [rosrv@32473 x="1"] text\n'
+        f"<111>1 2026-03-01T00:00:00Z robot rosrv - checkpoint [{SYSLOG_ELEMENT} {element}] text\n"
+        f"{copies[2].as_json()[:50]}\n"
+    )
+    assert read_copies(file) == copies[:2]
+
+
+@pytest.mark.parametrize("text", ["", "{}\n", "[" * 100_000, '{"log": 1}\n', "\x00\xff\n"])
+def test_a_file_without_any(tmp_path: Path, text: str) -> None:
+    """A file with no checkpoint in it, or no file, is an error that names it."""
+    file = tmp_path / "kept"
+    file.write_text(text)
+    with pytest.raises(CopiesUnreadableError, match="kept: no checkpoint"):
+        read_copies(file)
+    with pytest.raises(CopiesUnreadableError, match="nowhere: No such file"):
+        read_copies(tmp_path / "nowhere")
+
+
+def test_json_and_back(log: Path) -> None:
+    """What leaves the machine is what is read again, and its signature is of exactly these fields."""
+    one = signed_checkpoints(log, limit=1)[0]
+    assert msgspec.json.decode(one.as_json(), type=SignedCheckpoint) == one
+    assert signed_checkpoints(log, after=one.number)[0].number == one.number + 1
