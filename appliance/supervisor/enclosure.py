@@ -27,6 +27,7 @@ from appliance.network.firewall.rules import FirewallSettings, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
+from appliance.network.shared import bridges, is_contained, lives_on_the_machines_network
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
@@ -111,6 +112,8 @@ class Contained(Enclosure):
 
     def build(self) -> None:
         """Install the firewall. Raises `StartError`."""
+        if self._namespace == Namespace.own():
+            _require_own_network()
         try:
             self._firewall = Firewall(self._namespace, self._backend)
             chosen = self._firewall.install(self._settings())
@@ -272,6 +275,22 @@ def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptable
     if isolation == "container":
         return Contained(ports, backend)
     return InNamespace(ports, backend) if isolation == "netns" else Enclosure()
+
+
+def _require_own_network() -> None:
+    """Raise `StartError` in a container that shares the machine's network: the firewall would be the machine's."""
+    shared = lives_on_the_machines_network()
+    if is_contained() and (shared or bridges()):
+        raise StartError(
+            "isolation container: this container shares the machine's network (network_mode: host, hostNetwork), so "
+            "the firewall would be everybody's there. Give it a network of its own, as compose.host.yaml does for a "
+            "robot whose nodes run on the machine itself; or run rosrv without a container, with isolation netns"
+        )
+    if shared:
+        log.warning(
+            "isolation container, and no container: the firewall is this machine's. That is right where it is the "
+            "appliance's alone (a virtual machine); else use --isolation netns"
+        )
 
 
 def _client_ports() -> PortRange:

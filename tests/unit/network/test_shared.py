@@ -1,0 +1,41 @@
+"""Tests of how the appliance sees that its network is the machine's own."""
+
+from pathlib import Path
+
+from appliance.network.shared import bridges, is_contained, lives_on_the_machines_network
+
+
+def test_the_machines_network_has_settings_that_no_other_has(tmp_path: Path) -> None:
+    """A namespace that was made later lacks the settings of the whole machine."""
+    settings = tmp_path / "sys/net/core"
+    settings.mkdir(parents=True)
+    (settings / "somaxconn").touch()
+    assert not lives_on_the_machines_network(tmp_path)
+    (settings / "netdev_max_backlog").touch()
+    assert lives_on_the_machines_network(tmp_path)
+
+
+def test_a_container_is_known_by_its_engines_mark(tmp_path: Path) -> None:
+    """Docker and Podman each leave a file."""
+    assert not is_contained(tmp_path)
+    (tmp_path / ".dockerenv").touch()
+    assert is_contained(tmp_path)
+
+
+def test_a_container_is_known_by_its_process_ids(tmp_path: Path) -> None:
+    """Kubernetes' containers have no mark, but process ids of their own."""
+    namespaces = tmp_path / "proc/self/ns"
+    namespaces.mkdir(parents=True)
+    (namespaces / "pid").symlink_to("pid:[4026531836]")
+    assert not is_contained(tmp_path)
+    (namespaces / "pid").unlink()
+    (namespaces / "pid").symlink_to("pid:[4026532211]")
+    assert is_contained(tmp_path)
+
+
+def test_bridges_are_told_from_other_interfaces(tmp_path: Path) -> None:
+    """An engine's machine has a bridge; a container's interfaces are none."""
+    (tmp_path / "eth0").mkdir()
+    assert bridges(tmp_path) == []
+    (tmp_path / "docker0" / "bridge").mkdir(parents=True)
+    assert bridges(tmp_path) == ["docker0"]
