@@ -53,6 +53,27 @@ def split_address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
+def split_receiver(text: str) -> tuple[str, str, int]:
+    """`udp|tcp|tls://ADDRESS:PORT` as protocol, address and port. Raises `ValueError`."""
+    protocol, slashes, place = text.partition("://")
+    example = "for example tls://10.0.0.9:6514 or udp://[fd00::9]:514"
+    if not slashes or protocol not in ("udp", "tcp", "tls"):
+        raise ValueError(f"{text!r} is not udp://, tcp:// or tls:// with ADDRESS:PORT, {example}")
+    host, port = split_address(place)
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        raise ValueError(f"{host!r} is no address; names are not looked up, {example}") from None
+    if not port:
+        raise ValueError(f"{text!r}: port 0 is no receiver's, {example}")
+    return protocol, host, port
+
+
+def _checked_receiver(text: str) -> str:
+    split_receiver(text)
+    return text
+
+
 def _checked_address(text: str) -> str:
     split_address(text)
     return text
@@ -113,6 +134,49 @@ class Limits(_Section):
     )
 
 
+class Syslog(_Section):
+    """Where the audit log is forwarded to (RFC 5424), in a process of its own; off unless `to` is given."""
+
+    to: Annotated[str, AfterValidator(_checked_receiver)] | None = Field(
+        default=None,
+        description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that nothing is asked of a name server",
+    )
+    send: Literal["all", "denials"] = Field(
+        default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
+    )
+    facility: int = Field(
+        default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`"
+    )
+    host_name: str | None = Field(
+        default=None, description="the name messages come from; the machine's unless it is given"
+    )
+    ca: Path | None = Field(
+        default=None,
+        description="authority of the receiver's certificate (PEM); those the system trusts if not given",
+    )
+    name: str | None = Field(
+        default=None, description="name in the receiver's certificate; its address unless it is given"
+    )
+    certificate: Path | None = Field(
+        default=None, description="for a receiver that wants to know who sends (PEM)"
+    )
+    key: Path | None = Field(default=None, description="of `certificate`; readable by user rosrv-syslog")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        given = [name for name in ("ca", "name", "certificate", "key") if getattr(self, name) is not None]
+        if given and (self.to is None or not self.to.startswith("tls://")):
+            raise ValueError(f"{', '.join(given)} would do nothing: only tls:// has certificates")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key go together")
+        return self
+
+    @property
+    def destination(self) -> tuple[str, str, int]:
+        """`to` as protocol, address and port; only where it is given."""
+        return split_receiver(self.to or "")
+
+
 class Audit(_Section):
     """The audit log."""
 
@@ -130,6 +194,7 @@ class Audit(_Section):
     retention_bytes: Annotated[ByteSize, Field(ge=1 << 20)] | None = Field(
         default=None, description="beyond this size the oldest records are removed"
     )
+    syslog: Syslog = Syslog()
 
 
 class Liveness(_Section):
@@ -275,6 +340,16 @@ class Settings(_Section):
     def _mediation_fits(self) -> Self:
         if self.mediation == "monitored" and self.relaying == "all":
             raise ValueError("mediation: monitored needs relaying: monitored (--relay monitored)")
+        return self
+
+    @model_validator(mode="after")
+    def _receiver_is_reachable(self) -> Self:
+        to = self.audit.syslog.to
+        if to is not None and self.isolation == "netns" and is_loopback(split_receiver(to)[1]):
+            raise ValueError(
+                f"audit.syslog.to: {to} is the loopback of the appliance's own namespace (isolation: netns);"
+                " a receiver on this machine is reached by another of its addresses"
+            )
         return self
 
     @property

@@ -30,10 +30,14 @@ _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN"}
 # What Kubernetes and container links put there for a service that happens to be named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
-_PATH_KEYS = ("policy", "monitors", "state", "hosts")
+_PATH_KEYS = (
+    ("policy",), ("monitors",), ("state",), ("hosts",),
+    ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
+)  # fmt: skip
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 
 KeyPath = tuple[str | int, ...]
+_Model = typing.TypeVar("_Model", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -108,9 +112,8 @@ class _Gathered:
             return
         if not isinstance(values, dict):
             raise ConfigError([Mistake(f"{file}:1", "must have lines of the form `key: value`")])
-        for key in _PATH_KEYS:
-            if isinstance(values.get(key), str):
-                values[key] = str(file.absolute().parent / values[key])
+        for path in _PATH_KEYS:
+            _resolve_path(values, path, file.absolute().parent)
         self._values = values
 
     def add_environment(self, environment: Mapping[str, str]) -> None:
@@ -143,8 +146,7 @@ class _Gathered:
             raise ConfigError(self._mistakes) from error
         if self._mistakes:
             raise ConfigError(self._mistakes)
-        chosen = {key: value for key in _PATH_KEYS if (value := getattr(settings, key)) is not None}
-        return settings.model_copy(update={key: path.absolute() for key, path in chosen.items()})
+        return _with_absolute_paths(settings)
 
     def _set(self, path: KeyPath, value: Any, place: str) -> None:
         table: Any = self._values
@@ -224,6 +226,30 @@ def _unknown_key(path: KeyPath) -> str:
         nearest = elsewhere[:1]
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
     return f"unknown key {_dotted(path)}: {advice}"
+
+
+def _with_absolute_paths(section: _Model) -> _Model:
+    """A copy in which no path depends on the working directory."""
+    changes: dict[str, Any] = {}
+    for key in type(section).model_fields:
+        value = getattr(section, key)
+        if isinstance(value, Path):
+            changes[key] = value.absolute()
+        elif isinstance(value, BaseModel) and (absolute := _with_absolute_paths(value)) != value:
+            changes[key] = absolute
+    return section.model_copy(update=changes) if changes else section
+
+
+def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
+    """Make the path at a key relative to the file's folder, where there is one."""
+    *sections, key = path
+    for section in sections:
+        below = values.get(section)
+        if not isinstance(below, dict):
+            return
+        values = below
+    if isinstance(values.get(key), str):
+        values[key] = str(folder / values[key])
 
 
 def _keys_at(model: type[BaseModel], path: KeyPath) -> set[str]:

@@ -54,6 +54,18 @@ METRICS = (
     Metric("rosrv_audit_queue", "gauge", (), "audit records that wait to be on disk"),
     Metric("rosrv_audit_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
     Metric("rosrv_audit_failed", "gauge", (), "1 while the audit log cannot be written"),
+    Metric("rosrv_syslog_up", "gauge", (), "1 while the audit log is forwarded; absent when it is not to be"),
+    Metric(
+        "rosrv_syslog_sent_total", "counter", (), "messages the receiver has, since the forwarder started"
+    ),
+    Metric("rosrv_syslog_lag_records", "gauge", (), "audit records that wait to be forwarded"),
+    Metric("rosrv_syslog_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
+    Metric(
+        "rosrv_syslog_missed_total",
+        "counter",
+        (),
+        "records that retention removed before they were forwarded",
+    ),
     Metric("rosrv_policy_revision", "gauge", (), "revision of the policy in force"),
     Metric("rosrv_policy_differs_from_file", "gauge", (), "1 while the policy in force is not the file's"),
     Metric("rosrv_process_restarts_total", "counter", ("role",), "times a process was started again"),

@@ -116,11 +116,25 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_audit_queue": [((), audit["lag_records"])],
         "rosrv_audit_lag_seconds": [((), audit["lag_seconds"])],
         "rosrv_audit_failed": [((), audit["failed"] is not None)],
+        **_forwarding(audit["forwarding"]),
         "rosrv_policy_revision": [((), policy["revision"])],
         "rosrv_policy_differs_from_file": [((), policy["differs_from_file"])],
         "rosrv_process_restarts_total": [((one["role"],), one["restarts"]) for one in status["processes"]],
         "rosrv_process_resident_bytes": list(_memory(status["processes"])),
         "rosrv_rest_calls_total": body["rest"],
+    }
+
+
+def _forwarding(forwarding: dict[str, Any] | None) -> dict[str, _Samples]:
+    if forwarding is None:
+        names = ("up", "sent_total", "lag_records", "lag_seconds", "missed_total")
+        return {f"rosrv_syslog_{name}": [] for name in names}
+    return {
+        "rosrv_syslog_up": [((), not forwarding["trouble"])],
+        "rosrv_syslog_sent_total": [((), forwarding["sent"])],
+        "rosrv_syslog_lag_records": [((), forwarding["behind"])],
+        "rosrv_syslog_lag_seconds": [((), forwarding["seconds"])],
+        "rosrv_syslog_missed_total": [((), forwarding["missed"])],
     }
 
 

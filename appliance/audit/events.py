@@ -55,5 +55,8 @@ EVENTS: dict[str, str] = {
     "records lost": "The queue was full while the log could not be written; `detail` has how many.",
     "checkpoint": "The state of the chain up to the record before was sealed for signing.",
     "signature refused": "The signer refused a checkpoint, or its signature is wrong or of another key.",
+    "forwarding failed": "The receiver of the forwarded log could not be reached for ten seconds; records wait here.",
+    "forwarding resumed": "The receiver of the forwarded log has it again.",
+    "forwarding gap": "Retention removed records before they could be forwarded; `detail` has how many.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }

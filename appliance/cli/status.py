@@ -44,6 +44,12 @@ def _troubles(body: dict[str, Any]) -> list[str]:
         found.append(f"the audit log cannot be written: {body['audit']['failed']}")
     if body["audit"]["degraded"]:
         found.append(f"the audit log is behind: {body['audit']['degraded']}")
+    forwarding = body["audit"]["forwarding"]
+    if forwarding is not None and forwarding["trouble"]:
+        found.append(
+            f"the audit log is not forwarded to {forwarding['to']}, {counted(forwarding['behind'], 'record')} wait:"
+            f" {forwarding['trouble']}"
+        )
     if body["probe"] not in ("", "passed"):
         found.append(f"the ROS Master is not hidden: {body['probe']}")
     monitors = body["monitors"]
@@ -100,7 +106,11 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}",
     )
     grid.add_row("tunnels", _tunnels(body["ipsec"]))
-    grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written")
+    forwarding = audit["forwarding"]
+    forwarded = (
+        "" if forwarding is None else f", {forwarding['behind']} to be forwarded to {forwarding['to']}"
+    )
+    grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written{forwarded}")
     console.print(grid)
     table = Table("process", "pid", "for", "restarts", box=None, padding=(0, 2, 0, 0), header_style="dim")
     for process in body["processes"]:

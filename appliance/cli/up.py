@@ -79,7 +79,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     configure_logs("supervisor")
     run_appliance(
         settings,
-        roles_of(api=settings.api_address is not None),
+        roles_of(api=settings.api_address is not None, syslog=settings.audit.syslog.to is not None),
         partial(_announce, as_json=as_json),
         node_ports=_node_ports(settings.policy),
     )

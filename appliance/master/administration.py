@@ -45,7 +45,10 @@ class UnknownThingError(Exception):
 
 
 class Administration:
-    """Carries out requests; `lag()` is the audit log's, in records and seconds."""
+    """Carries out requests; `lag()` is the audit log's, in records and seconds.
+
+    `forwarded()` is how its forwarding to a syslog receiver stands; None when it is not forwarded.
+    """
 
     def __init__(
         self,
@@ -60,6 +63,7 @@ class Administration:
         audit_failed: Callable[[], str | None],
         audit_degraded: Callable[[], str | None],
         queued_deliveries: Callable[[], int],
+        forwarded: Callable[[], dict[str, Any] | None],
     ) -> None:
         self._master = master
         self._policies = policies
@@ -71,6 +75,7 @@ class Administration:
         self._audit_failed = audit_failed
         self._audit_degraded = audit_degraded
         self._queued_deliveries = queued_deliveries
+        self._forwarded = forwarded
         self._started = time.time()
         self._changing = asyncio.Lock()
 
@@ -253,6 +258,7 @@ class Administration:
                 "lag_seconds": lag_seconds,
                 "failed": self._audit_failed(),
                 "degraded": self._audit_degraded(),
+                "forwarding": self._forwarded(),
             },
         }
 

@@ -20,15 +20,17 @@ from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
 from appliance.master.admin import AdminServer
 from appliance.master.administration import Administration
+from appliance.master.allocation import TOPIC, Allocation
 from appliance.master.assembly import INNER, RVMASTER, Foundation, Parts, assemble
 from appliance.master.authority import Authority
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.doors import Doors
+from appliance.master.forwarded import Forwarded
 from appliance.master.hosts import Hosts
 from appliance.master.http import listen
 from appliance.master.journal import restore
 from appliance.master.lifeline import ControlLifeline
-from appliance.master.monitors import Monitors
+from appliance.master.monitors import ALLOCATION, Monitors
 from appliance.master.places import NoPortError
 from appliance.master.policies import Policies, PolicyRefusedError
 from appliance.master.recorder import Recorder
@@ -122,6 +124,9 @@ class _Control:
             store,
             recorder,
             on_fault=self._settings.on_fault,
+            allocation=Allocation(
+                self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)
+            ),
         )
         monitors.start(restarted=restarted)
         return Foundation(
@@ -174,6 +179,7 @@ class _Control:
         await doors.open(sockets[_OWN], parts.pipeline.handler(MASTER_CALLS, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
         self._tokens = Tokens(base.store, base.recorder)
+        self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
         administration = Administration(
             parts.master,
             base.policies,
@@ -185,6 +191,7 @@ class _Control:
             audit_failed=lambda: self._audit.failed,
             audit_degraded=lambda: self._audit.degraded,
             queued_deliveries=lambda: parts.delivery.waiting,
+            forwarded=self._forwarded.status,
         )
         self._rest = RestLink(administration, self._tokens, base.recorder)
         if _ADMIN in sockets:
@@ -195,12 +202,15 @@ class _Control:
         """From now on the supervisor's messages and links to other processes are taken."""
         lifeline, base = self._lifeline, self._base
         lifeline.links["relay"] = self._relay_link
-        lifeline.links["signer"] = lambda descriptor: self._signing.attach(descriptor, self._audit)
-        lifeline.links["api"] = lambda descriptor: self._rest.attach(
+        lifeline.links["signer"] = lambda _index, descriptor: self._signing.attach(descriptor, self._audit)
+        lifeline.links["api"] = lambda _index, descriptor: self._rest.attach(
             Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
         )
-        lifeline.links["charon"] = lambda descriptor: base.hosts.attach(
+        lifeline.links["charon"] = lambda _index, descriptor: base.hosts.attach(
             Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
+        )
+        lifeline.links["syslog"] = lambda descriptor: self._forwarded.attach(
+            Channel(socket.socket(fileno=descriptor), messages.ForwardingLink)
         )
         lifeline.probed = base.doors.probed
         lifeline.processes_changed = self._parts.reconciler.wake
@@ -263,10 +273,10 @@ class _Control:
         except PolicyRefusedError as error:
             _log.error("the policy was refused, the last good one stays in force", findings=error.findings)
 
-    def _relay_link(self, descriptor: int) -> None:
-        master = self._parts.master
-        master.relay.attach(Channel(socket.socket(fileno=descriptor), messages.RelayLink))
-        master.graph.tell_everybody()
+    def _relay_link(self, index: int, descriptor: int) -> None:
+        relay = self._parts.master.relay
+        relay.attach(index, Channel(socket.socket(fileno=descriptor), messages.RelayLink))
+        self._parts.master.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
         self._parts.reminders.begin()
 
     async def _save_parameters(self) -> None:
@@ -310,5 +320,5 @@ async def _restore(base: Foundation, parts: Parts) -> None:
             _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
             registry.forget(incarnation)
             continue
-        claimed |= {incarnation.outer_port, incarnation.relay_port}
+        claimed |= set(incarnation.ports)
     places.close_unclaimed(claimed)

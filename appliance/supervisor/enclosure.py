@@ -23,7 +23,7 @@ import structlog
 from appliance.network import links
 from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
-from appliance.network.firewall.rules import FirewallSettings, PortRange
+from appliance.network.firewall.rules import FirewallSettings, Forwarder, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
@@ -47,6 +47,7 @@ class Ports:
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # who may connect to it besides this machine
     own: int | None = None
+    syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
 
 
 class Enclosure:
@@ -203,11 +204,18 @@ class Contained(Enclosure):
             api_port=self._ports.api,
             api_networks=self._api_networks(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
+            forwarder=self._forwarder(),
             tunnel_interface=TUNNEL_INTERFACE if self._tunnels and self._tunnels[1] == "user space" else None,
         )
 
     def _api_networks(self) -> tuple[str, ...]:
         return self._ports.api_networks
+
+    def _forwarder(self) -> Forwarder | None:
+        if self._ports.syslog is None:
+            return None
+        protocol, address, port = self._ports.syslog
+        return Forwarder(account_of("rosrv-syslog").uid, address, port, datagrams=protocol == "udp")
 
 
 class InNamespace(Contained):

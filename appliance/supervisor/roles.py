@@ -49,6 +49,7 @@ class Role:
     limit on open files. `readable_by` is the user whose group may pass through `part` and read what there is
     readable for it. `listens`: each of its lives is given the listening socket that the supervisor holds for it.
     `dispensable`: when it cannot serve, the others go on without it. `on_demand`: started when control asks for it.
+    `group` is the user whose group it is in instead of one of its own, to read what is `readable_by` that.
     `capabilities` are those of `privileges.SUPERVISORS` that it keeps.
     """
 
@@ -70,10 +71,13 @@ class Role:
     dispensable: bool = False
     on_demand: bool = False
     capabilities: tuple[str, ...] = ()
+    group: str | None = None
 
 
-def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = True) -> tuple[Role, ...]:
-    """The roles in the order they are started, with or without REST.
+def roles_of(
+    *, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = True, syslog: bool = False
+) -> tuple[Role, ...]:
+    """The roles in the order they are started, with or without REST and the forwarder of the audit log.
 
     Raises `StartError` when a program is missing.
     """
@@ -122,7 +126,7 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = 
             part="control",
             entry="appliance.master.process:main",
             path=lambda facts: facts.config,
-            links=("relay", "signer", "api", "charon"),
+            links=("relay", "signer", "api", "charon", "syslog"),
             files=65_536,
             readable_by="rosrv-api",
         ),
@@ -163,8 +167,20 @@ def roles_of(*, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = 
             on_demand=True,
             capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
         ),
+        Role(
+            name="syslog",
+            user="rosrv-syslog",
+            part="syslog",
+            entry="appliance.forwarding.process:main",
+            path=lambda facts: facts.config,
+            links=("control",),
+            after="control",
+            dispensable=True,
+            group="rosrv-api",
+        ),
     )
-    return tuple(role for role in roles if api or role.name != "api")
+    left_out = {name for name, wanted in (("api", api), ("syslog", syslog)) if not wanted}
+    return tuple(role for role in roles if role.name not in left_out)
 
 
 def _find(program: Path, package: str) -> None:

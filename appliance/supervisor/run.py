@@ -54,6 +54,7 @@ def run_appliance(
             nodes=node_ports,
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(one) for one in settings.api_networks),
+            syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
         )
         enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)

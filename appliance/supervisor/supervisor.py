@@ -222,7 +222,7 @@ class Supervisor:
         plan = Plan(
             parent=os.getpid(),
             lifeline=lifeline,
-            account=account_of(role.user),
+            account=account_of(role.user, group=role.group),
             home=home,
             network=role.network,
             files=role.files,

@@ -8,7 +8,7 @@ is held.
 
 import os
 import pwd
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 NUMERIC_IDS = {
     "rosrv": 61011,
@@ -17,6 +17,7 @@ NUMERIC_IDS = {
     "rosrv-api": 61014,
     "rosrv-signer": 61015,
     "rosrv-ipsec": 61016,
+    "rosrv-syslog": 61017,
 }
 
 
@@ -29,8 +30,13 @@ class Account:
     gid: int
 
 
-def account_of(user: str) -> Account:
-    """The account that a role's user stands for here. Raises `KeyError` for a user that is no role's."""
+def account_of(user: str, group: str | None = None) -> Account:
+    """The account that a role's user stands for here, in the group of the user `group` if that is given.
+
+    Raises `KeyError` for a user that is no role's.
+    """
+    if group is not None:
+        return replace(account_of(user), gid=account_of(group).gid)
     numeric = NUMERIC_IDS[user]
     if os.geteuid() != 0:
         return Account(user, os.geteuid(), os.getegid())

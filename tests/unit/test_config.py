@@ -90,3 +90,37 @@ def test_rest_can_be_off() -> None:
     assert Settings.model_validate({"api": "off"}).api_address is None
     assert Settings.model_validate({"api": False}).api_address is None
     assert Settings().api_address == ("127.0.0.1", 8443)
+
+
+@pytest.mark.parametrize(
+    ("text", "destination"),
+    [
+        ("udp://10.0.0.9:514", ("udp", "10.0.0.9", 514)),
+        ("tcp://[fd00::9]:601", ("tcp", "fd00::9", 601)),
+        ("tls://10.0.0.9:6514", ("tls", "10.0.0.9", 6514)),
+    ],
+)
+def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None:
+    """A receiver of the audit log is a protocol, an address and a port."""
+    settings = Settings.model_validate({"audit": {"syslog": {"to": text}}})
+    assert settings.audit.syslog.destination == destination
+
+
+@pytest.mark.parametrize(
+    ("syslog", "why"),
+    [
+        ({"to": "10.0.0.9:514"}, "is not udp://"),
+        ({"to": "http://10.0.0.9:514"}, "is not udp://"),
+        ({"to": "tls://logs.example.com:6514"}, "names are not looked up"),
+        ({"to": "udp://10.0.0.9:0"}, "port 0"),
+        ({"to": "udp://127.0.0.1:514"}, "loopback of the appliance's own namespace"),
+        ({"to": "tcp://10.0.0.9:601", "ca": "x.pem"}, "ca would do nothing"),
+        ({"name": "logs"}, "name would do nothing"),
+        ({"to": "tls://10.0.0.9:6514", "key": "x.pem"}, "go together"),
+        ({"to": "udp://10.0.0.9:514", "facility": 24}, "facility"),
+    ],
+)
+def test_a_syslog_receiver_that_cannot_be(syslog: dict[str, object], why: str) -> None:
+    """What could not work, or would do nothing, is an error that says which key and why."""
+    with pytest.raises(ValidationError, match=why):
+        Settings.model_validate({"audit": {"syslog": syslog}})

@@ -15,6 +15,7 @@ from appliance.channel.messages.api import (
     TokenKept,
     TokensStated,
 )
+from appliance.channel.messages.forwarding import ForwardingLink, ForwardingReported
 from appliance.channel.messages.lifeline import (
     ApplianceStopRequested,
     Failed,
@@ -121,6 +122,8 @@ __all__ = [
     "Esp",
     "Failed",
     "FirewallReported",
+    "ForwardingLink",
+    "ForwardingReported",
     "GrantInstalled",
     "GrantRevoked",
     "Lifeline",

@@ -165,6 +165,22 @@ class Rule:
         return f"{', '.join(words) or 'all'} -> {self.verdict}{f' to {self.to}' if self.to else ''}"
 
 
+@dataclass(frozen=True)
+class Forwarder:
+    """The local user that sends the audit log on, and the one receiver that it may reach."""
+
+    uid: int
+    address: str
+    port: int
+    datagrams: bool = False  # UDP, else TCP
+
+    def __post_init__(self) -> None:
+        PortRange.one(self.port)
+        family_of(self.address)
+        if self.uid < 0:
+            raise ValueError(f"forwarder: {self.uid} is no user id")
+
+
 @dataclass(frozen=True, kw_only=True)
 class FirewallSettings:
     """What the rules of the appliance's own namespace are built from.
@@ -188,6 +204,7 @@ class FirewallSettings:
     api_networks: tuple[str, ...] = ()
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
+    forwarder: Forwarder | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
@@ -222,6 +239,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
         *inner_port("ROSMaster port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *inner_port("own nodes' master", settings.own_port, "rosmaster", settings.rosmaster_uid),
+        *_forwarding(settings.forwarder),
         *_api(settings),
         *_rate_limits(settings),
         *_chosen_by_the_kernel(settings),
@@ -293,6 +311,30 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[Rule, ...]:
             destination=network,
             leaves_on=outside,
             clear_text=interface is None,
+        ),
+    )
+
+
+def _forwarding(forwarder: Forwarder | None) -> tuple[Rule, ...]:
+    """The forwarder's packets go to its receiver; whatever else its user sends goes nowhere."""
+    if forwarder is None:
+        return ()
+    ports = PortRange.one(forwarder.port)
+    return (
+        Rule(
+            chain=Chain.OUT,
+            purpose="audit log's forwarder: its receiver",
+            verdict=Verdict.RETURN,
+            destination=forwarder.address,
+            tcp_ports=None if forwarder.datagrams else ports,
+            udp_ports=ports if forwarder.datagrams else None,
+            uid=forwarder.uid,
+        ),
+        Rule(
+            chain=Chain.OUT,
+            purpose="audit log's forwarder: nobody else",
+            verdict=Verdict.DROP,
+            uid=forwarder.uid,
         ),
     )
 

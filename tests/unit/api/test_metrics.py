@@ -23,7 +23,9 @@ def body() -> dict[str, Any]:
             "version": "1", "since": 5.0, "relay": "connected", "rosmaster": "reachable",
             "policy": {"revision": 3, "differs_from_file": True},
             "monitors": {"loaded": 3, "enabled": 2, "held": ["b"], "failing": []},
-            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None},
+            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None, "forwarding": {
+                "sent": 9, "behind": 4, "seconds": 1.5, "missed": 0, "trouble": "nobody there",
+            }},
             "processes": [{"role": "control", "pid": 1, "restarts": 4}],
         },
         "queued_deliveries": 6,
@@ -64,7 +66,17 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_decision_seconds_bucket", (("le", "+Inf"),)] == 2
     assert samples["rosrv_relay_bytes_total", (("resource", '/a"\\\n'),)] == 2
     assert samples["rosrv_audit_failed", ()] == 0
+    assert samples["rosrv_syslog_up", ()] == 0
+    assert samples["rosrv_syslog_lag_records", ()] == 4
     assert samples["rosrv_process_resident_bytes", (("role", "control"),)] > 0
+
+
+def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:
+    """Without a syslog receiver there are no samples of it, so that no alert takes absence for a fault."""
+    answer = body()
+    answer["status"]["audit"]["forwarding"] = None
+    families = {one.name: one for one in text_string_to_metric_families(rendered(answer).decode())}
+    assert not any(family.samples for name, family in families.items() if name.startswith("rosrv_syslog_"))
 
 
 def test_the_page_is_what_the_code_says() -> None:

@@ -31,15 +31,26 @@ def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Pat
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
     """If one end of a link is new, the row of that end says so: a restart of either renews it."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE)}
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True)}
     for role in roles.values():
         for other in role.links:
             assert role.name in roles[other].links
 
 
+def test_the_forwarder_is_there_when_it_has_something_to_do() -> None:
+    """It has a user of its own, in the group that may read the audit log; the others do without it."""
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True)}
+    forwarder = roles["syslog"]
+    assert "syslog" not in {role.name for role in roles_of(rosmaster=HERE, rosout=HERE)}
+    assert forwarder.user not in {role.user for role in roles.values() if role is not forwarder}
+    assert forwarder.group == roles["control"].readable_by
+    assert forwarder.dispensable
+    assert not forwarder.capabilities
+
+
 def test_rows_are_consistent() -> None:
     """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
-    roles = roles_of(rosmaster=HERE, rosout=HERE)
+    roles = roles_of(rosmaster=HERE, rosout=HERE, syslog=True)
     assert all(role.user in NUMERIC_IDS for role in roles)
     assert all((role.entry is None) != (role.program is None) for role in roles)
     parts = [role.part for role in roles if role.entry]

@@ -24,6 +24,7 @@ def test_without_a_user_of_that_name_the_numeric_id_is_taken(monkeypatch: pytest
         "rosrv-api": (61014, 61014),
         "rosrv-signer": (61015, 61015),
         "rosrv-ipsec": (61016, 61016),
+        "rosrv-syslog": (61017, 61017),
     }
 
 

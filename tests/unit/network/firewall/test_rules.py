@@ -9,6 +9,7 @@ from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.rules import (
     Chain,
     FirewallSettings,
+    Forwarder,
     Interface,
     PortRange,
     RateLimit,
@@ -174,3 +175,23 @@ def test_a_rule_is_for_tcp_or_for_udp() -> None:
         )
     rule = Rule(chain=Chain.IN, purpose="one", verdict=Verdict.DROP, udp_ports=PortRange.one(500))
     assert rule.describe() == "udp 500 -> DROP"
+
+
+def test_the_forwarder_reaches_its_receiver_and_nobody_else() -> None:
+    """Of what the forwarder's user sends, only packets to the one address and port leave; nobody else is concerned."""
+    for datagrams in (False, True):
+        to = Forwarder(61017, "10.0.0.9", 6514, datagrams=datagrams)
+        settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarder=to, new_connections=None)
+        receiver, others = appliance_rules(settings)
+        assert (receiver.chain, receiver.uid, receiver.destination) == (Chain.OUT, 61017, "10.0.0.9")
+        assert receiver.verdict is Verdict.RETURN
+        assert receiver.udp_ports == (PortRange.one(6514) if datagrams else None)
+        assert receiver.tcp_ports == (None if datagrams else PortRange.one(6514))
+        assert others == Rule(chain=Chain.OUT, purpose=others.purpose, verdict=Verdict.DROP, uid=61017)
+
+
+@pytest.mark.parametrize("wrong", [(-1, "10.0.0.9", 1), (1, "logs.example.com", 1), (1, "10.0.0.9", 0)])
+def test_a_forwarder_that_cannot_be(wrong: tuple[int, str, int]) -> None:
+    """What is no user, no address or no port is an error."""
+    with pytest.raises(ValueError, match=r"is no |port"):
+        Forwarder(*wrong)

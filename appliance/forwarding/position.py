@@ -1,0 +1,38 @@
+"""How far the log was forwarded: a small file that outlives the process, and is only ever behind, never ahead.
+
+It is written after the receiver has what it says; what was sent since is sent again after a crash.
+"""
+
+import os
+from pathlib import Path
+
+import msgspec
+
+
+class Position(msgspec.Struct, frozen=True):
+    """Of the log with this id: the last record's sequence and the last checkpoint's number that were sent."""
+
+    log: str
+    sequence: int = 0
+    checkpoint: int = 0
+
+
+def load_position(path: Path) -> Position | None:
+    """What was kept; None when there is nothing. Raises `ValueError`, `OSError` when it cannot be read."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Position)
+    except FileNotFoundError:
+        return None
+    except msgspec.DecodeError as error:
+        raise ValueError(f"{path}: {error}; remove it to have the whole log forwarded again") from error
+
+
+def save_position(path: Path, position: Position) -> None:
+    """Keep it, on the disk. Raises `OSError`."""
+    making = path.with_name(path.name + ".new")
+    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(msgspec.json.encode(position))
+        file.flush()
+        os.fsync(file.fileno())
+    making.rename(path)

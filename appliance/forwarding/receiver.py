@@ -1,0 +1,163 @@
+"""The way to the receiver: UDP (RFC 5426), TCP with octet counting (RFC 6587), TLS (RFC 5425).
+
+Invariants:
+
+1. `send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left (UDP);
+   else it raises `OSError`. No call takes longer than its limits.
+2. Nothing the receiver says is interpreted; that it closes the connection is noticed before more is sent.
+3. TLS means a certificate that the configured authority signed, for the configured name or address.
+
+Syslog has no acknowledgement of its own: what a receiver had accepted and not yet worked off when it died is lost, and
+what a network drops of UDP too. Who cannot have that keeps the log itself; the checkpoints show a gap.
+"""
+
+import fcntl
+import select
+import socket
+import ssl
+import struct
+import termios
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+_CONNECT_SECONDS = 5.0
+_SEND_SECONDS = 10.0
+_OBJECTION_SECONDS = 1.0
+_LOOK_SECONDS = (0.001, 0.02)  # between two looks at what is not acknowledged yet: at first, at most
+
+
+class Receiver(Protocol):
+    """Takes messages."""
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Send all of them, in order; see the invariants above. Raises `OSError`."""
+
+    def close(self) -> None:
+        """Let go of the connection, if there is one."""
+
+
+class DatagramReceiver:
+    """One datagram for each message. That nobody listens is told by the other side only now and then."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._place = (host, port)
+        self._socket: socket.socket | None = None
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Send each as a datagram."""
+        if self._socket is None:
+            family = socket.AF_INET6 if ":" in self._place[0] else socket.AF_INET
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
+            self._socket.settimeout(_SEND_SECONDS)
+            self._socket.connect(self._place)
+        for message in messages:
+            self._socket.send(message)
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class StreamReceiver:
+    """A connection that stays open. `context` gives what TLS needs anew at each connection; None: clear text."""
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        context: Callable[[], ssl.SSLContext] | None = None,
+        name: str | None = None,
+    ) -> None:
+        self._place = (host, port)
+        self._context = context
+        self._name = name or host
+        self._socket: socket.socket | None = None
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Send each with its length before it, and wait until all of it is acknowledged."""
+        connection = self._socket
+        if connection is None:
+            connection = self._socket = self._connect()
+        _require_open(connection)
+        connection.settimeout(_SEND_SECONDS)
+        connection.sendall(b"".join(b"%d %b" % (len(one), one) for one in messages))
+        _await_acknowledgement(connection)
+
+    def _connect(self) -> socket.socket:
+        plain = socket.create_connection(self._place, _CONNECT_SECONDS)
+        try:
+            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._context is None:
+                return plain
+            return _settled(self._context().wrap_socket(plain, server_hostname=self._name))
+        except BaseException:
+            plain.close()
+            raise
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.close()
+            self._socket = None
+
+
+def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
+    """The receiver's certificate must be signed by `ca` (None: one the system trusts); ours, if it asks for one.
+
+    Raises `OSError` with the file that cannot be read.
+    """
+    try:
+        context = ssl.create_default_context(cafile=ca)
+    except OSError as error:
+        raise OSError(f"{ca}: {error.strerror or error}: the authority cannot be read") from error
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    if certificate is not None:
+        try:
+            context.load_cert_chain(certificate, key)
+        except OSError as error:
+            raise OSError(
+                f"{certificate}, {key}: {error.strerror or error}: the forwarder's own certificate cannot be read"
+            ) from error
+    return context
+
+
+def _settled(connection: ssl.SSLSocket) -> ssl.SSLSocket:
+    """With TLS 1.3 a server says only after our side of the handshake that it does not want our certificate."""
+    select.select([connection], [], [], _OBJECTION_SECONDS)
+    _require_open(connection)
+    return connection
+
+
+def _require_open(connection: socket.socket) -> None:
+    """Raise `ConnectionResetError` when the receiver has closed; what it says is thrown away."""
+    connection.settimeout(0)
+    try:
+        while True:
+            if not connection.recv(4096):
+                raise ConnectionResetError("the receiver closed the connection")
+    except (BlockingIOError, ssl.SSLWantReadError):
+        return
+
+
+def _await_acknowledgement(connection: socket.socket) -> None:
+    deadline = time.monotonic() + _SEND_SECONDS
+    pause, longest = _LOOK_SECONDS
+    while _unacknowledged(connection):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"the receiver took nothing for {_SEND_SECONDS:g} s")
+        readable, _, _ = select.select([connection], [], [], pause)
+        if readable:
+            _require_open(connection)
+        pause = min(2 * pause, longest)
+
+
+def _unacknowledged(connection: socket.socket) -> int:
+    """How many bytes the receiver's kernel has not acknowledged (`SIOCOUTQ`, tcp(7))."""
+    answer = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
+    return int(struct.unpack("i", answer)[0])

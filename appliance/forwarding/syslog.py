@@ -1,0 +1,125 @@
+"""A record as a message of RFC 5424. No I/O.
+
+Invariants:
+
+1. A message is printable ASCII: whatever a stranger named himself, no receiver, terminal or line-based file acts on it,
+   and no value can end its parameter, its element or the message (RFC 5424, 6.3.3: `"`, `\\` and `]` are escaped).
+2. A message is at most `longest` bytes: first its details go, then the end of its text; both are said. What identifies
+   the record (sequence, id) is always there.
+3. The same record gives the same message: a receiver that gets it twice sees by `sequence` that it did.
+"""
+
+import json
+import socket
+from datetime import UTC, datetime
+
+from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
+from appliance.audit.output import Entry, printable
+from appliance.audit.record import Record, RuleReference, Severity
+
+ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
+LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1
+_SEVERITIES = {
+    Severity.DEBUG: 7,
+    Severity.INFO: 6,
+    Severity.NOTICE: 5,
+    Severity.WARNING: 4,
+    Severity.ALARM: 1,
+}
+_LONGEST_MESSAGE_ID = 32
+_LONGEST_HOST_NAME = 255
+_LONGEST_VALUE = 512
+_CUT = "..."
+
+
+class Formatter:
+    """Makes messages that come from `host_name`, of a facility (0 to 23), at most `longest` bytes each."""
+
+    def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
+        self._facility = facility
+        self._longest = longest
+        self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
+
+    def record(self, entry: Entry) -> bytes:
+        """A record of the log."""
+        record = entry.record
+        head = self._head(record.severity, record.time, record.event)
+        named = _parameters(entry)
+        text = _ascii(record.reason or record.event)
+        detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else None
+        whole = _message(head, ELEMENT, {**named, "detail": detail}, text)
+        if len(whole) <= self._longest:
+            return whole
+        bare = _message(head, ELEMENT, {**named, "cut": "detail"}, "")
+        room = max(0, self._longest - len(bare) - 1)
+        return _message(head, ELEMENT, {**named, "cut": "detail"}, _shortened(text, room))
+
+    def checkpoint(self, one: SignedCheckpoint) -> bytes:
+        """A signed checkpoint: what `rosrv audit verify --checkpoints` finds again in the receiver's file."""
+        head = self._head(Severity.NOTICE, one.time, "checkpoint signed")
+        fields: dict[str, str | None] = {name: str(getattr(one, name)) for name in one.__struct_fields__}
+        return _message(head, SYSLOG_ELEMENT, fields, f"checkpoint {one.number} of the audit log")
+
+    def _head(self, severity: Severity, time: int, event: str) -> str:
+        priority = self._facility * 8 + _SEVERITIES[severity]
+        event_id = _name(event.replace(" ", "-"), _LONGEST_MESSAGE_ID)
+        return f"<{priority}>1 {_time(time)} {self._host} rosrv - {event_id}"
+
+
+def _parameters(entry: Entry) -> dict[str, str | None]:
+    record: Record = entry.record
+    return {
+        "sequence": str(entry.sequence),
+        "id": record.id,
+        "event": record.event,
+        "severity": record.severity.value,
+        "decision": record.decision,
+        "host": record.host,
+        "caller_id": record.caller_id,
+        "category": record.category,
+        "resource": record.resource,
+        "rule": _rule(record.rule),
+        "revision": None if record.revision is None else str(record.revision),
+    }
+
+
+def _rule(rule: RuleReference | None) -> str | None:
+    return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
+
+
+def _message(head: str, element: str, fields: dict[str, str | None], text: str) -> bytes:
+    shown = "".join(f' {name}="{_value(name, value)}"' for name, value in fields.items() if value)
+    return f"{head} [{element}{shown}]{f' {text}' if text else ''}".encode("ascii")
+
+
+def _value(name: str, value: str) -> str:
+    """A parameter's value. Long names of strangers are cut; details are whole or not there."""
+    shown = _ascii(value)
+    if name != "detail":
+        shown = _shortened(shown, _LONGEST_VALUE)
+    return shown.replace("\\", "\\\\").replace('"', '\\"').replace("]", "\\]")
+
+
+def _ascii(text: str) -> str:
+    return printable(text).encode("ascii", "backslashreplace").decode("ascii")
+
+
+def _shortened(text: str, room: int) -> str:
+    if len(text) <= room:
+        return text
+    return text[: room - len(_CUT)] + _CUT if room > len(_CUT) else ""
+
+
+def _name(text: str, longest: int) -> str:
+    """A field of the header: printable ASCII without space, or `-` where nothing is left (RFC 5424, 6)."""
+    return "".join(one for one in text if "!" <= one <= "~")[:longest] or "-"
+
+
+def _time(time: int) -> str:
+    """RFC 3339 with microseconds, which is what RFC 5424 allows; `-` for a time that no calendar has."""
+    seconds, fraction = divmod(time, 1_000_000_000)
+    try:
+        moment = datetime.fromtimestamp(seconds, UTC)
+    except (OverflowError, ValueError, OSError):
+        return "-"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction // 1000:06d}Z"
