@@ -23,6 +23,7 @@ from appliance.api import (
     monitors,
     policy,
     policy_changes,
+    tokens,
 )
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
@@ -61,6 +62,7 @@ def build_app(services: Services) -> FastAPI:
         console_tests,
         monitors,
         monitor_changes,
+        tokens,
         audit,
         graph,
         metrics,

@@ -2,8 +2,7 @@
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make, list or revoke tokens: an api that fell to a stranger gains no access
-that lasts.
+passes on `RestRequest`, which cannot make tokens: an api that fell to a stranger gains no access that lasts.
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
@@ -170,10 +169,10 @@ class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
 
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
-    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange
+    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange | TokenList | TokenRevoke
 )  # fmt: skip
 HostRequest = HostAdd | HostRenew | HostList | HostRevoke
-AnyRequest = RestRequest | TokenAdd | TokenList | TokenRevoke | HostRequest
+AnyRequest = RestRequest | TokenAdd | HostRequest
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "busy", "failed"]
