@@ -89,15 +89,16 @@ class StreamReceiver:
         _await_acknowledgement(connection)
 
     def _connect(self) -> socket.socket:
-        plain = socket.create_connection(self._place, _CONNECT_SECONDS)
+        connection = socket.create_connection(self._place, _CONNECT_SECONDS)
         try:
-            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if self._context is None:
-                return plain
-            return _settled(self._context().wrap_socket(plain, server_hostname=self._name))
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._context is not None:
+                connection = self._context().wrap_socket(connection, server_hostname=self._name)
+                _await_objection(connection)
         except BaseException:
-            plain.close()
+            connection.close()
             raise
+        return connection
 
     def close(self) -> None:
         """Close the connection."""
@@ -127,11 +128,10 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
     return context
 
 
-def _settled(connection: ssl.SSLSocket) -> ssl.SSLSocket:
+def _await_objection(connection: socket.socket) -> None:
     """With TLS 1.3 a server says only after our side of the handshake that it does not want our certificate."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
-    return connection
 
 
 def _require_open(connection: socket.socket) -> None:

@@ -29,6 +29,7 @@ _SEVERITIES = {
 _LONGEST_MESSAGE_ID = 32
 _LONGEST_HOST_NAME = 255
 _LONGEST_VALUE = 512
+_FIXED, _OPEN = 700, 5  # bytes of header and our own parameters at most; parameters that strangers make long
 _CUT = "..."
 
 
@@ -38,26 +39,29 @@ class Formatter:
     def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
         self._facility = facility
         self._longest = longest
+        self._room = min(_LONGEST_VALUE, (longest - _FIXED) // _OPEN)
         self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
 
     def record(self, entry: Entry) -> bytes:
         """A record of the log."""
         record = entry.record
         head = self._head(record.severity, record.time, record.event)
-        named = _parameters(entry)
+        named = {name: _value(value, self._room) for name, value in _parameters(entry).items() if value}
         text = _ascii(record.reason or record.event)
-        detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else None
-        whole = _message(head, ELEMENT, {**named, "detail": detail}, text)
-        if len(whole) <= self._longest:
-            return whole
-        bare = _message(head, ELEMENT, {**named, "cut": "detail"}, "")
-        room = max(0, self._longest - len(bare) - 1)
-        return _message(head, ELEMENT, {**named, "cut": "detail"}, _shortened(text, room))
+        detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else ""
+        if len(detail) < self._longest:
+            shown = {"detail": _value(detail, 2 * len(detail))} if detail else {}
+            whole = _message(head, ELEMENT, named | shown, text)
+            if len(whole) <= self._longest:
+                return whole
+        named |= {"cut": "detail"} if detail else {}
+        room = max(0, self._longest - len(_message(head, ELEMENT, named, "")) - 1)
+        return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, one: SignedCheckpoint) -> bytes:
         """A signed checkpoint: what `rosrv audit verify --checkpoints` finds again in the receiver's file."""
         head = self._head(Severity.NOTICE, one.time, "checkpoint signed")
-        fields: dict[str, str | None] = {name: str(getattr(one, name)) for name in one.__struct_fields__}
+        fields = {name: str(getattr(one, name)) for name in one.__struct_fields__}
         return _message(head, SYSLOG_ELEMENT, fields, f"checkpoint {one.number} of the audit log")
 
     def _head(self, severity: Severity, time: int, event: str) -> str:
@@ -87,17 +91,23 @@ def _rule(rule: RuleReference | None) -> str | None:
     return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
 
 
-def _message(head: str, element: str, fields: dict[str, str | None], text: str) -> bytes:
-    shown = "".join(f' {name}="{_value(name, value)}"' for name, value in fields.items() if value)
+def _message(head: str, element: str, fields: dict[str, str], text: str) -> bytes:
+    shown = "".join(f' {name}="{value}"' for name, value in fields.items())
     return f"{head} [{element}{shown}]{f' {text}' if text else ''}".encode("ascii")
 
 
-def _value(name: str, value: str) -> str:
-    """A parameter's value. Long names of strangers are cut; details are whole or not there."""
-    shown = _ascii(value)
-    if name != "detail":
-        shown = _shortened(shown, _LONGEST_VALUE)
-    return shown.replace("\\", "\\\\").replace('"', '\\"').replace("]", "\\]")
+def _value(value: str, room: int) -> str:
+    """A parameter's value, escaped, in at most `room` bytes."""
+    pieces = [f"\\{one}" if one in '\\"]' else one for one in _ascii(value)]
+    if sum(map(len, pieces)) <= room:
+        return "".join(pieces)
+    left, kept = room - len(_CUT), []
+    for piece in pieces:
+        left -= len(piece)
+        if left < 0:
+            break
+        kept.append(piece)
+    return "".join(kept) + _CUT
 
 
 def _ascii(text: str) -> str:

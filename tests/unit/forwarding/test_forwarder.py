@@ -1,0 +1,265 @@
+"""Tests of forwarding a real log: at least once, in order, from where it was, whatever the receiver does."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.copies import SYSLOG_ELEMENT, read_copies, signed_checkpoints
+from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.record import Severity
+from appliance.audit.retention import Retention
+from appliance.audit.search import search
+from appliance.audit.verify import verify
+from appliance.forwarding.forwarder import Chosen, Forwarder
+from appliance.forwarding.syslog import Formatter
+from tests.support.audit import decision, settle
+from tests.support.syslog import Message, parse
+
+
+class Kept:
+    """A receiver that keeps what it gets, and fails when it is told to."""
+
+    def __init__(self) -> None:
+        self.lines: list[bytes] = []
+        self.failing = 0
+        self.torn = False
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Keep them; with `torn`, the first half arrives and then it fails."""
+        if self.torn:
+            self.lines += messages[: len(messages) // 2]
+            raise ConnectionResetError("cut in the middle")
+        if self.failing:
+            self.failing -= 1
+            raise ConnectionRefusedError("nobody there")
+        self.lines += messages
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    @property
+    def messages(self) -> list[Message]:
+        """What it has, taken apart."""
+        return [parse(one) for one in self.lines]
+
+    def sequences(self) -> list[int]:
+        """The sequences of the records."""
+        return [int(one.fields["sequence"]) for one in self.messages if SYSLOG_ELEMENT not in one.elements]
+
+
+@pytest.fixture
+def kept() -> Kept:
+    """A receiver."""
+    return Kept()
+
+
+def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> Forwarder:
+    """As the process makes it."""
+    formatter = Formatter(facility=13, longest=8192, host_name="robot")
+    return Forwarder(path, path.with_name("position.json"), kept, formatter, chosen=chosen)
+
+
+def run(one: Forwarder, steps: int = 100) -> None:
+    """Step until nothing is left to do at once."""
+    for _ in range(steps):
+        if one.step() > 0:
+            return
+    raise AssertionError("it does not come to an end")
+
+
+def record(log: AuditLog, count: int, **fields: object) -> None:
+    """Record some and wait until they are on disk."""
+    for number in range(count):
+        log.record(decision(log, number, **fields))
+    assert settle(log) is None
+
+
+def everything(path: Path) -> list[int]:
+    """All sequences of the log."""
+    found: list[int] = []
+    cursor: str | None = "0"
+    while cursor is not None:
+        page = search(path, Filter(), cursor, 1000, newest_first=False)
+        found += [one.sequence for one in page.entries]
+        cursor = page.cursor
+    return found
+
+
+def test_the_whole_log_in_order(make_log, path: Path, kept: Kept) -> None:
+    """Every record is sent once and in order, also what was there before; then it waits for more."""
+    log = make_log()
+    record(log, 700)
+    one = forwarder(path, kept)
+    run(one)
+    record(log, 3)
+    run(one)
+    assert kept.sequences() == everything(path)
+    assert one.progress.behind == 0
+    assert one.progress.trouble == ""
+
+
+def test_a_receiver_that_is_away(make_log, path: Path, kept: Kept) -> None:
+    """Nothing is passed over: after a failure the same batch is sent again, at growing distances."""
+    log = make_log()
+    record(log, 10)
+    kept.failing = 4
+    one = forwarder(path, kept)
+    pauses = [one.step() for _ in range(4)]
+    assert pauses == sorted(pauses)
+    assert pauses[-1] > pauses[0]
+    assert one.progress.trouble == "nobody there"
+    assert one.progress.behind >= 10
+    assert one.progress.seconds > 0
+    run(one)
+    assert kept.sequences() == everything(path)
+    assert one.progress.trouble == ""
+
+
+def test_the_distance_is_bounded(make_log, path: Path, kept: Kept) -> None:
+    """However long the receiver is away, it is asked for again within half a minute."""
+    record(make_log(), 1)
+    kept.failing = 50
+    one = forwarder(path, kept)
+    assert max(one.step() for _ in range(50)) == 30.0
+
+
+def test_over_a_restart(make_log, path: Path, kept: Kept) -> None:
+    """A forwarder that is started again goes on where the one before ended."""
+    log = make_log()
+    record(log, 300)
+    first = forwarder(path, kept)
+    run(first)
+    first.close()
+    record(log, 5)
+    second = forwarder(path, kept)
+    run(second)
+    assert kept.sequences() == everything(path)
+
+
+def test_a_forwarder_that_was_killed(make_log, path: Path, kept: Kept) -> None:
+    """After a death in the middle of a batch the batch is sent again: nothing is missing, some is there twice."""
+    log = make_log()
+    record(log, 300)
+    first = forwarder(path, kept)
+    first.step()
+    kept.torn = True
+    first.step()  # and is killed: nothing is closed
+    kept.torn = False
+    run(forwarder(path, kept))
+    sequences = kept.sequences()
+    assert sorted(set(sequences)) == everything(path)
+    assert len(sequences) > len(set(sequences))
+
+
+def test_only_denials(make_log, path: Path, kept: Kept) -> None:
+    """With `denials`, what was refused, warnings and alarms are sent, and every checkpoint; nothing else."""
+    log = make_log(checkpoint_every=5)
+    record(log, 20)
+    log.record(decision(log, decision="deny", severity=Severity.WARNING, resource="/arm"))
+    log.record(decision(log, decision=None, event="probe failed", severity=Severity.ALARM))
+    assert settle(log) is None
+    log.close()
+    one = forwarder(path, kept, "denials")
+    run(one)
+    records = [one for one in kept.messages if SYSLOG_ELEMENT not in one.elements]
+    assert {one.event for one in records} == {"decision", "probe-failed"}
+    assert [one.fields.get("decision") for one in records if one.event == "decision"] == ["deny"]
+    assert len(kept.messages) - len(records) == len(signed_checkpoints(path))
+    assert one.progress.behind == 0
+
+
+def test_checkpoints_at_the_receiver_are_proof(make_log, path: Path, kept: Kept, tmp_path: Path) -> None:
+    """The receiver's file is what `verify --checkpoints` takes: each checkpoint comes after the records it seals."""
+    log = make_log(checkpoint_every=50)
+    for _ in range(10):
+        record(log, 30)
+    log.close()
+    run(forwarder(path, kept))
+    file = tmp_path / "messages.log"
+    file.write_bytes(b"\n".join(b"Nov 20 10:00:00 robot " + one for one in kept.lines))
+    copies = read_copies(file)
+    assert copies == signed_checkpoints(path)
+    result = verify(path, copies=copies)
+    assert result.ok
+    assert result.elsewhere is not None
+    assert result.elsewhere.checkpoints == len(copies)
+    seen = 0
+    for message in kept.messages:
+        if SYSLOG_ELEMENT in message.elements:
+            assert int(message.fields["sequence"]) <= seen
+        else:
+            seen = int(message.fields["sequence"])
+
+
+def test_what_retention_took_before(make_log, path: Path, kept: Kept) -> None:
+    """Records that were removed before they could be sent are counted, not passed over in silence."""
+    log = make_log(checkpoint_every=20, clock=lambda: 1)
+    record(log, 100, time=1)
+    first = forwarder(path, kept)
+    first.step()
+    first.close()
+    record(log, 400, time=1)
+    log.close()
+    before = kept.sequences()[-1]
+    log = make_log(checkpoint_every=20, retention=Retention(days=1))
+    for _ in range(200):
+        record(log, 1)
+        if everything(path)[0] > before + 1:
+            break
+    log.close()
+    one = forwarder(path, kept)
+    run(one)
+    assert one.progress.missed == everything(path)[0] - before - 1
+    assert one.progress.missed > 0
+    assert one.progress.behind == 0
+
+
+def test_a_log_that_was_there_long_before(make_log, path: Path, kept: Kept) -> None:
+    """What retention removed before forwarding was ever asked for is not missed."""
+    log = make_log(checkpoint_every=20, clock=lambda: 1)
+    record(log, 100, time=1)
+    log.close()
+    log = make_log(checkpoint_every=20, retention=Retention(days=1))
+    for _ in range(200):
+        record(log, 1)
+        if everything(path)[0] > 50:
+            break
+    one = forwarder(path, kept)
+    run(one)
+    assert everything(path)[0] > 50
+    assert one.progress.missed == 0
+
+
+def test_another_log(make_log, path: Path, kept: Kept) -> None:
+    """A new log in the place of the old one is forwarded from its beginning."""
+    log = make_log()
+    record(log, 20)
+    one = forwarder(path, kept)
+    run(one)
+    log.close()
+    for file in path.parent.glob("audit.db*"):
+        file.unlink()
+    kept.lines.clear()
+    record(make_log(), 4)
+    one.step()  # finds that it is another one
+    run(one)
+    assert kept.sequences() == everything(path)
+
+
+def test_no_log_yet(path: Path, kept: Kept) -> None:
+    """Without a log it says so and comes again."""
+    one = forwarder(path, kept)
+    assert one.step() > 0
+    assert "no audit log yet" in one.progress.trouble
+
+
+def test_a_position_that_cannot_be_read(make_log, path: Path, kept: Kept) -> None:
+    """A damaged position stops the forwarding with the reason; nothing is sent twice or not at all in silence."""
+    record(make_log(), 3)
+    path.with_name("position.json").write_text("rubbish")
+    one = forwarder(path, kept)
+    assert one.step() > 0
+    assert "position.json" in one.progress.trouble
+    assert kept.lines == []

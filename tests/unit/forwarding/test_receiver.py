@@ -1,0 +1,159 @@
+"""Tests of the way to a receiver, over real sockets on loopback."""
+
+import socket
+import ssl
+import threading
+from pathlib import Path
+
+import pytest
+
+from appliance.forwarding.receiver import DatagramReceiver, StreamReceiver, tls_context
+from tests.support.syslog import DatagramCollector, StreamCollector
+from tests.unit.forwarding.conftest import Certificates, make_certificates
+
+HOST = "127.0.0.1"
+
+
+def message(number: int) -> bytes:
+    """A small message with a number."""
+    return f'<110>1 - robot rosrv - decision [rosrv@32473 sequence="{number}"]'.encode()
+
+
+def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.SSLContext:
+    """The receiver's side."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificates.certificate, certificates.key)
+    if clients:
+        context.load_verify_locations(certificates.ca)
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+def test_datagrams() -> None:
+    """Over UDP each message is a datagram."""
+    with DatagramCollector() as collector:
+        receiver = DatagramReceiver(HOST, collector.port)
+        receiver.send([message(1), message(2)])
+        collector.wait_for(lambda messages: len(messages) == 2)
+        assert collector.sequences() == [1, 2]
+        receiver.close()
+
+
+def test_octet_counting() -> None:
+    """Over TCP each message has its length before it, whatever is in it, on one connection that stays open."""
+    with StreamCollector() as collector:
+        receiver = StreamReceiver(HOST, collector.port)
+        receiver.send([message(1), message(2)])
+        receiver.send([message(3)])
+        collector.wait_for(lambda messages: len(messages) == 3)
+        assert collector.sequences() == [1, 2, 3]
+        assert collector.connected == 1
+        receiver.close()
+
+
+def test_a_receiver_that_went_away() -> None:
+    """That the receiver closed is an error before anything more is taken for sent; the next connection works."""
+    with StreamCollector() as collector:
+        receiver = StreamReceiver(HOST, collector.port)
+        receiver.send([message(1)])
+        collector.wait_for(lambda messages: messages)
+        collector.close()
+        with pytest.raises(OSError, match=r"closed|reset|refused"):
+            receiver.send([message(2)])
+        receiver.close()
+        with pytest.raises(ConnectionRefusedError):
+            receiver.send([message(2)])
+        collector.open()
+        receiver.send([message(2)])
+        collector.wait_for(lambda messages: len(messages) == 2)
+        assert collector.sequences() == [1, 2]
+        receiver.close()
+
+
+def test_a_receiver_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the other side's kernel does not acknowledge is not taken for sent: an error within the limit."""
+    monkeypatch.setattr("appliance.forwarding.receiver._SEND_SECONDS", 0.3)
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        listener.bind((HOST, 0))
+        listener.listen(1)
+        receiver = StreamReceiver(HOST, listener.getsockname()[1])
+        with pytest.raises(TimeoutError):
+            for _ in range(1000):
+                receiver.send([b"x" * 60_000])
+        receiver.close()
+
+
+def test_tls(certificates: Certificates) -> None:
+    """Over TLS the receiver shows a certificate of the given authority, for its address or the given name."""
+    with StreamCollector(context=server_context(certificates)) as collector:
+        for name in (None, "logs.example"):
+            receiver = StreamReceiver(
+                HOST, collector.port, lambda: tls_context(certificates.ca, None, None), name
+            )
+            receiver.send([message(1)])
+            receiver.close()
+        collector.wait_for(lambda messages: len(messages) == 2)
+
+
+def test_tls_with_the_wrong_receiver(certificates: Certificates, tmp_path: Path) -> None:
+    """A certificate of another authority, or for another name, gets nothing sent."""
+    other = make_certificates(tmp_path / "other")
+    with StreamCollector(context=server_context(certificates)) as collector:
+        for ca, name in ((other.ca, None), (certificates.ca, "evil.example")):
+            receiver = StreamReceiver(HOST, collector.port, lambda ca=ca: tls_context(ca, None, None), name)
+            with pytest.raises(ssl.SSLCertVerificationError):
+                receiver.send([message(1)])
+            receiver.close()
+        assert collector.messages == []
+
+
+def test_tls_clients_that_must_show_a_certificate(certificates: Certificates) -> None:
+    """With ours the receiver takes it; without, the refusal is an error although TLS 1.3 tells it late."""
+    with StreamCollector(context=server_context(certificates, clients=True)) as collector:
+        receiver = StreamReceiver(
+            HOST,
+            collector.port,
+            lambda: tls_context(certificates.ca, certificates.certificate, certificates.key),
+        )
+        receiver.send([message(1)])
+        collector.wait_for(lambda messages: len(messages) == 1)
+        receiver.close()
+        bare = StreamReceiver(HOST, collector.port, lambda: tls_context(certificates.ca, None, None))
+        with pytest.raises(OSError, match=r"certificate|closed|reset"):
+            bare.send([message(2)])
+        bare.close()
+        assert collector.sequences() == [1]
+
+
+def test_files_that_cannot_be_read(tmp_path: Path, certificates: Certificates) -> None:
+    """A missing authority or certificate is an error that names the file."""
+    with pytest.raises(OSError, match=r"nowhere\.pem.*authority"):
+        tls_context(tmp_path / "nowhere.pem", None, None)
+    with pytest.raises(OSError, match=r"nowhere\.key.*own certificate"):
+        tls_context(certificates.ca, certificates.certificate, tmp_path / "nowhere.key")
+
+
+def test_clear_text_where_tls_is_meant(certificates: Certificates) -> None:
+    """A receiver that does not speak TLS is an error, and is sent no record."""
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        listener.listen(1)
+        seen: list[bytes] = []
+
+        def answer() -> None:
+            connection, _peer = listener.accept()
+            with connection:
+                seen.append(connection.recv(65_536))
+                connection.sendall(b"220 hello\r\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        receiver = StreamReceiver(
+            HOST, listener.getsockname()[1], lambda: tls_context(certificates.ca, None, None)
+        )
+        with pytest.raises(ssl.SSLError):
+            receiver.send([message(1)])
+        thread.join()
+        receiver.close()
+        assert b"rosrv@32473" not in b"".join(seen)

@@ -1,0 +1,148 @@
+"""Tests of records as messages of RFC 5424, read back by its grammar."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
+from appliance.audit.output import Entry
+from appliance.audit.record import Record, RuleReference, Severity
+from appliance.forwarding.syslog import ELEMENT, Formatter
+from tests.support.syslog import parse
+
+_TIME = 1_700_000_000_123_456_789
+
+
+def entry(**fields: Any) -> Entry:
+    """A record at place 7."""
+    return Entry(7, Record(**{"id": "0" * 20, "time": _TIME, "event": "decision"} | fields))
+
+
+def formatter(longest: int = 8192) -> Formatter:
+    """As the appliance has it."""
+    return Formatter(facility=13, longest=longest, host_name="robot-1")
+
+
+def test_a_denial() -> None:
+    """Who, what, the rule and the reason are there, each in its own parameter, and the time to the microsecond."""
+    message = parse(
+        formatter().record(
+            entry(
+                severity=Severity.WARNING, decision="deny", host="10.0.0.66", caller_id="/evil",
+                category="publish", resource="/cmd_vel", revision=3, reason="[Publishers] /cmd_vel does not have it",
+                rule=RuleReference("Publishers", "/cmd_vel", "robot.ini", 12), detail={"call": "registerPublisher"},
+            )
+        )
+    )  # fmt: skip
+    assert (message.facility, message.severity) == (13, 4)
+    assert (message.host, message.program, message.event) == ("robot-1", "rosrv", "decision")
+    assert message.time == "2023-11-14T22:13:20.123456Z"
+    assert message.text == "[Publishers] /cmd_vel does not have it"
+    assert message.elements == {
+        ELEMENT: {
+            "sequence": "7", "id": "0" * 20, "event": "decision", "severity": "warning", "decision": "deny",
+            "host": "10.0.0.66", "caller_id": "/evil", "category": "publish", "resource": "/cmd_vel",
+            "rule": "[Publishers] /cmd_vel robot.ini:12", "revision": "3",
+            "detail": '{"call":"registerPublisher"}',
+        }
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("severity", "number"),
+    [
+        (Severity.DEBUG, 7),
+        (Severity.INFO, 6),
+        (Severity.NOTICE, 5),
+        (Severity.WARNING, 4),
+        (Severity.ALARM, 1),
+    ],
+)
+def test_severities(severity: Severity, number: int) -> None:
+    """Each severity has its own in syslog: an alarm is an alert."""
+    assert parse(formatter().record(entry(severity=severity))).severity == number
+
+
+def test_an_event_of_several_words() -> None:
+    """The event is the message id, without spaces."""
+    assert parse(formatter().record(entry(event="denials folded"))).event == "denials-folded"
+
+
+@given(
+    caller=st.text(max_size=80), resource=st.text(max_size=80), reason=st.text(max_size=200),
+    detail=st.dictionaries(st.text(max_size=8), st.text(max_size=30), max_size=4),
+)  # fmt: skip
+def test_strangers_text(caller: str, resource: str, reason: str, detail: dict[str, str]) -> None:
+    """Whatever a stranger is called, the message is printable ASCII, and ends no parameter and no line."""
+    record = entry(caller_id=caller, resource=resource, reason=reason, detail=detail)
+    data = formatter().record(record)
+    assert all(0x20 <= one <= 0x7E for one in data)
+    fields = parse(data).fields
+    assert set(fields) <= {"sequence", "id", "event", "severity", "caller_id", "resource", "detail"}
+    if detail:
+        assert json.loads(fields["detail"].encode().decode("unicode_escape")) is not None
+
+
+def test_injection() -> None:
+    """A name that is written like the end of an element, or a second message, is the value of its parameter."""
+    evil = '/x"] [rosrv@32473 decision="allow"]\n<0>1 - - - - - -'
+    message = parse(formatter().record(entry(caller_id=evil, decision="deny")))
+    assert message.fields["decision"] == "deny"
+    assert message.fields["caller_id"] == '/x"] [rosrv@32473 decision="allow"]\\n<0>1 - - - - - -'
+    assert list(message.elements) == [ELEMENT]
+
+
+@pytest.mark.parametrize("longest", [2048, 8192])
+def test_a_bound(longest: int) -> None:
+    """However long everything is, the message is within the bound and says what was left out."""
+    huge = "\\]" * 4096
+    data = formatter(longest).record(
+        entry(
+            caller_id=huge,
+            resource=huge[:300],
+            host="10.0.0.1",
+            reason="r" * 4096,
+            detail={"x": "y" * 60_000},
+        )
+    )
+    assert len(data) <= longest
+    message = parse(data)
+    assert message.fields["cut"] == "detail"
+    assert message.fields["sequence"] == "7"
+    assert message.fields["caller_id"].endswith("...")
+    assert message.text.startswith("rrr")
+
+
+def test_the_bound_of_a_datagram() -> None:
+    """An ordinary record with large details fits a datagram, with its whole reason."""
+    data = formatter(2048).record(entry(reason="why it was so", detail={"before": "00" * 4000}))
+    assert len(data) <= 2048
+    assert parse(data).text == "why it was so"
+
+
+@pytest.mark.parametrize("time", [-1, 0, 2**62, -(2**62)])
+def test_any_time(time: int) -> None:
+    """A clock that is far off makes no message that a receiver refuses."""
+    parse(formatter().record(entry(time=time)))
+
+
+@pytest.mark.parametrize("name", ["", "räuber", "two words", "x" * 300, "\n"])
+def test_any_host_name(name: str) -> None:
+    """Whatever the machine is called, the header has its form."""
+    assert parse(Formatter(facility=0, longest=2048, host_name=name).record(entry())).host
+
+
+def test_a_checkpoint() -> None:
+    """A checkpoint carries all that was signed, and the signature, under a name of its own."""
+    one = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
+    message = parse(formatter().checkpoint(one))
+    assert message.event == "checkpoint-signed"
+    assert message.elements == {
+        SYSLOG_ELEMENT: {
+            "log": "a" * 32, "number": "3", "sequence": "120", "hash": "b" * 64, "time": str(_TIME),
+            "previous": "c" * 64, "signature": "d" * 128, "key": "e" * 64,
+        }
+    }  # fmt: skip
