@@ -72,8 +72,12 @@ class Liveness:
                 self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
-        """Look at a node now (unless it is being looked at)."""
-        if incarnation.key not in self._looks:
+        """Look at a node now (unless it is being looked at).
+
+        The publisher of what monitors publish is control itself: it is there, and the firewall lets only the ROS Master
+        call it.
+        """
+        if incarnation.key not in self._looks and not incarnation.of_monitors:
             task = asyncio.get_running_loop().create_task(self._look(incarnation))
             self._looks[incarnation.key] = task
             task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
