@@ -6,6 +6,7 @@ here because something reads it.
 """
 
 import ipaddress
+import os
 import re
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -255,6 +256,11 @@ class ApiLimits(_Section):
     streams: Count = Field(default=16, description="clients that follow the audit log, at once")
 
 
+def relays_for_this_machine() -> int:
+    """How many relay processes there are unless it is configured: half of the cores, 1 to 4."""
+    return max(1, min(4, (os.cpu_count() or 1) // 2))
+
+
 class Settings(_Section):
     """All of it."""
 
@@ -316,7 +322,11 @@ class Settings(_Section):
         default=Path("ipsec/hosts.yaml"),
         description="the hosts that are meant to be enrolled; may be missing",
     )
-    relays: Count = Field(default=1, le=1, description="relay processes")
+    relays: Count = Field(
+        default_factory=relays_for_this_machine,
+        le=16,
+        description="relay processes that share topics and monitors; by default one for every two cores, at most 4",
+    )
     advertise: list[Advertisement] = []
     limits: Limits = Limits()
     audit: Audit = Audit()

@@ -30,6 +30,7 @@ from appliance.master.lifeline import ControlLifeline
 from appliance.master.liveness import Liveness, LivenessSettings
 from appliance.master.mediation import Mediation
 from appliance.master.monitors import Monitors
+from appliance.master.moving import Moving
 from appliance.master.node_calls import NODE_CALLS
 from appliance.master.parameters import ParameterMirror
 from appliance.master.pipeline import Pipeline
@@ -177,6 +178,7 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         base.policies.current.ports,
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
+        relays=settings.relays,
     )
     addresses = Addresses(
         [(one.network, one.address) for one in settings.advertise],
@@ -187,7 +189,15 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         limits=value_limits(settings),
         troubled=wires.node_troubled,
     )
-    relay = RelayControl(registry, places, base.store, delivery, base.recorder, broken=wires.look_at)
+    relay = RelayControl(
+        registry,
+        places,
+        base.store,
+        delivery,
+        base.recorder,
+        allocation=base.monitors.allocation,
+        broken=wires.look_at,
+    )
     mediation = Mediation(
         lambda: base.policies.current,
         lambda: base.monitors.checked,
@@ -265,8 +275,11 @@ def _make_master(
 
 def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> Parts:
     """The parts on top, and what policy, hosts and specifications call when they change."""
-    base.monitors.send = reach.relay.send
-    reach.relay.statement, reach.relay.heard = base.monitors.statement, base.monitors.received
+    relay, reminders = reach.relay, Reminders(reach.registry, reach.relay, reach.graph)
+    base.monitors.connect(Moving(relay, reach.graph, reminders))
+    relay.statement, relay.heard, relay.lost = (
+        base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
+    )  # fmt: skip
     publisher = OwnPublisher(
         master,
         base.settings.publish_as,
@@ -287,7 +300,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
         master=master,
         places=reach.places,
         delivery=reach.delivery,
-        reminders=Reminders(reach.registry, reach.relay, reach.graph),
+        reminders=reminders,
         reconciler=reconciler,
         publisher=publisher,
         pipeline=wires.pipeline.fill(

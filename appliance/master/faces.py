@@ -97,7 +97,7 @@ class Faces:
         return await asyncio.shield(coming)
 
     async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
-        outer_port, relay_port = self._places.open()
+        outer_port, relay_port, *more = self._places.open()
         incarnation = Incarnation(
             key=new_key(),
             name=caller.caller_id,
@@ -107,6 +107,7 @@ class Faces:
             told=self._address_for(caller.peer),
             outer_port=outer_port,
             relay_port=relay_port,
+            more_relay_ports=tuple(more),
             own=caller.own,
             changed=time.time(),
             touched=time.monotonic(),
@@ -131,12 +132,15 @@ class Faces:
 
     async def reopen(self, incarnation: Incarnation) -> None:
         """Serve the faces of an incarnation that was restored. Raises `NoPortError` when a port is taken."""
+        ports = incarnation.ports
         if not self._places.reopen(incarnation):
             raise NoPortError(f"a port of {incarnation.name} is in use by another program")
+        if incarnation.ports != ports:
+            self._registry.changed_ports(incarnation)
         await self.open(incarnation)
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the outer face and both ports, once: afterwards the ports may be another incarnation's."""
+        """Close the outer face and all its ports, once: afterwards the ports may be another incarnation's."""
         server = self._servers.pop(incarnation.key, None)
         if server is not None:
             server.close()

@@ -168,11 +168,18 @@ class Graph:
         for subscriber in list(self._registry.registered(Kind.SUBSCRIPTION, topic)):
             self._tell_one(subscriber, topic, always=always)
 
-    def tell_everybody(self) -> None:
-        """Give every subscriber the lists of all its topics, once: after a rebuild or a new relay."""
+    def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> None:
+        """Give every subscriber the lists of all (the concerned) topics, once: after a rebuild or a new relay."""
         topics = {one.resource for _node, one in self._registry.in_order() if one.kind is Kind.SUBSCRIPTION}
         for topic in sorted(topics):
-            self.tell(topic, always=True)
+            if concerned(topic):
+                self.tell(topic, always=True)
+
+    def renew_all(self, topic: str) -> None:
+        """Have every subscriber of a topic drop its publishers and take them again: they are reached elsewhere."""
+        publishers = list(self._registry.registered(Kind.PUBLICATION, topic))
+        for subscriber in list(self._registry.registered(Kind.SUBSCRIPTION, topic)):
+            self.renew(subscriber, topic, publishers)
 
     def remind(self, subscriber: Incarnation, topic: str) -> None:
         """Give a subscriber its list of a topic once more."""

@@ -21,7 +21,7 @@ class StoreJournal:
             IncarnationRow(
                 incarnation.key, incarnation.name, str(incarnation.host), incarnation.api_text, incarnation.told,
                 incarnation.outer_port, incarnation.relay_port, incarnation.own, incarnation.life.value,
-                incarnation.changed,
+                incarnation.changed, incarnation.more_relay_ports,
             )
         )  # fmt: skip
 
@@ -69,6 +69,7 @@ def restore(registry: Registry, store: StateStore) -> int:
             own=row.own,
             life=Life(row.life),
             changed=row.changed,
+            more_relay_ports=row.more_relay_ports,
         )
         for row in incarnations
     }

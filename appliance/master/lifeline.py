@@ -15,21 +15,21 @@ _log = structlog.get_logger()
 
 
 class ControlLifeline:
-    """The lifeline; `links[role]` is called with each new link, `stopped()` when control is to end."""
+    """The lifeline; `links[role]` is called with the other end's index and each new link, `stopped()` at the end."""
 
     def __init__(self, descriptor: int) -> None:
         self._channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
-        self.links: dict[str, Callable[[int], None]] = {}
+        self.links: dict[str, Callable[[int, int], None]] = {}
         self.stopped: Callable[[], None] = lambda: None
         self.processes_changed: Callable[[], None] = lambda: None
         self.reload_requested: Callable[[], None] = lambda: None
         self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
         self.tunnels_enclosed: Callable[[messages.TunnelsEnclosed], None] = lambda answer: None  # noqa: ARG005 - as above
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
-        self._early_links: list[tuple[str, int]] = []
+        self._early_links: list[tuple[str, int, int]] = []
 
     def attach(self) -> None:
         """Begin to listen; `restored` is set when all kept sockets are here."""
@@ -38,8 +38,8 @@ class ControlLifeline:
     def open_links(self) -> None:
         """Hand out the links that came before control was ready for them."""
         early, self._early_links = self._early_links, []
-        for role, descriptor in early:
-            self._open_link(role, descriptor)
+        for role, index, descriptor in early:
+            self._open_link(role, index, descriptor)
 
     def say(self, message: messages.Message) -> None:
         """Tell the supervisor something."""
@@ -80,8 +80,8 @@ class ControlLifeline:
                 self.sockets[name] = socket.socket(fileno=descriptors[0])
             case messages.SocketsRestored():
                 self.restored.set()
-            case messages.LinkOpened(role):
-                self._open_link(role, descriptors[0])
+            case messages.LinkOpened(role, index):
+                self._open_link(role, index, descriptors[0])
             case _ if not descriptors:
                 self._learned(message)
             case _:
@@ -112,12 +112,12 @@ class ControlLifeline:
             case _:
                 _not_for_us(message)
 
-    def _open_link(self, role: str, descriptor: int) -> None:
+    def _open_link(self, role: str, index: int, descriptor: int) -> None:
         serve = self.links.get(role)
         if serve is not None:
-            serve(descriptor)
+            serve(index, descriptor)
         else:
-            self._early_links.append((role, descriptor))
+            self._early_links.append((role, index, descriptor))
 
 
 def _not_for_us(message: Any) -> None:

@@ -35,7 +35,8 @@ async def lookup_service(master: "Master", caller: Caller, arguments: tuple[obje
             return [-1, "no provider", ""]
         if master.mediation.carries_service(service):
             master.relay.grant_service(incarnation, service, caller.peer.host)
-            uri = service_uri(master.addresses.told_to(caller.peer), incarnation.relay_port)
+            port = master.relay.port(incarnation, Kind.SERVICE, service)
+            uri = service_uri(master.addresses.told_to(caller.peer), port)
         else:
             port = int(incarnation.registrations[Kind.SERVICE, service].detail)
             uri = service_uri(str(incarnation.host), port)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from appliance.master.core import Master
 
 _WORDS = {"enable": True, "disable": False}
+_NOBODY = (0, 0)
 
 
 async def get_monitors(master: "Master", _caller: Caller, _arguments: tuple[object, ...]) -> Answer:
@@ -36,17 +37,19 @@ async def monitor_control(master: "Master", caller: Caller, arguments: tuple[obj
 async def get_rv_state(master: "Master", _caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`getRVState(caller_id)` → `[real port, RVMaster's port, [[monitor, topic, XML-RPC port, TCP port], …]]`.
 
-    The ports are those that stand for each publisher of the topic.
+    The ports are those that stand for each publisher of the topic; 0 for a topic that nobody publishes.
     """
     return [1, "RV State", cast(Value, rv_state(master))]
 
 
 def rv_state(master: "Master") -> list[object]:
     """The value of `getRVState`."""
-    rows = [
-        [monitor, topic, publisher.outer_port, publisher.relay_port]
-        for monitor, topics in master.monitors.checked.topics.items()
-        for topic in sorted(topics)
-        for publisher in master.registry.registered(Kind.PUBLICATION, topic)
-    ]
+    rows: list[list[object]] = []
+    for monitor, topics in master.monitors.checked.topics.items():
+        for topic in sorted(topics):
+            ports = [
+                (publisher.outer_port, master.relay.port(publisher, Kind.PUBLICATION, topic))
+                for publisher in master.registry.registered(Kind.PUBLICATION, topic)
+            ]
+            rows += [[monitor, topic, *pair] for pair in ports or [_NOBODY]]
     return [master.rosmaster.port, master.port, rows]

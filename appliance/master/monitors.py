@@ -10,7 +10,7 @@ Switches survive restarts, too: a monitor that nobody has switched is enabled or
 import asyncio
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +19,8 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
+from appliance.master.allocation import Allocation
+from appliance.master.moving import Relays
 from appliance.master.observed import MonitorRecords
 from appliance.master.recorder import Recorder
 from appliance.master.specifications import (
@@ -28,12 +30,13 @@ from appliance.master.specifications import (
     check,
     read_folder,
 )
+from appliance.master.stating import Revision, Stating
 from appliance.store.state import MonitorRevisionRow, StateStore
 
 _log = structlog.get_logger()
 _DISK = "disk"
 _SWITCHES = "monitor switches"
-_RELAY_SECONDS = 15.0
+ALLOCATION = "relays"
 
 
 class UnknownMonitorError(Exception):
@@ -51,7 +54,10 @@ class MonitorsChangedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Replaced:
-    """What a load did: the revision in force, the one before, files added, changed and removed, the lint."""
+    """What a load did: the revision in force, the one before, files added, changed and removed, the lint.
+
+    `moved` are monitors that began in their initial state because another relay process has them now.
+    """
 
     revision: int
     replaced: int
@@ -59,13 +65,13 @@ class Replaced:
     changed: list[str]
     removed: list[str]
     warnings: list[str]
+    moved: list[str]
 
 
 class Monitors:
     """Keeps specifications and switches.
 
-    `send(message)` tells the relay, and says whether one is there; `published()` is called when monitors may publish
-    other topics. Changes are made one at a time.
+    `published()` is called when monitors may publish other topics. Changes are made one at a time.
     """
 
     def __init__(
@@ -76,26 +82,21 @@ class Monitors:
         recorder: Recorder,
         *,
         on_fault: Literal["drop", "pass"] = "drop",
+        allocation: Allocation | None = None,
     ) -> None:
         self.folder = folder
         self._enable = enable
         self._store = store
         self._recorder = recorder
-        self._on_fault: Literal["drop", "pass"] = on_fault
+        self.allocation = allocation or Allocation(1)
+        self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
         self._switches: dict[str, bool] = {}
-        self._answers: dict[int, asyncio.Future[list[str]]] = {}
         self._changing = asyncio.Lock()
-        self._relay_known = False
-        self._fresh = False
         self.revision = 0
         self.sources = Sources()
         self.checked = Checked()
         self.who, self.note, self.loaded = _DISK, "", 0.0
-        self.refused: list[str] = []
-        self.held: set[str] = set()
-        self.rows: dict[str, messages.MonitorRow] = {}
         self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data))  # noqa: PLW0108 - of whatever is in force then
-        self.send: Callable[[messages.Message], bool] = lambda message: False  # noqa: ARG005 - set when wired
         self.published: Callable[[], None] = lambda: None
 
     # --- start ---
@@ -106,8 +107,8 @@ class Monitors:
         As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
         unless an operator's own revision was in force when it stopped.
         """
-        self._relay_known = restarted
-        self._switches = json.loads(self._store.settings().get(_SWITCHES, "{}"))
+        settings = self._store.settings()
+        self._switches = json.loads(settings.get(_SWITCHES, "{}"))
         last = self._store.monitor_revision()
         if last is not None and (restarted or last.who != _DISK):
             sources = Sources(**json.loads(last.sources))
@@ -119,13 +120,34 @@ class Monitors:
                 self._enforce(sources, checked, last)
             elif sources.files or last is not None:
                 self._keep(sources, checked, who=_DISK, note="read at start")
+        now = Revision(self.revision, self.sources, self.checked)
+        self._stating.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         unknown = sorted(self._named() - self.checked.monitors.keys())
         if unknown and self.who == _DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
         if unknown:  # it was removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
 
+    def connect(self, relays: Relays) -> None:
+        """These are the relays."""
+        self._stating.relays = relays
+
     # --- looking ---
+
+    @property
+    def refused(self) -> list[str]:
+        """Why a relay does not take what is in force; empty when all do."""
+        return self._stating.refused
+
+    @property
+    def held(self) -> set[str]:
+        """The monitors that hold their topics."""
+        return self._stating.held
+
+    @property
+    def rows(self) -> Mapping[str, messages.MonitorRow]:
+        """State and counters of the monitors."""
+        return self._stating.rows
 
     @property
     def differs_from_folder(self) -> bool:
@@ -144,11 +166,9 @@ class Monitors:
         """All monitors, in the order in which they see messages."""
         return list(self.checked.monitors)
 
-    def statement(self) -> messages.SpecificationsStated:
-        """What a relay is told before anything else; one that follows another must hold what is to be held."""
-        restarted, self._relay_known = self._relay_known, True
-        self._fresh = restarted
-        return self._statement(restarted)
+    def statement(self, relay: int = 0) -> messages.SpecificationsStated:
+        """What a relay is told before anything else."""
+        return self._stating.statement(relay)
 
     # --- changing ---
 
@@ -207,7 +227,7 @@ class Monitors:
             changed = [name for name in dict.fromkeys(names) if self.enabled(name) is not enabled]
             for name in changed:
                 self._switches[name] = enabled
-                self.send(messages.MonitorSwitched(name, enabled))
+                self._stating.tell(name, messages.MonitorSwitched(name, enabled))
                 word = "enabled" if enabled else "disabled"
                 self._recorder.happened(
                     f"monitor {word}",
@@ -228,8 +248,8 @@ class Monitors:
         self._all_known(names)
         held = [name for name in dict.fromkeys(names) if name in self.held]
         for name in held:
-            self.send(messages.MonitorResumed(name))
-            self.held.discard(name)
+            self._stating.tell(name, messages.MonitorResumed(name))
+            self._stating.resumed(name)
             self._recorder.happened(
                 "monitor resumed",
                 f"the topics of {name} go on",
@@ -242,50 +262,16 @@ class Monitors:
 
     # --- what the relay says ---
 
-    def received(self, message: messages.Message) -> None:
-        """A message of the relay about monitors."""
-        match message:
-            case messages.SpecificationsTaken(revision, began, held):
-                self._taken(revision, began, held)
-            case messages.SpecificationsRefused(revision, findings):
-                self._relay_refused(revision, findings)
-            case messages.MonitorsCounted(rows):
-                self.rows = {row.name: row for row in rows}
-            case messages.MonitorsReported(events, lost):
-                self.records.reported(events, lost)
+    def received(self, message: messages.Message, relay: int = 0) -> None:
+        """A message of a relay about monitors."""
+        if isinstance(message, messages.MonitorsReported):
+            self.records.reported(message.events, message.lost)
+        else:
+            self._stating.received(message, relay)
 
-    def _taken(self, revision: int, began: list[str], held: list[str]) -> None:
-        self.refused = []
-        self.held = set(held)
-        if self._fresh and began:
-            self._recorder.happened(
-                "monitors restarted",
-                f"a new relay process: {', '.join(began)} began in the initial state"
-                + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
-                severity=Severity.ALARM,
-                category="monitor",
-                resource="",
-                monitors=began,
-                held=held,
-            )
-        self._fresh = False
-        self._answer(revision, [])
-
-    def _relay_refused(self, revision: int, findings: list[str]) -> None:
-        if revision == self.revision:
-            self.refused = findings
-        self._recorder.happened(
-            "specifications refused",
-            f"the relay does not take revision {revision}: {findings[0] if findings else ''}",
-            severity=Severity.ALARM,
-            findings=findings,
-        )
-        self._answer(revision, findings or ["the relay gives no reason"])
-
-    def _answer(self, revision: int, findings: list[str]) -> None:
-        waiting = self._answers.pop(revision, None)
-        if waiting is not None and not waiting.done():
-            waiting.set_result(findings)
+    def relay_lost(self, relay: int) -> None:
+        """A relay is gone."""
+        self._stating.lost(relay)
 
     # --- inside ---
 
@@ -308,21 +294,11 @@ class Monitors:
         if expected is not None and expected != self.revision:
             raise MonitorsChangedError(expected, self.revision)
 
-    def _statement(self, restarted: bool) -> messages.SpecificationsStated:
-        return messages.SpecificationsStated(
-            self.revision,
-            list(self.sources.files.items()),
-            self.sources.definitions,
-            {name: self.enabled(name) for name in self.checked.monitors},
-            restarted,
-            self._on_fault,
-        )
-
     async def _change(self, sources: Sources, keeper: str, who: str, note: str) -> Replaced:
         before, previous = self.revision, self.sources
         try:
             checked = await asyncio.to_thread(check, sources)
-            await self._try(sources, checked)
+            moved = await self._stating.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
             self._recorder.happened(
                 "specifications refused",
@@ -333,37 +309,10 @@ class Monitors:
             )
             raise
         self._keep(sources, checked, who=keeper, note=note, by=who, before=previous)
-        self.send(self._statement(False))  # a relay that came in between was told the revision before
         await self._store.settled()
         self.published()
         added, changed, removed = sources.difference(previous)
-        return Replaced(self.revision, before, added, changed, removed, list(checked.warnings))
-
-    async def _try(self, sources: Sources, checked: Checked) -> None:
-        """Have the relay take them. Without a relay they come into force when there is one."""
-        number = self.revision + 1
-        answer = asyncio.get_running_loop().create_future()
-        self._answers[number] = answer
-        statement = messages.SpecificationsStated(
-            number,
-            list(sources.files.items()),
-            sources.definitions,
-            {name: self.enabled(name) for name in checked.monitors},
-            False,
-            self._on_fault,
-        )
-        try:
-            if not self.send(statement):
-                return
-            findings = await asyncio.wait_for(answer, _RELAY_SECONDS)
-        except TimeoutError:
-            self.send(self._statement(False))
-            text = f"the relay does not answer within {_RELAY_SECONDS:g} s; try again"
-            raise SpecificationsRefusedError([text]) from None
-        finally:
-            self._answers.pop(number, None)
-        if findings:
-            raise SpecificationsRefusedError(findings)
+        return Replaced(self.revision, before, added, changed, removed, list(checked.warnings), moved)
 
     def _keep(
         self,

@@ -7,11 +7,11 @@ sends those, so from anybody else they are denied like any unknown call.
 
 from typing import TYPE_CHECKING, cast
 
+from appliance.master.allocation import TOPIC as TOPIC_CONNECTION
 from appliance.master.arguments import MESSAGE, PROTOCOLS, TOPIC
 from appliance.master.call import Answer, Call, Caller, Identity
 from appliance.master.client import CallFailedError
 from appliance.master.registry import Incarnation, Kind
-from appliance.master.relays import TOPIC as TOPIC_CONNECTION
 from appliance.master.relays import tcpros_port
 from appliance.policy.model import Category
 from appliance.ros.uris import node_uri
@@ -35,7 +35,8 @@ async def request_topic(master: "Master", caller: Caller, arguments: tuple[objec
         return await _negotiated_directly(master, target, topic, caller)
     master.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
     address = master.addresses.told_to(caller.peer)
-    return [1, f"ready on {address}:{target.relay_port}", ["TCPROS", address, target.relay_port]]
+    port = master.relay.port(target, Kind.PUBLICATION, topic)
+    return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
 
 async def _negotiated_directly(master: "Master", target: Incarnation, topic: str, caller: Caller) -> Answer:
@@ -108,7 +109,8 @@ async def get_bus_info(master: "Master", caller: Caller, _arguments: tuple[objec
         if connection.kind != TOPIC_CONNECTION:
             continue
         if connection.key == target.key:
-            text = f"TCPROS connection on port {target.relay_port} to [{connection.host}]"
+            port = master.relay.port(target, Kind.PUBLICATION, connection.resource)
+            text = f"TCPROS connection on port {port} to [{connection.host}]"
             rows.append(
                 [connection.number, connection.caller_id, "o", "TCPROS", connection.resource, True, text]
             )
@@ -116,7 +118,8 @@ async def get_bus_info(master: "Master", caller: Caller, _arguments: tuple[objec
             publisher = master.registry.by_key(connection.key)
             if publisher is not None:
                 uri = publisher.outer_uri(address)
-                text = f"TCPROS connection to [{address}:{publisher.relay_port}]"
+                port = master.relay.port(publisher, Kind.PUBLICATION, connection.resource)
+                text = f"TCPROS connection to [{address}:{port}]"
                 rows.append([connection.number, uri, "i", "TCPROS", connection.resource, True, text])
     return [1, "bus info", rows]
 

@@ -5,9 +5,10 @@ Everything is read from the registry and the relay's reports at one moment. The 
 
 from typing import Any
 
+from appliance.master.allocation import SERVICE, TOPIC
 from appliance.master.core import Master
 from appliance.master.registry import Incarnation, Kind, Life
-from appliance.master.relays import SERVICE, TOPIC, RelayControl
+from appliance.master.relays import RelayControl
 
 _ANY_TYPE = "*"
 

@@ -3,8 +3,8 @@
 Control opens every listening socket and gives the supervisor a duplicate to keep, so that neither control's death
 nor the relay's closes a port; a restarted control gets them back by name.
 
-Ports come from the policy's `[Ports]` range, two per incarnation, the longest unused first: a subscriber that still
-knocks at a dead node's port finds nobody, not somebody else.
+Ports come from the policy's `[Ports]` range, for each incarnation one and another for every relay process, the longest
+unused first: a subscriber that still knocks at a dead node's port finds nobody, not somebody else.
 """
 
 import errno
@@ -33,7 +33,9 @@ class Places:
         *,
         keep: Callable[[str, sockets.socket], None],
         drop: Callable[[str], None],
+        relays: int = 1,
     ) -> None:
+        self._each = 1 + relays
         self._host = host
         self._keep = keep
         self._drop = drop
@@ -49,20 +51,25 @@ class Places:
         used = {one.getsockname()[1] for one in self._sockets.values()}
         self._unused = deque(port for port in ports if port not in used)
 
-    def open(self) -> tuple[int, int]:
-        """Reserve two ports with listening sockets: (outer, relay). Raises `NoPortError`."""
-        outer = self._listen()
+    def open(self) -> tuple[int, ...]:
+        """Reserve ports with listening sockets: (outer, one for each relay). Raises `NoPortError`."""
+        return self._open(self._each)
+
+    def _open(self, count: int) -> tuple[int, ...]:
+        opened: list[sockets.socket] = []
         try:
-            relay = self._listen()
+            while len(opened) < count:
+                opened.append(self._listen())
         except NoPortError:
-            self._unused.append(outer.getsockname()[1])
-            outer.close()
+            for one in opened:
+                self._unused.append(one.getsockname()[1])
+                one.close()
             raise
-        ports = (outer.getsockname()[1], relay.getsockname()[1])
-        self._sockets[f"port:{ports[0]}"], self._sockets[f"port:{ports[1]}"] = outer, relay
-        self._keep(f"port:{ports[0]}", outer)
-        self._keep(f"port:{ports[1]}", relay)
-        return ports
+        for one in opened:
+            name = f"port:{one.getsockname()[1]}"
+            self._sockets[name] = one
+            self._keep(name, one)
+        return tuple(one.getsockname()[1] for one in opened)
 
     def socket(self, port: int) -> sockets.socket:
         """The listening socket of a port that was opened or adopted."""
@@ -76,9 +83,13 @@ class Places:
             self._unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
-        """Open the same ports again (after a restart of the appliance); False when another process has one."""
+        """Open the same ports again (after a restart of the appliance); False when another process has one.
+
+        If there are more or fewer relays than then, the incarnation has as many ports afterwards.
+        Raises `NoPortError`.
+        """
         opened: list[sockets.socket] = []
-        for port in (incarnation.outer_port, incarnation.relay_port):
+        for port in incarnation.ports[: self._each]:
             if f"port:{port}" in self._sockets:
                 continue
             try:
@@ -91,11 +102,13 @@ class Places:
             name = f"port:{one.getsockname()[1]}"
             self.adopt(name, one)
             self._keep(name, one)
+        known = incarnation.more_relay_ports[: self._each - 2]
+        incarnation.more_relay_ports = known + self._open(self._each - 2 - len(known))
         return True
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close both ports; they go to the end of the line."""
-        for port in (incarnation.outer_port, incarnation.relay_port):
+        """Close its ports; they go to the end of the line."""
+        for port in incarnation.ports:
             sock = self._sockets.pop(f"port:{port}", None)
             if sock is None:
                 continue
@@ -128,5 +141,6 @@ class Places:
                     ) from error
                 self._unused.append(port)  # another program has it for now
         raise NoPortError(
-            f"all ports {self._range.start}-{self._range.stop - 1} are in use (two per node); widen [Ports] range"
+            f"all ports {self._range.start}-{self._range.stop - 1} are in use"
+            f" ({self._each} per node); widen [Ports] range"
         )

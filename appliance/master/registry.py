@@ -61,6 +61,7 @@ class Incarnation:
 
     `api` is the URI it gave (its host is a claim and never followed); `told` is the appliance's address that this
     node reaches us at, used in every URI we tell it. `own` marks the appliance's own nodes (the rosout aggregator).
+    It has a port on every relay process: `relay_port` on the first, `more_relay_ports` on the others.
     """
 
     key: str
@@ -78,11 +79,22 @@ class Incarnation:
     registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
     shelf: dict[tuple[Kind, str], Registration] = field(default_factory=dict)  # what the policy took back
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    more_relay_ports: tuple[int, ...] = ()
 
     @property
     def of_monitors(self) -> bool:
         """Whether this is the appliance's own publisher of what monitors publish."""
         return self.own and self.api.path == PUBLISHER_PATH
+
+    @property
+    def relay_ports(self) -> tuple[int, ...]:
+        """Its port on each relay process."""
+        return (self.relay_port, *self.more_relay_ports)
+
+    @property
+    def ports(self) -> tuple[int, ...]:
+        """Every port that stands for it."""
+        return (self.outer_port, *self.relay_ports)
 
     @property
     def real_uri(self) -> str:
@@ -214,6 +226,10 @@ class Registry:
             self._live[incarnation.name] = incarnation
             for registration in incarnation.registrations.values():
                 self._index(incarnation, registration)
+
+    def changed_ports(self, incarnation: Incarnation) -> None:
+        """Keep the ports of an incarnation that has others than when it was added."""
+        self._journal.incarnation_saved(incarnation)
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Registration:
         """Record that ROSMaster took this registration."""

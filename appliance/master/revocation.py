@@ -12,11 +12,11 @@ from typing import Any
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.master.allocation import TOPIC
 from appliance.master.client import CallFailedError
 from appliance.master.core import Master
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Kind, Registration
-from appliance.master.relays import TOPIC
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.store.state import PermissionRow
 

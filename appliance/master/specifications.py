@@ -63,7 +63,10 @@ class Sources(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Specifications without errors: their monitors (name to file), what they listen to and publish."""
+    """Specifications without errors: their monitors (name to file), what they listen to and publish.
+
+    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
+    """
 
     monitors: dict[str, str] = field(default_factory=dict)
     topics: dict[str, frozenset[str]] = field(default_factory=dict)
@@ -72,6 +75,8 @@ class Checked:
     warnings: tuple[str, ...] = ()
     types: dict[str, str] = field(default_factory=dict)
     definitions: Definitions = field(default_factory=lambda: Definitions({}))
+    uses: dict[str, frozenset[str]] = field(default_factory=dict)
+    published_by: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
         """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
@@ -125,6 +130,8 @@ def check(sources: Sources) -> Checked:
         tuple(str(one) for one in monitors.warnings),
         dict(monitors.topics) | dict(monitors.publications),
         definitions,
+        {one.name: one.code.uses for one in monitors.monitors},
+        {name: monitors.published_by(name) for name in sources.files},
     )
 
 

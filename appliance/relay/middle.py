@@ -101,6 +101,10 @@ class Middle:
         )
         self._set, self._stated, self._blocked = result, message, ""
         began = list(result.began)
+        for monitor in result.monitors:
+            monitor.held = monitor.held or (
+                monitor.code.hold and monitor.name in message.moved and monitor.name in began
+            )
         self._telling.keep([one.name for one in result.monitors], began)
         self._telling.told(outcome, ("", ""))
         self._taken(message, began)

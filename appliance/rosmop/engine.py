@@ -99,6 +99,10 @@ class MonitorSet:
         """The topics that specifications publish, and their message types."""
         return MappingProxyType({each.topic: each.type for each in self._compiled.publications})
 
+    def published_by(self, file: str) -> frozenset[str]:
+        """The topics that the specifications of a file publish."""
+        return frozenset(one.topic for one in self._compiled.publications if one.position.file == file)
+
     def md5sum(self, message_type: str) -> str:
         """The md5sum of a message type as the specifications understand it."""
         return self._compiled.messages.definitions.md5sum(message_type)

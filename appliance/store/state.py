@@ -16,6 +16,9 @@ CREATE TABLE IF NOT EXISTS incarnation (
     outer_port INTEGER NOT NULL, relay_port INTEGER NOT NULL, own INTEGER NOT NULL,
     life TEXT NOT NULL, changed REAL NOT NULL
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS relay_port (
+    key TEXT NOT NULL, relay INTEGER NOT NULL, port INTEGER NOT NULL, PRIMARY KEY (key, relay)
+) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS registration (
     key TEXT NOT NULL, kind TEXT NOT NULL, resource TEXT NOT NULL, detail TEXT NOT NULL,
     ordinal INTEGER NOT NULL, PRIMARY KEY (key, kind, resource)
@@ -47,7 +50,10 @@ CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) 
 
 @dataclass(frozen=True, slots=True)
 class IncarnationRow:
-    """One incarnation as it is kept; `changed` is seconds since the epoch."""
+    """One incarnation as it is kept; `changed` is seconds since the epoch.
+
+    `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
+    """
 
     key: str
     name: str
@@ -59,6 +65,7 @@ class IncarnationRow:
     own: bool
     life: str
     changed: float
+    more_relay_ports: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +153,14 @@ class StateStore:
                 row.outer_port, row.relay_port, int(row.own), row.life, row.changed,
             ),
         )  # fmt: skip
+        self._database.submit("DELETE FROM relay_port WHERE key = ?", (row.key,))
+        for relay, port in enumerate(row.more_relay_ports, start=1):
+            self._database.submit("INSERT INTO relay_port VALUES (?, ?, ?)", (row.key, relay, port))
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""
         self._database.submit("DELETE FROM incarnation WHERE key = ?", (key,))
+        self._database.submit("DELETE FROM relay_port WHERE key = ?", (key,))
         self._database.submit("DELETE FROM registration WHERE key = ?", (key,))
         self._database.submit("DELETE FROM permission WHERE key = ?", (key,))
 
@@ -168,8 +179,13 @@ class StateStore:
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
         """Everything that is kept, registrations in order."""
+        ports: dict[str, tuple[int, ...]] = {}
+        for key, port in self._database.query("SELECT key, port FROM relay_port ORDER BY key, relay"):
+            ports[key] = (*ports.get(key, ()), port)
         incarnations = [
-            IncarnationRow(key, name, host, api, told, outer, relay, bool(own), life, changed)
+            IncarnationRow(
+                key, name, host, api, told, outer, relay, bool(own), life, changed, ports.get(key, ())
+            )
             for key, name, host, api, told, outer, relay, own, life, changed in self._database.query(
                 "SELECT * FROM incarnation ORDER BY changed"
             )

@@ -41,6 +41,11 @@ class Plan(msgspec.Struct, frozen=True):
     environment: dict[str, str] = {}
 
 
+def title_of(role: str, index: int | None) -> str:
+    """What a process is called in lists of processes: its role, and its number from the second on."""
+    return role if not index else f"{role}-{index + 1}"
+
+
 class UnreachableError(Exception):
     """The role's user cannot get at something the role needs."""
 
@@ -49,7 +54,7 @@ def main() -> None:
     """Become the role that the arguments name."""
     role, text = sys.argv[1:3]
     plan = msgspec.json.decode(text, type=Plan)
-    setproctitle.setproctitle(f"rosrv: {role}")
+    setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")
     configure_logs(role)
     try:
         _prepare(plan)

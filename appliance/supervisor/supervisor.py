@@ -415,7 +415,7 @@ class Supervisor:
 
     def _tell_processes(self) -> None:
         rows = [
-            ProcessInfo(_title(post), life.pid, life.since, post.lives - 1)
+            ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1)
             for post in self._posts
             if (life := post.life) is not None
         ]
@@ -479,10 +479,6 @@ def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
 def _printable(text: str) -> str:
     """Text that a terminal shows and does not obey; lines stay lines."""
     return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
-
-
-def _title(post: Post) -> str:
-    return post.role.name if post.index == 0 else f"{post.role.name}-{post.index}"
 
 
 def _end_of(code: int) -> str:

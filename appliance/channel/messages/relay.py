@@ -190,7 +190,8 @@ class SpecificationsStated(Message):
 
     `files` are pairs of name and text, in order; `definitions` are `.msg` and `.srv` files by name, besides ROS's own.
     `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
-    takes the place of one that died, so monitors with the modifier `hold` block their topics.
+    takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
+    they come from another relay, and begin here.
     """
 
     revision: int
@@ -199,6 +200,7 @@ class SpecificationsStated(Message):
     enabled: dict[str, bool]
     restarted: bool
     on_fault: Literal["drop", "pass"] = "drop"
+    moved: tuple[str, ...] = ()
 
 
 class MonitorSwitched(Message):

@@ -10,6 +10,7 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.master.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.master.moving import NoRelays
 from appliance.master.recorder import Recorder
 from appliance.master.specifications import SpecificationsRefusedError
 from appliance.store.state import StateStore
@@ -42,19 +43,26 @@ class Desk:
     def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
         """A control starts."""
         monitors = Monitors(self.folder if folder else None, enable, self.store, self.recorder)
-
-        def send(message: messages.Message) -> bool:
-            self.sent.append(message)
-            if isinstance(message, messages.SpecificationsStated):
-                answer: messages.Message = messages.SpecificationsTaken(message.revision, [], [])
-                if self.findings:
-                    answer = messages.SpecificationsRefused(message.revision, self.findings)
-                asyncio.get_running_loop().call_soon(monitors.received, answer)
-            return True
-
-        monitors.send = send
+        monitors.connect(Taking(self, monitors))
         monitors.start(restarted=restarted)
         return monitors
+
+
+class Taking(NoRelays):
+    """One relay, which takes everything, or refuses it with the findings of the desk."""
+
+    def __init__(self, desk: Desk, monitors: Monitors) -> None:
+        self.desk, self.monitors = desk, monitors
+
+    def send(self, message: messages.Message, relay: int) -> bool:
+        """It answers in the next turn of the loop."""
+        self.desk.sent.append(message)
+        if isinstance(message, messages.SpecificationsStated):
+            answer: messages.Message = messages.SpecificationsTaken(message.revision, [], [])
+            if self.desk.findings:
+                answer = messages.SpecificationsRefused(message.revision, self.desk.findings)
+            asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
+        return True
 
 
 pytestmark = pytest.mark.anyio

@@ -1,0 +1,154 @@
+"""What the relays carry, as they report it: connections, each with its records, and traffic."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.channel.messages import TopicTraffic
+from appliance.master.recorder import Recorder
+
+_STILL_SECONDS = 3.0  # without a report: nothing flows
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A subscriber or client that is connected through a relay; `kind` is "topic" or "service".
+
+    `number` is unique among all relays.
+    """
+
+    number: int
+    key: str
+    resource: str
+    kind: str
+    host: str
+    caller_id: str
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Counters of one relayed topic or service of one incarnation, since control started."""
+
+    messages: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    seconds: float = 0.0  # monotonic, of the last report
+    messages_per_second: float = 0.0  # between the last two reports
+    bytes_per_second: float = 0.0
+
+    def add(self, row: TopicTraffic, now: float) -> None:
+        """Count what the relay reported; it reports once a second, and only what changed."""
+        self.messages += row.messages
+        self.bytes += row.bytes
+        self.dropped += row.dropped
+        passed = max(now - self.seconds, 1.0) if self.seconds else 1.0
+        self.messages_per_second = row.messages / passed
+        self.bytes_per_second = row.bytes / passed
+        self.seconds = now
+
+
+class Carried:
+    """Connections and traffic of all relays; `name(key)` is the name of an incarnation, None of an unknown one."""
+
+    def __init__(self, recorder: Recorder, name: Callable[[str], str | None], relays: int) -> None:
+        self._recorder = recorder
+        self._name_of = name
+        self._relays = relays
+        self.connections: dict[tuple[int, int], Connection] = {}
+        self.traffic: dict[tuple[str, str], Traffic] = {}
+
+    def flow(self, key: str, resource: str) -> dict[str, float]:
+        """What went and goes through a topic or service of an incarnation, in plain values."""
+        traffic = self.traffic.get((key, resource), Traffic())
+        flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
+        return {
+            "messages": traffic.messages,
+            "bytes": traffic.bytes,
+            "dropped": traffic.dropped,
+            "messages_per_second": round(traffic.messages_per_second, 2) if flows else 0.0,
+            "bytes_per_second": round(traffic.bytes_per_second, 1) if flows else 0.0,
+        }
+
+    def lost(self, relay: int) -> None:
+        """A relay is gone, and its connections with it."""
+        for number in [one for one in self.connections if one[0] == relay]:
+            del self.connections[number]
+
+    def forgotten(self, key: str) -> None:
+        """An incarnation is gone for good."""
+        for one in [one for one in self.traffic if one[0] == key]:
+            del self.traffic[one]
+
+    def reported(self, rows: list[TopicTraffic]) -> None:
+        """A relay's counters; the last words about a node that is forgotten count for nothing."""
+        now = time.monotonic()
+        for row in rows:
+            if self._name_of(row.key) is not None:
+                self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now)
+
+    def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
+        """Somebody is connected."""
+        self.connections[relay, message.number] = Connection(
+            message.number * self._relays + relay,
+            message.key,
+            message.resource,
+            message.kind,
+            message.host,
+            message.caller_id,
+        )
+        name = self._name(message.key)
+        self._recorder.happened(
+            "connection opened",
+            f"{message.caller_id} ({message.host}) is connected to {message.resource} of {name}",
+            host=message.host,
+            caller_id=message.caller_id,
+            category=message.kind,
+            resource=message.resource,
+            node=name,
+        )
+
+    def closed(self, relay: int, message: messages.ConnectionClosed) -> None:
+        """A connection has ended."""
+        connection = self.connections.pop((relay, message.number), None)
+        if connection is None:
+            return
+        self._recorder.happened(
+            "connection closed",
+            message.reason or "closed in an orderly way",
+            host=connection.host,
+            caller_id=connection.caller_id,
+            category=connection.kind,
+            resource=connection.resource,
+            node=self._name(connection.key),
+        )
+
+    def refused(self, message: messages.ConnectionRefused) -> None:
+        """Somebody was turned away."""
+        self._recorder.happened(
+            "connection refused",
+            message.reason,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=message.host,
+            caller_id=message.caller_id,
+            resource=message.resource,
+            node=self._name(message.key),
+            count=message.count,
+        )
+
+    def publication_refused(self, message: messages.PublicationRefused) -> None:
+        """A publisher is not carried."""
+        self._recorder.happened(
+            "publication refused",
+            message.reason,
+            severity=Severity.ALARM,
+            decision="deny",
+            caller_id=self._name(message.key),
+            category="monitor",
+            resource=message.resource,
+        )
+
+    def _name(self, key: str) -> str:
+        return self._name_of(key) or ""

@@ -1,0 +1,238 @@
+"""Has the relays take the specifications: each those files that are its own, all of them or none.
+
+A load is tried first: every relay is told what it is to have, before anything is carried elsewhere. When all have
+taken it, what moves is withdrawn where it was, the allocation changes, and it is placed where its monitors are now:
+no message goes past its monitors. A monitor whose file moves begins in its initial state on the other relay (its
+variables are in the memory of the one it was on); one that is declared `hold` then holds its topics.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.master.allocation import Allocation, Plan
+from appliance.master.moving import NoRelays, Relays
+from appliance.master.recorder import Recorder
+from appliance.master.specifications import Checked, Sources, SpecificationsRefusedError
+
+_RELAY_SECONDS = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """Specifications in force, or about to be."""
+
+    number: int = 0
+    sources: Sources = field(default_factory=Sources)
+    checked: Checked = field(default_factory=Checked)
+
+
+class Stating:
+    """What the relays were told and what they said; `enabled(name)` says whether a monitor's events happen."""
+
+    def __init__(
+        self,
+        allocation: Allocation,
+        recorder: Recorder,
+        on_fault: Literal["drop", "pass"],
+        enabled: Callable[[str], bool],
+    ) -> None:
+        self.allocation = allocation
+        self.relays: Relays = NoRelays()
+        self.refused: list[str] = []
+        self._recorder = recorder
+        self._on_fault: Literal["drop", "pass"] = on_fault
+        self._enabled = enabled
+        self._now = Revision()
+        self._known: set[int] = set()  # relays that had specifications before
+        self._fresh: set[int] = set()  # relays that have not answered since they are there
+        self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}
+        self._held: dict[int, set[str]] = {}
+        self._rows: dict[int, list[messages.MonitorRow]] = {}
+
+    @property
+    def held(self) -> set[str]:
+        """The monitors that hold their topics."""
+        return {name for names in self._held.values() for name in names}
+
+    @property
+    def rows(self) -> dict[str, messages.MonitorRow]:
+        """State and counters of the monitors, as far as their relays have told."""
+        return {
+            row.name: row
+            for relay, rows in self._rows.items()
+            for row in rows
+            if self.allocation.of_file(row.file) == relay
+        }
+
+    def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
+        """These are in force. After a crash of control (`restarted`) the relays go on with what they have."""
+        self._now = now
+        if restarted:
+            self._known = set(range(self.allocation.relays))
+        if not (restarted and self.allocation.restore(kept)):
+            self.allocation.adopt(self.allocation.plan(now.checked))
+
+    def statement(self, relay: int) -> messages.SpecificationsStated:
+        """What a relay is told before anything else; one that follows another must hold what is to be held."""
+        restarted = relay in self._known
+        self._known.add(relay)
+        (self._fresh.add if restarted else self._fresh.discard)(relay)
+        return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted)
+
+    def relay_of(self, monitor: str) -> int:
+        """The relay that has a monitor."""
+        return self.allocation.of_file(self._now.checked.monitors[monitor])
+
+    def tell(self, monitor: str, message: messages.Message) -> None:
+        """Tell the relay that has a monitor."""
+        self.relays.send(message, self.relay_of(monitor))
+
+    def resumed(self, monitor: str) -> None:
+        """A monitor holds its topics no longer."""
+        for names in self._held.values():
+            names.discard(monitor)
+
+    # --- a change ---
+
+    async def take(self, coming: Revision) -> list[str]:
+        """Have every relay take these; the monitors that began anew because they moved.
+
+        Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
+        """
+        plan = self.allocation.plan(coming.checked, self.relays.carried_now())
+        await self._try(coming, plan)
+        return self._settle(coming, plan)
+
+    async def _try(self, coming: Revision, plan: Plan) -> None:
+        answers: dict[int, asyncio.Future[list[str]]] = {}
+        losing = {self.allocation.of_file(name) for name in plan.moved_files}
+        for relay in range(self.allocation.relays):
+            if relay in losing:
+                continue  # it goes on with what it has until its topics are withdrawn
+            answer = asyncio.get_running_loop().create_future()
+            self._waiting[relay, coming.number] = answer
+            if self.relays.send(self._statement(coming, relay, _of(plan), plan.moved_files), relay):
+                answers[relay] = answer
+        try:
+            findings = await self._findings(list(answers.values()))
+        finally:
+            for relay in range(self.allocation.relays):
+                self._waiting.pop((relay, coming.number), None)
+        if findings:
+            self._restate()
+            raise SpecificationsRefusedError(findings)
+
+    async def _findings(self, answers: list[asyncio.Future[list[str]]]) -> list[str]:
+        try:
+            said = await asyncio.wait_for(asyncio.gather(*answers), _RELAY_SECONDS)
+        except TimeoutError:
+            return [f"a relay does not answer within {_RELAY_SECONDS:g} s; try again"]
+        return [finding for findings in said for finding in findings]
+
+    def _settle(self, coming: Revision, plan: Plan) -> list[str]:
+        """Between two messages of every relay's link: nothing is awaited here."""
+        self._now = coming
+        self.relays.withdraw(plan.moves)
+        self.allocation.adopt(plan)
+        self._restate()  # those that lose monitors, and one that came in between and was told the revision before
+        self.relays.place(plan.moves)
+        moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
+        if plan.moves:
+            self._say_moved(plan, moved)
+        return moved
+
+    def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
+        names = [move.name for move in plan.moves]
+        anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
+        self._recorder.happened(
+            "topics moved",
+            f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} carried by another relay process{anew}",
+            severity=Severity.ALARM if monitors else Severity.NOTICE,
+            category="monitor",
+            resource="",
+            topics=names[:1000],
+            monitors=monitors,
+        )
+
+    def _restate(self) -> None:
+        for relay in range(self.allocation.relays):
+            self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+
+    def _statement(
+        self,
+        revision: Revision,
+        relay: int,
+        of_file: Callable[[str], int],
+        moved: frozenset[str] = frozenset(),
+        *,
+        restarted: bool = False,
+    ) -> messages.SpecificationsStated:
+        files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
+        mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
+        return messages.SpecificationsStated(
+            revision.number,
+            files,
+            revision.sources.definitions,
+            {name: self._enabled(name) for name in revision.checked.monitors if name in mine},
+            restarted,
+            self._on_fault,
+            tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
+        )
+
+    # --- what the relays say ---
+
+    def received(self, message: messages.Message, relay: int) -> None:
+        """A message of a relay about its monitors."""
+        match message:
+            case messages.SpecificationsTaken(number, began, held):
+                self._taken(relay, number, began, held)
+            case messages.SpecificationsRefused(number, findings):
+                self._refused(relay, number, findings)
+            case messages.MonitorsCounted(rows):
+                self._rows[relay] = rows
+
+    def lost(self, relay: int) -> None:
+        """A relay is gone: what it has not answered is refused, since it may have died of it."""
+        for at, number in [one for one in self._waiting if one[0] == relay]:
+            self._answer(at, number, ["a relay process ended while it took them: try again"])
+
+    def _taken(self, relay: int, number: int, began: list[str], held: list[str]) -> None:
+        self.refused = []
+        self._held[relay] = set(held)
+        if relay in self._fresh and began:
+            self._recorder.happened(
+                "monitors restarted",
+                f"a new relay process: {', '.join(began)} began in the initial state"
+                + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
+                severity=Severity.ALARM,
+                category="monitor",
+                resource="",
+                monitors=began,
+                held=held,
+            )
+        self._fresh.discard(relay)
+        self._answer(relay, number, [])
+
+    def _refused(self, relay: int, number: int, findings: list[str]) -> None:
+        if number == self._now.number:
+            self.refused = findings
+        self._recorder.happened(
+            "specifications refused",
+            f"the relay does not take revision {number}: {findings[0] if findings else ''}",
+            severity=Severity.ALARM,
+            findings=findings,
+        )
+        self._answer(relay, number, findings or ["the relay gives no reason"])
+
+    def _answer(self, relay: int, number: int, findings: list[str]) -> None:
+        waiting = self._waiting.pop((relay, number), None)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(findings)
+
+
+def _of(plan: Plan) -> Callable[[str], int]:
+    return lambda file: plan.files.get(file, 0)
