@@ -1,5 +1,6 @@
 """Tests of which nodes the appliance takes for gone."""
 
+import os
 import xmlrpc.client
 from pathlib import Path
 
@@ -26,9 +27,11 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
             assert isinstance(answer, list)
             assert answer[0] == 1, answer
 
-        robot.run(register)
-        tail = Process(ThisMachine(), [ROSRV, "audit", "tail", "--json", "--state", str(appliance.state)])
+        command = [ROSRV, "audit", "tail", "--json", "--state", str(appliance.state)]
+        tail = Process(ThisMachine(), command, env=os.environ, label="rosrv audit tail")
         try:
+            tail.wait_for(event="appliance started")
+            robot.run(register)
             tail.wait_for(event="node lost", caller_id="/brief")
         finally:
             tail.stop()
