@@ -2,7 +2,8 @@
 
 `METRICS` is the one list that `/metrics` is made from and docs/metrics.md is generated from
 (`python -m appliance.metrics`). Counting is a few additions on the way of a request; nothing is formatted there.
-Labels have few values: names of calls, categories and roles are ours; topics are those that are registered.
+Labels have few values: names of calls, categories and roles are ours; topics and services are those that are carried,
+and only so many of them by name (`appliance.master.measures`).
 """
 
 import bisect
@@ -40,6 +41,8 @@ METRICS = (
     Metric(
         "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
     ),
+    Metric("rosrv_monitor_dropped_total", "counter", ("resource",), "messages that monitors dropped"),
+    Metric("rosrv_monitor_changed_total", "counter", ("resource",), "messages that monitors changed"),
     Metric(
         "rosrv_monitor_events_total",
         "counter",

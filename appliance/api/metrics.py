@@ -102,6 +102,8 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
         "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_monitor_dropped_total": [((name,), row[0]) for name, row in body["drop_at"].items()],
+        "rosrv_monitor_changed_total": [((name,), row[0]) for name, row in body["change_at"].items()],
         "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body["monitors"]],
         "rosrv_monitors": [
             (("enabled",), monitors["enabled"]),

@@ -1,26 +1,71 @@
 """What control measures, in plain values: for the api, which makes Prometheus's format of it."""
 
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from appliance.master.core import Master
+from appliance.master.observed import KINDS
 from appliance.master.registry import Life
+from appliance.policy.model import Category
+
+MOST_RESOURCES = 2000
+OTHERS = "(others)"  # no name of ROS has a bracket
+
+
+_Labels = tuple[str, str]
+_DECISIONS = tuple(
+    (category.value, outcome) for category in Category for outcome in ("allow", "deny", "would deny")
+)
 
 
 def measures_of(master: Master) -> dict[str, Any]:
-    """Counters of requests, and the state of registry and relay at this moment."""
+    """Counters of requests, and the state of registry and relay at this moment.
+
+    Topics and services are named as far as `MOST_RESOURCES` goes: who registers names without end fills `OTHERS`.
+    """
     lives = Counter(one.life for one in master.registry.all() if not one.own)
     kinds = Counter(one.kind.value for node, one in master.registry.in_order() if not node.own)
-    relayed: dict[str, list[int]] = {}
-    for (_key, resource), traffic in master.relay.traffic.items():
-        row = relayed.setdefault(resource, [0, 0, 0])
-        for place, more in enumerate((traffic.messages, traffic.bytes, traffic.dropped)):
-            row[place] += more
+    records = master.monitors.records
+    relayed = by_resource(
+        (resource, (traffic.messages, traffic.bytes, traffic.dropped))
+        for (_key, resource), traffic in master.relay.traffic.items()
+    )
+    values = master.recorder.meter.values()
+    decided = {(category, outcome): count for category, outcome, count in values["decisions"]}
     return {
-        **master.recorder.meter.values(),
+        **values,
+        "decisions": [[*labels, count] for labels, count in from_zero(decided, _DECISIONS).items()],
         "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         "registrations": dict(kinds),
         "relayed": relayed,
-        "monitors": [[kind, name, count] for (kind, name), count in master.monitors.records.counts.items()],
+        "monitors": [
+            [kind, name, count]
+            for (kind, name), count in from_zero(
+                records.counts, ((kind, name) for name in master.monitors.names() for kind in KINDS)
+            ).items()
+        ],
+        **{
+            f"{kind}_at": by_resource(
+                (resource, (count,)) for (what, resource), count in records.at.items() if what == kind
+            )
+            for kind in ("drop", "change")
+        },
         "connections": dict(Counter(one.kind for one in master.relay.connections.values())),
     }
+
+
+def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dict[_Labels, int]:
+    """The counts, those that did not happen yet as 0: Prometheus sees no increase where a counter only begins."""
+    return dict.fromkeys(expected, 0) | dict(counts)
+
+
+def by_resource(rows: Iterable[tuple[str, tuple[int, ...]]]) -> dict[str, list[int]]:
+    """The sums of each resource's rows; of the first `MOST_RESOURCES` by name, of all others together."""
+    sums: dict[str, list[int]] = {}
+    for resource, values in rows:
+        name = resource if resource in sums or len(sums) < MOST_RESOURCES else OTHERS
+        row = sums.setdefault(name, [0] * len(values))
+        for place, more in enumerate(values):
+            row[place] += more
+    return sums

@@ -17,13 +17,14 @@ _EVENTS = {
     "log": ("monitor log", Severity.INFO),
     "publish": ("monitor published", Severity.INFO),
 }
+KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
 
 
 class MonitorRecords:
     """Makes records of reports; `fields(topic, data)` reads a message.
 
-    `counts` has how often each kind happened, by monitor.
+    `counts` has how often each kind happened, by monitor; `at` how often messages of a topic were dropped or changed.
     """
 
     def __init__(
@@ -34,11 +35,14 @@ class MonitorRecords:
         self._recorder = recorder
         self._fields = fields
         self.counts: Counter[tuple[str, str]] = Counter()
+        self.at: Counter[tuple[str, str]] = Counter()
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
         """A batch of the relay."""
         for event in events:
             self.counts[event.kind, event.monitor] += event.count or 1
+            if event.kind in ("drop", "change"):
+                self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"

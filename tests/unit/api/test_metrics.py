@@ -33,6 +33,7 @@ def body() -> dict[str, Any]:
         "registrations": {"publication": 3},
         "monitors": [["drop", "safeTrigger", 4]],
         "relayed": {"/a\"\\\n": [1, 2, 3]},
+        "drop_at": {"/b": [5]}, "change_at": {"/b": [6], "(others)": [1]},
         "connections": {"topic": 7},
         "rest": [(("GET", "200"), 8)],
     }  # fmt: skip
@@ -66,6 +67,8 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_decision_seconds_bucket", (("le", "+Inf"),)] == 2
     assert samples["rosrv_relay_bytes_total", (("resource", '/a"\\\n'),)] == 2
     assert samples["rosrv_audit_failed", ()] == 0
+    assert samples["rosrv_monitor_dropped_total", (("resource", "/b"),)] == 5
+    assert samples["rosrv_monitor_changed_total", (("resource", "(others)"),)] == 1
     assert samples["rosrv_syslog_up", ()] == 0
     assert samples["rosrv_syslog_lag_records", ()] == 4
     assert samples["rosrv_process_resident_bytes", (("role", "control"),)] > 0

@@ -1,0 +1,55 @@
+"""The alert rules that are shipped, by Prometheus's own tool, and the scrape configuration by Prometheus itself."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "examples" / "prometheus"
+
+
+def promtool(*arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
+    """Run it in the folder with the rules."""
+    program = shutil.which("promtool")
+    assert program is not None, "promtool is missing: apt install prometheus (packages-system.txt)"
+    return subprocess.run(
+        [program, *arguments], cwd=folder, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_the_rules_are_right() -> None:
+    """Prometheus takes the rules as they are."""
+    done = promtool("check", "rules", "alerts.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "SUCCESS" in done.stdout
+
+
+def test_the_scrape_configuration_is_right() -> None:
+    """Prometheus takes the scrape configuration as it is."""
+    done = promtool("check", "config", "--syntax-only", "prometheus.yml")
+    assert done.returncode == 0, done.stderr
+
+
+def test_each_alert_fires_when_it_should_and_not_before() -> None:
+    """The cases of alerts.tests.yaml hold."""
+    done = promtool("test", "rules", "alerts.tests.yaml")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        ("rosrv_audit_failed == 1", "rosrv_audit_failed == 2"),
+        ('kind="fault"', 'kind="verdict"'),
+        ("for: 1h", "for: 1m"),
+        ("rosrv_process_restarts_total[10m]", "rosrv_process_restarts_total[2m]"),
+    ],
+)
+def test_the_cases_would_notice(tmp_path: Path, was: str, now: str) -> None:
+    """A rule that was changed for the worse does not pass its cases."""
+    rules = (FOLDER / "alerts.yaml").read_text()
+    assert was in rules
+    (tmp_path / "alerts.yaml").write_text(rules.replace(was, now))
+    shutil.copy(FOLDER / "alerts.tests.yaml", tmp_path)
+    assert promtool("test", "rules", "alerts.tests.yaml", folder=tmp_path).returncode != 0

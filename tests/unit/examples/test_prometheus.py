@@ -1,0 +1,55 @@
+"""Tests of the alert rules that are shipped: they name what there is, and say what to do."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from appliance.audit.events import EVENTS
+from appliance.metrics import METRICS
+
+FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
+
+
+def rules() -> list[dict[str, Any]]:
+    """All alerts."""
+    groups = yaml.safe_load((FOLDER / "alerts.yaml").read_text())["groups"]
+    return [rule for group in groups for rule in group["rules"]]
+
+
+def test_every_metric_that_an_alert_names_is_measured() -> None:
+    """An alert on a name that nothing measures would never fire; its labels are those of the metric, too."""
+    known = {metric.name: metric for metric in METRICS}
+    for rule in rules():
+        names = re.findall(r"\brosrv_\w+", rule["expr"].replace('job="rosrv"', ""))
+        assert names or "up{" in rule["expr"], rule["alert"]
+        for name in names:
+            metric = known.get(name) or known.get(re.sub(r"_(bucket|sum|count)$", "", name))
+            assert metric is not None, f"{rule['alert']}: {name} is not measured"
+            for labels in re.findall(rf"\b{name}{{([^}}]*)}}", rule["expr"]):
+                given = set(re.findall(r"(\w+)=", labels))
+                assert given <= set(metric.labels), f"{rule['alert']}: {given}"
+
+
+def test_every_alert_says_what_it_means_and_what_to_do() -> None:
+    """Who is woken by it reads what happened and the next step; the records it points to are of known events."""
+    for rule in rules():
+        notes = rule["annotations"]
+        assert set(notes) == {"summary", "what_to_do"}, rule["alert"]
+        assert all(len(text) > 20 for text in notes.values()), rule["alert"]
+        assert rule["labels"]["severity"] in {"critical", "warning", "info"}
+        for event in re.findall(r"--event '([^']+)'", notes["what_to_do"]):
+            assert event in EVENTS, f"{rule['alert']}: {event}"
+
+
+def test_every_alert_is_tested() -> None:
+    """Each alert has a case in alerts.tests.yaml."""
+    cases = (FOLDER / "alerts.tests.yaml").read_text()
+    assert [rule["alert"] for rule in rules() if rule["alert"] not in cases] == []
+
+
+def test_the_page_names_every_alert() -> None:
+    """docs/metrics.md has each alert with what it is about."""
+    page = (FOLDER.parents[1] / "docs" / "metrics.md").read_text()
+    assert [rule["alert"] for rule in rules() if rule["alert"] not in page] == []
