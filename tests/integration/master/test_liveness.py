@@ -30,7 +30,7 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
         command = [ROSRV, "audit", "tail", "--json", "--state", str(appliance.state)]
         tail = Process(ThisMachine(), command, env=os.environ, label="rosrv audit tail")
         try:
-            tail.wait_for(event="appliance started")
+            tail.wait_for(lambda event: "sequence" in event)
             robot.run(register)
             tail.wait_for(event="node lost", caller_id="/brief")
         finally:
