@@ -27,7 +27,7 @@ from appliance.config import Settings
 
 DEFAULT_FILE = Path("appliance.yaml")
 _PREFIX = "ROSRV_"
-_NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN"}
+_NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
 # What Kubernetes and container links put there for a service that happens to be named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
 _PATH_KEYS = (

@@ -80,6 +80,11 @@ def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[Entry]:
         yield from entries
 
 
+def last_sequence(path: Path) -> int:
+    """The sequence of the last record; 0 when there is none."""
+    return _reading(path, _last_sequence)
+
+
 class Follower:
     """What is recorded from now on. Each `poll` gives the records since the last one, oldest first."""
 

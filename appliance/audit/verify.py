@@ -10,7 +10,7 @@ the signer's memory with it) only checkpoints kept on another machine can show.
 """
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +27,7 @@ from appliance.audit.signatures import pinned_key_path, read_public_key
 from appliance.audit.writer import RemovedRange
 
 _WINDOW = 64
+_TOLD_EVERY = 5000
 _MOST_FINDINGS = 1000
 _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
 # By how many places a record may have been renumbered.
@@ -39,13 +40,15 @@ def verify(
     public_key: bytes | None = None,
     signer: Path | None = None,
     copies: Sequence[SignedCheckpoint] | None = None,
+    progress: Callable[[int], None] = lambda _sequence: None,
 ) -> Verification:
     """Check the log at `path` from end to end.
 
     `public_key` (raw, 32 bytes) is the key the checkpoints must be signed with; by default the one pinned
     beside the log. `signer` is the signer's directory, whose memory the checkpoints are held against. `copies` are
-    checkpoints that were kept on another machine, which the chain is held against as well. Raises
-    `LogUnreadableError` if there is no log, and `KeyUnreadableError` if the pinned key is no key.
+    checkpoints that were kept on another machine, which the chain is held against as well. `progress` is told now and
+    then the sequence that was looked at last. Raises `LogUnreadableError` if there is no log, and
+    `KeyUnreadableError` if the pinned key is no key.
     """
     if public_key is None and pinned_key_path(path).exists():
         public_key = read_public_key(pinned_key_path(path))
@@ -53,7 +56,7 @@ def verify(
         with closing(open_for_reading(path)) as connection:
             connection.text_factory = _undecoded
             connection.execute("BEGIN")
-            return _Verifier(connection, public_key, signer, copies).run()
+            return _Verifier(connection, public_key, signer, copies, progress).run()
     except sqlite3.Error as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
 
@@ -85,8 +88,10 @@ class _Verifier:
         key: bytes | None,
         signer: Path | None,
         copies: Sequence[SignedCheckpoint] | None,
+        progress: Callable[[int], None],
     ) -> None:
         self._connection = connection
+        self._progress = progress
         self._key = key
         (self._log,) = connection.execute("SELECT id FROM log").fetchone()
         remembered = None if signer is None else read_remembered(signer, self._log)
@@ -177,6 +182,8 @@ class _Verifier:
         try:
             for row in self._rows():
                 self.records += 1
+                if not self.records % _TOLD_EVERY:
+                    self._progress(row.sequence)
                 self.first = self.first or row.sequence
                 previous = self._step(row, previous)
         except sqlite3.DatabaseError as error:

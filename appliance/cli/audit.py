@@ -1,134 +1,96 @@
-"""`rosrv audit tail|search|show|verify|export`: the review of the audit log.
+"""`rosrv audit tail|search|show|verify|checkpoints|export`: the review of the audit log.
 
-Reads the log's file directly, so it works while the appliance runs, when it is stopped, and on a copy.
+With a state directory they read the log's file, so they work while the appliance runs, when it is stopped, and on a
+copy; with `--api` they read the running appliance's log over REST.
 """
 
 import json
-import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, TextIO
 
 import msgspec
 import typer
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
-from appliance.audit.copies import CopiesUnreadableError, read_copies, signed_checkpoints
-from appliance.audit.database import LogUnreadableError
-from appliance.audit.moment import MomentError, parse_moment
-from appliance.audit.output import Entry, as_json, as_object, printable
-from appliance.audit.query import Filter, FilterError
-from appliance.audit.record import Severity
-from appliance.audit.search import LARGEST_PAGE, Follower
-from appliance.audit.search import export as export_entries
-from appliance.audit.search import search as search_log
-from appliance.audit.search import show as show_one
-from appliance.audit.signatures import KeyUnreadableError, read_public_key
-from appliance.audit.verify import verify as verify_log
+from appliance.audit.copies import read_copies
+from appliance.audit.output import Entry, as_json, as_object
+from appliance.audit.query import Filter
+from appliance.audit.search import LARGEST_PAGE
+from appliance.audit.signatures import read_public_key
+from appliance.cli.audit_errors import Errors, fail, tell
+from appliance.cli.audit_filter import filtered
 from appliance.cli.audit_output import line, print_entries, print_shown, print_verification, write
-from appliance.config import Settings
+from appliance.cli.running import Appliance, speaks
 
 app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)
 
-CANNOT_READ = 2
-DEFAULT_STATE: Path = Settings.model_fields["state"].default
 _POLL_SECONDS = 0.2
-_PROGRESS_EVERY = 1000
-
-_State = Annotated[
-    Path,
-    typer.Option("--state", envvar="ROSRV_STATE", help="State directory of the appliance", readable=False),
-]
-_Deny = Annotated[bool, typer.Option("--deny", help="Only what was denied (and summaries of denials)")]
-_Allow = Annotated[bool, typer.Option("--allow", help="Only what was allowed")]
-_WouldDeny = Annotated[bool, typer.Option("--would-deny", help="Only what a trial policy would have denied")]
-_Since = Annotated[
-    str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
-]
-_Until = Annotated[str | None, typer.Option("--until", help="Before this moment")]
-_Topic = Annotated[
-    str | None,
-    typer.Option("--topic", "--resource", help="Topic, service, parameter, call; a glob: '/cmd_*'"),
-]
-_Host = Annotated[str | None, typer.Option("--host", help="Address of the peer; a glob")]
-_Caller = Annotated[str | None, typer.Option("--caller", help="Name the node gave; a glob")]
-_Event = Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")]
-_Category = Annotated[str | None, typer.Option("--category", help="Category of the request; a glob")]
-_Severity = Annotated[Severity | None, typer.Option("--severity", help="This severity or a graver one")]
-_Rule = Annotated[str | None, typer.Option("--rule", help="Section or key of the policy rule; a glob")]
-_Text = Annotated[str | None, typer.Option("--text", help="Found anywhere in names, reason and details")]
+_TOLD_EVERY = 1000
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
+_AlwaysJson = Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")]
 
 
 @app.command()
+@speaks
+@filtered
 def search(
-    *, state: _State = DEFAULT_STATE,
-    deny: _Deny = False, allow: _Allow = False, would_deny: _WouldDeny = False,
-    since: _Since = None, until: _Until = None, topic: _Topic = None, host: _Host = None,
-    caller: _Caller = None, event: _Event = None, category: _Category = None, severity: _Severity = None,
-    rule: _Rule = None, text: _Text = None,
+    appliance: Appliance,
+    wanted: Filter,
+    *,
     limit: Annotated[int, typer.Option("--limit", min=1, max=LARGEST_PAGE, help="At most")] = 100,
     oldest_first: Annotated[bool, typer.Option("--oldest-first", help="From the first record on")] = False,
     cursor: Annotated[str | None, typer.Option("--cursor", help="Go on where a search ended")] = None,
     as_json_lines: _Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Find records, newest first.
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
-    with _Errors():
-        decisions = _decisions(deny=deny, allow=allow, would_deny=would_deny)
-        wanted = _filter(
-            decisions, since, until, host=host, caller_id=caller, resource=topic, category=category,
-            event=event, severity=severity, rule=rule, text=text,
-        )  # fmt: skip
-        page = search_log(_log(state), wanted, cursor, limit, newest_first=not oldest_first)
-        _print(page.entries, as_json_lines)
-        if page.cursor is not None:
-            _say(f"more records match: --cursor {page.cursor}, or a larger --limit")
+    page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
+    if as_json_lines:
+        _print_lines(page.entries, as_json_lines)
+    else:
+        print_entries(page.entries)
+    if page.cursor is not None:
+        tell(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
 @app.command()
+@speaks
+@filtered
 def tail(
-    *, state: _State = DEFAULT_STATE,
-    deny: _Deny = False, allow: _Allow = False, would_deny: _WouldDeny = False,
-    since: _Since = None, until: _Until = None, topic: _Topic = None, host: _Host = None,
-    caller: _Caller = None, event: _Event = None, category: _Category = None, severity: _Severity = None,
-    rule: _Rule = None, text: _Text = None,
+    appliance: Appliance,
+    wanted: Filter,
+    *,
     lines: Annotated[int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="At first")] = 10,
     follow: Annotated[bool, typer.Option(help="Wait for more, until interrupted")] = True,
     as_json_lines: _Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Show the last records and follow the log.
 
     Example: rosrv audit tail --deny
     """
-    with _Errors():
-        decisions = _decisions(deny=deny, allow=allow, would_deny=would_deny)
-        wanted = _filter(
-            decisions, since, until, host=host, caller_id=caller, resource=topic, category=category,
-            event=event, severity=severity, rule=rule, text=text,
-        )  # fmt: skip
-        path = _log(state)
-        follower = Follower(path, wanted)
-        if lines:
-            last = search_log(path, wanted, str(follower.position + 1), lines)
-            _print_lines(last.entries[::-1], as_json_lines)
-        pause = threading.Event()
-        while follow:
-            _print_lines(follower.poll(), as_json_lines)
-            pause.wait(_POLL_SECONDS)
+    for entries in appliance.audit().follow(wanted, lines, on=follow):
+        _print_lines(entries, as_json_lines)
 
 
 @app.command()
+@speaks
 def show(
+    appliance: Appliance,
     record_id: Annotated[str, typer.Argument(metavar="ID", help="The record's id, or its sequence")],
-    state: _State = DEFAULT_STATE,
     neighbours: Annotated[int, typer.Option("--neighbours", min=0, max=1000, help="How many around it")] = 5,
     as_json_lines: _Json = False,
 ) -> None:
@@ -136,11 +98,10 @@ def show(
 
     Example: rosrv audit show 18e9aa02efc40abb0e51
     """
-    with _Errors():
-        path = _log(state)
-        shown = show_one(path, record_id, neighbours)
+    with Errors():
+        shown = appliance.audit().show(record_id, neighbours)
         if shown is None:
-            _fail(f"{path}: no record with the id {record_id!a}", 1)
+            fail(f"no record with the id {record_id!a} is in the log", 1)
         if as_json_lines:
             around = {
                 "before": [as_object(one) for one in shown.before],
@@ -152,8 +113,9 @@ def show(
 
 
 @app.command()
+@speaks
 def verify(
-    state: _State = DEFAULT_STATE,
+    appliance: Appliance,
     key: Annotated[
         Path | None, typer.Option("--key", help="Public key (PEM) that the checkpoints must be signed with")
     ] = None,
@@ -171,15 +133,12 @@ def verify(
 
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
-    with _Errors():
-        path = _log(state)
+    with Errors():
+        source = appliance.audit()
         copies = None if checkpoints is None else read_copies(checkpoints)
         public_key = None if key is None else read_public_key(key)
-        signer = path.parent.parent / "signer"
-        with _progress("checking the chain"):
-            result = verify_log(
-                path, public_key, signer if os.access(signer, os.R_OK | os.X_OK) else None, copies
-            )
+        with _progress("checking the chain", source.last) as progress:
+            result = source.verify(public_key, copies, progress)
         if as_json_lines:
             write(json.dumps(msgspec.to_builtins(result)))
         else:
@@ -189,21 +148,22 @@ def verify(
 
 
 @app.command()
+@speaks
 def checkpoints(
-    state: _State = DEFAULT_STATE,
+    appliance: Appliance,
     after: Annotated[int, typer.Option("--after", min=0, help="Only those with a greater number")] = 0,
     follow: Annotated[bool, typer.Option("--follow", help="Wait for more, until interrupted")] = False,
-    as_json_lines: Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")] = True,  # noqa: ARG001  every verb takes --json
+    as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
     """Write the signed checkpoints as NDJSON: keep them on another machine, for `verify --checkpoints`.
 
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """
-    with _Errors():
-        path = _log(state)
+    with Errors():
+        source = appliance.audit()
         pause = threading.Event()
         while True:
-            found = signed_checkpoints(path, after)
+            found = source.checkpoints(after)
             for one in found:
                 write(one.as_json())
                 after = one.number
@@ -215,86 +175,29 @@ def checkpoints(
 
 
 @app.command()
+@speaks
+@filtered
 def export(
-    *, state: _State = DEFAULT_STATE,
-    deny: _Deny = False, allow: _Allow = False, would_deny: _WouldDeny = False,
-    since: _Since = None, until: _Until = None, topic: _Topic = None, host: _Host = None,
-    caller: _Caller = None, event: _Event = None, category: _Category = None, severity: _Severity = None,
-    rule: _Rule = None, text: _Text = None,
+    appliance: Appliance,
+    wanted: Filter,
+    *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
-    as_json_lines: Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")] = True,  # noqa: ARG001  every verb takes --json
-) -> None:  # fmt: skip
+    as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
+) -> None:
     """Write all records that match as NDJSON, oldest first.
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
-    with _Errors():
-        decisions = _decisions(deny=deny, allow=allow, would_deny=would_deny)
-        wanted = _filter(
-            decisions, since, until, host=host, caller_id=caller, resource=topic, category=category,
-            event=event, severity=severity, rule=rule, text=text,
-        )  # fmt: skip
-        entries = export_entries(_log(state), wanted)
-        with _progress("exporting") as progress:
-            if output is None:
-                count = _write_all(entries, progress, sys.stdout)
-            else:
-                with output.open("x", encoding="ascii") as file:
-                    count = _write_all(entries, progress, file)
-        if output is not None:
-            _say(f"{count} records in {output}")
-
-
-class _Errors:
-    """Says in words what went wrong, and ends with the exit status for it."""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        match error:
-            case LogUnreadableError() | KeyUnreadableError() | CopiesUnreadableError():
-                _fail(str(error), CANNOT_READ)
-            case FilterError() | MomentError():
-                _fail(str(error), CANNOT_READ)
-            case BrokenPipeError():
-                # The reader (head, less) has enough: what is still buffered has nowhere to go.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                raise typer.Exit(0)
-            case KeyboardInterrupt():
-                raise typer.Exit(0)
-            case PermissionError():
-                _fail(f"{error.filename}: {error.strerror}; run this as root", CANNOT_READ)
-            case OSError():
-                _fail(f"{error.filename or 'output'}: {error.strerror}", CANNOT_READ)
-
-
-def _log(state: Path) -> Path:
-    if not state.is_dir():
-        raise LogUnreadableError(f"{state}: no such directory; is the state directory right (--state)?")
-    return state / "control" / "audit.db"
-
-
-def _decisions(*, deny: bool, allow: bool, would_deny: bool) -> tuple[str, ...]:
-    wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
-    return tuple(name for name, asked in wanted.items() if asked)
-
-
-def _filter(decision: tuple[str, ...], since: str | None, until: str | None, **rest: Any) -> Filter:
-    now = time.time_ns()
-    return Filter(
-        decision=decision,
-        since=None if since is None else parse_moment(since, now),
-        until=None if until is None else parse_moment(until, now),
-        **rest,
-    )
-
-
-def _print(entries: list[Entry], as_json_lines: bool) -> None:
-    if as_json_lines:
-        _print_lines(entries, as_json_lines)
-    else:
-        print_entries(entries)
+    source = appliance.audit()
+    entries = source.export(wanted)
+    with _progress("exporting", source.last) as progress:
+        if output is None:
+            count = _write_all(entries, progress, sys.stdout)
+        else:
+            with output.open("x", encoding="ascii") as file:
+                count = _write_all(entries, progress, file)
+    if output is not None:
+        tell(f"{count} records in {output}")
 
 
 def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
@@ -307,26 +210,20 @@ def _write_all(entries: Iterable[Entry], progress: Callable[[int], None], file: 
     count = 0
     for count, entry in enumerate(entries, 1):
         file.write(as_json(entry) + "\n")
-        if count % _PROGRESS_EVERY == 0:
-            progress(count)
+        if count % _TOLD_EVERY == 0:
+            progress(entry.sequence)
     file.flush()
     return count
 
 
 @contextmanager
-def _progress(what: str) -> Iterator[Callable[[int], None]]:
-    """Shows on a terminal that long work goes on; elsewhere nothing."""
+def _progress(what: str, last: Callable[[], int]) -> Iterator[Callable[[int], None]]:
+    """Shows on a terminal how far long work is, up to the last record; elsewhere nothing."""
     console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn(what), TextColumn("{task.completed} records"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(what, total=None)
-        yield lambda count: progress.update(task, completed=count)
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"rosrv: {text}\n")
-
-
-def _fail(text: str, status: int) -> NoReturn:
-    _say(printable(text))
-    raise typer.Exit(status)
+    if not console.is_terminal:
+        yield lambda _sequence: None
+        return
+    columns = (SpinnerColumn(), TextColumn(what), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(what, total=last() or None)
+        yield lambda sequence: progress.update(task, completed=sequence)

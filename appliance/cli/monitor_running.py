@@ -18,7 +18,7 @@ from appliance.channel.admin import (
     MonitorSwitch,
 )
 from appliance.cli.policy_output import counted, say
-from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
+from appliance.cli.running import Appliance, speaks
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
@@ -26,12 +26,13 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, on
 _Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
 
 
-def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def list_monitors(appliance: Appliance, as_json: _Json = False) -> None:
     """Show every monitor: enabled or not, what it listens to, what it did.
 
     Example: rosrv monitor list --json
     """
-    body = ask_or_exit(state, MonitorsWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     if as_json:
         for row in body["monitors"]:
             sys.stdout.write(json.dumps(row) + "\n")
@@ -55,25 +56,28 @@ def list_monitors(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     say(f"revision {body['revision']} of the specifications{source}, by {body['who']}{differs}")
 
 
-def enable(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def enable(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
     """Let the events of these monitors happen again.
 
     Example: rosrv monitor enable safeTrigger
     """
-    _switch(names, True, state, as_json=as_json)
+    _switch(appliance, names, True, as_json=as_json)
 
 
-def disable(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def disable(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
     """Let messages pass these monitors untouched; their variables stay.
 
     Example: rosrv monitor disable safeTrigger
     """
-    _switch(names, False, state, as_json=as_json)
+    _switch(appliance, names, False, as_json=as_json)
 
 
+@speaks
 def load(
+    appliance: Appliance,
     files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
-    state: State = DEFAULT_STATE,
     msg: Annotated[
         list[Path] | None,
         typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
@@ -96,40 +100,46 @@ def load(
             if path.suffix in {".msg", ".srv"} and path.is_file():
                 package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
                 definitions[f"{package.name}/{path.name}"] = _text(path)
-    _say_replaced(ask_or_exit(state, MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json)
+    _say_replaced(
+        appliance.ask_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json
+    )
 
 
-def remove(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def remove(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
     """Remove specifications, by the names of their monitors or files.
 
     Example: rosrv monitor remove safeTrigger
     """
-    _say_replaced(ask_or_exit(state, MonitorRemove(names), as_json=as_json), as_json=as_json)
+    _say_replaced(appliance.ask_or_exit(MonitorRemove(names), as_json=as_json), as_json=as_json)
 
 
-def reload(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def reload(appliance: Appliance, as_json: _Json = False) -> None:
     """Take what the folder of specifications has now, in the place of what is in force.
 
     Example: rosrv monitor reload
     """
-    _say_replaced(ask_or_exit(state, MonitorReload(), as_json=as_json), as_json=as_json)
+    _say_replaced(appliance.ask_or_exit(MonitorReload(), as_json=as_json), as_json=as_json)
 
 
-def resume(names: _Names, state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def resume(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
     """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
 
     Example: rosrv monitor resume safeTrigger
     """
-    body = ask_or_exit(state, MonitorResume(names), as_json=as_json)
+    body = appliance.ask_or_exit(MonitorResume(names), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
     else:
         say(f"resumed: {', '.join(body['names']) or 'none was held'}")
 
 
-def rv_state(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def rv_state(appliance: Appliance, as_json: _Json = False) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
-    body = ask_or_exit(state, MonitorsWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     real, port, rows = body["rv_state"]
     if as_json:
         sys.stdout.write(json.dumps(body["rv_state"]) + "\n")
@@ -139,8 +149,8 @@ def rv_state(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
         say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
 
 
-def _switch(names: list[str], enabled: bool, state: Path, *, as_json: bool) -> None:
-    body = ask_or_exit(state, MonitorSwitch(names, enabled), as_json=as_json)
+def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
+    body = appliance.ask_or_exit(MonitorSwitch(names, enabled), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
         return

@@ -30,6 +30,7 @@ from appliance.cli.policy_output import (
     say_finding,
     say_json,
 )
+from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
     Category,
     Difference,
@@ -187,19 +188,15 @@ def test(
 
 
 @app.command("diff")
+@speaks
 def compare(
+    appliance: Appliance,
     old: Annotated[Path, typer.Argument(metavar="OLD", help="The policy now", show_default=False)],
     new: Annotated[Path, typer.Argument(metavar="NEW", help="The policy to be", show_default=False)],
     *,
     requests: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="NDJSON of requests: host, caller_id, category, resource"),
-    ] = None,
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", envvar="ROSRV_STATE", help="State directory with the audit log", readable=False
-        ),
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
@@ -209,10 +206,12 @@ def compare(
 
     Example: rosrv policy diff policies/now.ini policies/next.ini --state /var/lib/rosrv
     """
-    if requests is None and state is None:
-        raise usage_error("say where the requests are: --state DIR (the audit log) or --requests FILE")
+    if requests is None and not appliance.said:
+        raise usage_error(
+            "say where the requests are: --state DIR or --api URL (the audit log), or --requests FILE"
+        )
     before, after = _compile_or_exit(old, robot, enrolled), _compile_or_exit(new, robot, enrolled)
-    differences = diff(before, after, _requests(requests, state))
+    differences = diff(before, after, _requests(requests, appliance))
     for difference in differences:
         if as_json:
             say_json(_difference_fields(difference))
@@ -224,12 +223,12 @@ def compare(
     raise typer.Exit(1 if differences else 0)
 
 
-def _requests(file: Path | None, state: Path | None) -> Iterator[Request]:
+def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
     if file is not None:
         yield from requests_of_file(file)
-    if state is not None and file is None:
-        yield from requests_of_audit_log(state)
-        yield from registrations_now(state)
+    else:
+        yield from requests_of_audit_log(appliance)
+        yield from registrations_now(appliance)
 
 
 def _difference_lines(difference: Difference) -> Iterator[str]:

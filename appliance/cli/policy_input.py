@@ -10,9 +10,9 @@ import typer
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter
-from appliance.audit.search import export
 from appliance.channel.admin import RegistrationsWanted
-from appliance.cli.running import NotRunningError, ask
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.running import Appliance
 from appliance.policy import Address, Category, Policy, Request, compile_policy
 from appliance.policy.actions import find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
@@ -91,27 +91,27 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
-def registrations_now(state: Path) -> Iterator[Request]:
-    """What is registered at the running appliance; nothing when none runs with this state directory."""
+def registrations_now(appliance: Appliance) -> Iterator[Request]:
+    """What is registered at the running appliance; nothing when none runs with the state directory."""
     try:
-        answer = ask(state, RegistrationsWanted())
+        answer = appliance.ask(RegistrationsWanted())
     except NotRunningError:
         return
     for row in answer.body.get("registrations", ()):
         yield request_of(row["host"], row["caller_id"], row["category"], row["resource"])
 
 
-def requests_of_audit_log(state: Path) -> Iterator[Request]:
-    """Every request that the audit log of a state directory has a decision on.
+def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
+    """Every request that an appliance's audit log has a decision on.
 
-    Works while the appliance runs. Records that sum up many different requests name none and are left out.
+    Records that sum up many different requests name none and are left out.
     """
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
-        for entry in export(state / "control" / "audit.db", decided):
+        for entry in appliance.audit().export(decided):
             record = entry.record
             if record.host is None or record.category not in set(Category) or record.resource is None:
                 continue
             yield request_of(record.host, record.caller_id or "", record.category, record.resource)
-    except LogUnreadableError as error:
+    except (LogUnreadableError, NotRunningError) as error:
         raise usage_error(str(error)) from error

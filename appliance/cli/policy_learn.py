@@ -13,18 +13,19 @@ import typer
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.query import Filter
-from appliance.audit.search import export
+from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.policy_input import Robot, networks_of, request_of, usage_error
 from appliance.cli.policy_output import counted, printable
-from appliance.cli.running import DEFAULT_STATE, State
+from appliance.cli.running import Appliance, speaks
 from appliance.policy import Category, PolicyError, compile_policy
 from appliance.policy.learn import Learned, Observation, learn
 
 _OWN_NODE = "the appliance's own node"
 
 
+@speaks
 def learn_policy(
-    state: State = DEFAULT_STATE,
+    appliance: Appliance,
     *,
     since: Annotated[
         str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
@@ -41,7 +42,7 @@ def learn_policy(
 
     Example: rosrv policy learn --state /var/lib/rosrv --robot 192.168.1.10 --output learned.ini
     """
-    learned = learn(_observations(state, since), networks_of(robot))
+    learned = learn(_observations(appliance, since), networks_of(robot))
     if not learned.requests:
         typer.echo("rosrv: no request that passed is in the audit log (since then)", err=True)
         raise typer.Exit(1)
@@ -62,11 +63,11 @@ def learn_policy(
     typer.echo(f"rosrv: learned from {counted(learned.requests, 'request')}{left_out}", err=True)
 
 
-def _observations(state: Path, since: str | None) -> Iterator[Observation]:
+def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
     try:
         start = None if since is None else parse_moment(since, time.time_ns())
         passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
-        for entry in export(state / "control" / "audit.db", passed):
+        for entry in appliance.audit().export(passed):
             record = entry.record
             if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
                 continue
@@ -75,7 +76,7 @@ def _observations(state: Path, since: str | None) -> Iterator[Observation]:
             )
             detail = record.detail
             yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
-    except (LogUnreadableError, MomentError) as error:
+    except (LogUnreadableError, NotRunningError, MomentError) as error:
         raise usage_error(str(error)) from error
 
 

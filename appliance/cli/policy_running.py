@@ -11,14 +11,15 @@ import typer
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import counted, say
-from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
+from appliance.cli.running import Appliance, speaks
 
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
+@speaks
 def reload(
-    state: State = DEFAULT_STATE,
+    appliance: Appliance,
     confirm_within: Annotated[
         str | None,
         typer.Option(
@@ -34,30 +35,32 @@ def reload(
     Example: rosrv policy reload --confirm-within 5m
     """
     seconds = _seconds(confirm_within) if confirm_within is not None else None
-    body = ask_or_exit(state, PolicyReload(seconds), as_json=as_json)
+    body = appliance.ask_or_exit(PolicyReload(seconds), as_json=as_json)
     _say_loaded(body, as_json=as_json)
 
 
+@speaks
 def rollback(
+    appliance: Appliance,
     revision: Annotated[
         int | None, typer.Argument(help="A kept revision; without it, the one before")
     ] = None,
-    state: State = DEFAULT_STATE,
     as_json: _Json = False,
 ) -> None:
     """Bring a kept revision into force again.
 
     Example: rosrv policy rollback 7
     """
-    _say_loaded(ask_or_exit(state, PolicyRollback(revision), as_json=as_json), as_json=as_json)
+    _say_loaded(appliance.ask_or_exit(PolicyRollback(revision), as_json=as_json), as_json=as_json)
 
 
-def confirm(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def confirm(appliance: Appliance, as_json: _Json = False) -> None:
     """Keep a policy that was loaded with --confirm-within; exit status 1 when there is nothing to confirm.
 
     Example: rosrv policy confirm
     """
-    body = ask_or_exit(state, PolicyConfirm(), as_json=as_json)
+    body = appliance.ask_or_exit(PolicyConfirm(), as_json=as_json)
     if as_json:
         sys.stdout.write(json.dumps(body) + "\n")
     else:
@@ -66,12 +69,13 @@ def confirm(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
     raise typer.Exit(0 if body["confirmed"] else 1)
 
 
-def revisions(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def revisions(appliance: Appliance, as_json: _Json = False) -> None:
     """List the kept revisions, the newest first.
 
     Example: rosrv policy revisions
     """
-    for row in ask_or_exit(state, PolicyRevisions(), as_json=as_json)["revisions"]:
+    for row in appliance.ask_or_exit(PolicyRevisions(), as_json=as_json)["revisions"]:
         if as_json:
             sys.stdout.write(json.dumps(row) + "\n")
             continue

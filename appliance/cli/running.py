@@ -1,69 +1,143 @@
-"""Speaks to the running appliance over the admin socket in its state directory."""
+"""Which running appliance a verb is for, and how it is asked: over the socket in its state directory, or over REST.
 
-import socket
+A verb that speaks to an appliance takes an `Appliance` first and is decorated with `speaks`, which gives it the
+options `--state`, `--api` and `--api-ca`. Whatever way is taken, the same question has the same answer. What is said
+on the command line goes before the environment, and of the environment REST before the socket.
+"""
+
+import functools
+import inspect
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, Protocol
 
 import msgspec
 import typer
 
 from appliance.channel.admin import AdminAnswer, AdminRequest
-from appliance.config import Settings
+from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
-ADMIN_SOCKET = "admin.sock"
-DEFAULT_STATE: Path = Settings.model_fields["state"].default
+if TYPE_CHECKING:
+    from appliance.cli.audit_source import AuditSource
+
+DEFAULT_STATE = Path("/var/lib/rosrv")  # as appliance.config has it, which is not imported for every verb
+TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
 State = Annotated[
     Path,
     typer.Option(
         "--state",
         envvar="ROSRV_STATE",
         help="State directory of the running appliance",
-        readable=False,  # it may be passed through, not looked into; who may not connect is told so below
+        readable=False,  # it may be passed through, not looked into; who may not connect is told so
     ),
 ]
-_SECONDS = 30.0
+Api = Annotated[
+    str | None,
+    typer.Option(
+        "--api",
+        metavar="URL",
+        envvar="ROSRV_API_URL",
+        help=f"Ask over REST instead; the access token is in {TOKEN}",
+    ),
+]
+ApiCa = Annotated[
+    Path | None,
+    typer.Option(
+        "--api-ca",
+        metavar="FILE",
+        envvar="ROSRV_API_CA",
+        help="Certificate that REST is trusted by (STATE/api/certificate.pem of the appliance)",
+    ),
+]
+_P = ParamSpec("_P")
 
 
-class NotRunningError(Exception):
-    """No appliance answers at this state directory; the text says what to do."""
+class Way(Protocol):
+    """A way to ask the running appliance."""
+
+    def ask(self, request: AdminRequest) -> AdminAnswer:
+        """Ask one thing. Raises `NotRunningError`."""
+
+    def audit(self) -> "AuditSource":
+        """Its audit log."""
 
 
-def ask(state: Path, request: AdminRequest) -> AdminAnswer:
-    """Ask the running appliance one thing. Raises `NotRunningError`."""
-    path = state / ADMIN_SOCKET
-    if not state.is_dir():
-        raise NotRunningError(
-            f"{state}: no such directory; give the appliance's state directory with --state"
-        )
+@dataclass(frozen=True)
+class Appliance:
+    """The appliance that a verb is for; `said`: it was named, on the command line or in the environment."""
+
+    way: Way
+    said: bool = False
+
+    def ask(self, request: AdminRequest) -> AdminAnswer:
+        """Ask the running appliance one thing. Raises `NotRunningError`."""
+        return self.way.ask(request)
+
+    def audit(self) -> "AuditSource":
+        """Its audit log; over the state directory it need not run."""
+        return self.way.audit()
+
+    def ask_or_exit(self, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+        """The answer's body. Ends the program with 1 when it refuses, 2 when none can be asked."""
+        try:
+            return body_or_exit(self.way.ask(request), as_json=as_json)
+        except NotRunningError as error:
+            typer.echo(f"rosrv: {error}", err=True)
+            raise typer.Exit(2) from None
+
+
+def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
+    """Give a verb whose first parameter is an `Appliance` the options that say which."""
+
+    @functools.wraps(verb)
+    def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
+        context, state, api, authority = (kwargs.pop(one.name) for one in _PLACES)
+        appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
+        verb(appliance, *args, **kwargs)
+
+    own = inspect.signature(verb, eval_str=True)
+    parameters = [*list(own.parameters.values())[1:], *_PLACES]
+    asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
+    asked.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
+    return asked
+
+
+_PLACES = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+    for name, default, annotation in (
+        ("context", inspect.Parameter.empty, typer.Context),
+        ("state", DEFAULT_STATE, State),
+        ("api", None, Api),
+        ("api_ca", None, ApiCa),
+    )
+]
+
+
+def _chosen(context: typer.Context, state: Path, api: str | None, authority: Path | None) -> Appliance:
+    """The appliance at one of both places. Ends the program with 2 when that makes no sense."""
+    sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
+    said = {name: getattr(source, "name", "") for name, source in sources.items()}
+    typed = {name for name, source in said.items() if source == "COMMANDLINE"}
+    if {"state", "api"} <= typed:
+        raise usage_error("--state and --api are two ways to the appliance: give one")
+    if api is None or "state" in typed:
+        if "api_ca" in typed:
+            raise usage_error("--api-ca is for --api URL, which is not given")
+        return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
+    from appliance.cli.rest import RestWay  # noqa: PLC0415  httpx is not imported for the socket
+
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-            sock.settimeout(_SECONDS)
-            sock.connect(str(path))
-            sock.sendall(msgspec.json.encode(request) + b"\n")
-            line = _read_line(sock)
-    except FileNotFoundError:
-        raise NotRunningError(
-            f"{state}: no appliance runs with this state directory; start it: rosrv up"
-        ) from None
-    except PermissionError:
-        raise NotRunningError(f"{path} is for its owner and root only; run this as one of them") from None
-    except ConnectionRefusedError:
-        raise NotRunningError(f"{state}: the appliance that used this state directory has ended") from None
-    except TimeoutError:
-        raise NotRunningError(f"{path}: the appliance did not answer within {_SECONDS:g} s") from None
-    except OSError as error:
-        raise NotRunningError(f"{path}: {error.strerror or error}") from error
-    return msgspec.json.decode(line, type=AdminAnswer)
+        return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True)
+    except ValueError as error:
+        raise usage_error(str(error)) from None
 
 
-def _read_line(sock: socket.socket) -> bytes:
-    line = bytearray()
-    while not line.endswith(b"\n"):
-        piece = sock.recv(65536)
-        if not piece:
-            raise ConnectionResetError("the appliance closed the connection before it answered")
-        line += piece
-    return bytes(line)
+def usage_error(text: str) -> typer.Exit:
+    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    typer.echo(f"rosrv: {text}", err=True)
+    return typer.Exit(2)
 
 
 def body_or_exit(answer: AdminAnswer, *, as_json: bool) -> dict[str, Any]:
@@ -79,10 +153,11 @@ def body_or_exit(answer: AdminAnswer, *, as_json: bool) -> dict[str, Any]:
     raise typer.Exit(1)
 
 
+def ask(state: Path, request: AdminRequest) -> AdminAnswer:
+    """Ask the appliance of a state directory one thing. Raises `NotRunningError`."""
+    return AdminSocket(state).ask(request)
+
+
 def ask_or_exit(state: Path, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
-    """Ask the running appliance; the answer's body. Ends the program with 1 when it refuses, 2 when none runs."""
-    try:
-        return body_or_exit(ask(state, request), as_json=as_json)
-    except NotRunningError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(2) from None
+    """The same over the socket alone."""
+    return Appliance(AdminSocket(state)).ask_or_exit(request, as_json=as_json)

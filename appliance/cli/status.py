@@ -13,13 +13,14 @@ from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
 from appliance.cli.policy_output import counted
-from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
+from appliance.cli.running import Appliance, speaks
 
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
+@speaks
 def status(
-    state: State = DEFAULT_STATE,
+    appliance: Appliance,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object")] = False,
 ) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
@@ -28,7 +29,7 @@ def status(
 
     Example: rosrv status --state /var/lib/rosrv
     """
-    body = ask_or_exit(state, StatusWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
     troubles = list(_troubles(body))
     if as_json:
         sys.stdout.write(json.dumps({**body, "troubles": troubles}) + "\n")

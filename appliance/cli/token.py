@@ -11,7 +11,7 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRole
 from appliance.cli.policy_input import usage_error
 from appliance.cli.policy_output import say
-from appliance.cli.running import DEFAULT_STATE, State, ask_or_exit
+from appliance.cli.running import Appliance, speaks
 
 app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
 
@@ -21,7 +21,9 @@ _UNITS = {"m": 60.0, "h": 3600.0, "d": _DAY, "w": 7 * _DAY}
 
 
 @app.command()
+@speaks
 def add(
+    appliance: Appliance,
     name: Annotated[
         str, typer.Argument(help="Who will hold it: it stands in the audit log", show_default=False)
     ],
@@ -30,14 +32,13 @@ def add(
         typer.Option(help="viewer: look; operator: also reload and roll back; admin: also load new policies"),
     ] = "viewer",
     expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
-    state: State = DEFAULT_STATE,
     as_json: _Json = False,
 ) -> None:
     """Make a token. Its text is printed once, here, and kept nowhere.
 
     Example: rosrv token add alice --role operator --expires 30d
     """
-    body = ask_or_exit(state, TokenAdd(name, role, _seconds(expires)), as_json=as_json)
+    body = appliance.ask_or_exit(TokenAdd(name, role, _seconds(expires)), as_json=as_json)
     if as_json:
         _print(json.dumps(body))
         return
@@ -50,13 +51,14 @@ def add(
 
 
 @app.command("list")
-def list_tokens(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
+@speaks
+def list_tokens(appliance: Appliance, as_json: _Json = False) -> None:
     """List all tokens that were made, without their secrets.
 
     Example: rosrv token list
     """
     now = datetime.datetime.now(datetime.UTC).timestamp()
-    for row in ask_or_exit(state, TokenList(), as_json=as_json)["tokens"]:
+    for row in appliance.ask_or_exit(TokenList(), as_json=as_json)["tokens"]:
         if as_json:
             _print(json.dumps(row))
             continue
@@ -68,16 +70,17 @@ def list_tokens(state: State = DEFAULT_STATE, as_json: _Json = False) -> None:
 
 
 @app.command()
+@speaks
 def revoke(
+    appliance: Appliance,
     name: Annotated[str, typer.Argument(help="The name it was made with", show_default=False)],
-    state: State = DEFAULT_STATE,
     as_json: _Json = False,
 ) -> None:
     """End a token now; exit status 1 when there is none of this name.
 
     Example: rosrv token revoke alice
     """
-    body = ask_or_exit(state, TokenRevoke(name), as_json=as_json)
+    body = appliance.ask_or_exit(TokenRevoke(name), as_json=as_json)
     if as_json:
         _print(json.dumps(body))
     else:

@@ -1,0 +1,71 @@
+"""Asks the running appliance over the admin socket in its state directory, which is for its owner and root."""
+
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from appliance.channel.admin import AdminAnswer, AdminRequest
+
+if TYPE_CHECKING:
+    from appliance.cli.audit_source import AuditSource
+
+ADMIN_SOCKET = "admin.sock"
+_SECONDS = 30.0
+
+
+class NotRunningError(Exception):
+    """No appliance can be asked at this place, or not by this user or token; the text says what to do."""
+
+
+class AdminSocket:
+    """The appliance that runs with a state directory."""
+
+    def __init__(self, state: Path) -> None:
+        self.state = state
+
+    def audit(self) -> "AuditSource":
+        """The audit log's file, which can be read without a running appliance."""
+        from appliance.cli.audit_source import FileLog  # noqa: PLC0415  only for the verbs that read it
+
+        return FileLog(self.state)
+
+    def ask(self, request: AdminRequest) -> AdminAnswer:
+        """Ask the running appliance one thing. Raises `NotRunningError`."""
+        path = self.state / ADMIN_SOCKET
+        if not self.state.is_dir():
+            raise NotRunningError(
+                f"{self.state}: no such directory; give the appliance's state directory with --state"
+            )
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+                sock.settimeout(_SECONDS)
+                sock.connect(str(path))
+                sock.sendall(msgspec.json.encode(request) + b"\n")
+                line = _read_line(sock)
+        except FileNotFoundError:
+            raise NotRunningError(
+                f"{self.state}: no appliance runs with this state directory; start it: rosrv up"
+            ) from None
+        except PermissionError:
+            raise NotRunningError(f"{path} is for its owner and root only; run this as one of them") from None
+        except ConnectionRefusedError:
+            raise NotRunningError(
+                f"{self.state}: the appliance that used this state directory has ended"
+            ) from None
+        except TimeoutError:
+            raise NotRunningError(f"{path}: the appliance did not answer within {_SECONDS:g} s") from None
+        except OSError as error:
+            raise NotRunningError(f"{path}: {error.strerror or error}") from error
+        return msgspec.json.decode(line, type=AdminAnswer)
+
+
+def _read_line(sock: socket.socket) -> bytes:
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        piece = sock.recv(65536)
+        if not piece:
+            raise ConnectionResetError("the appliance closed the connection before it answered")
+        line += piece
+    return bytes(line)

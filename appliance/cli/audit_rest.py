@@ -1,0 +1,159 @@
+"""The running appliance's audit log, read over REST."""
+
+import json
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from appliance.audit.copies import SignedCheckpoint
+from appliance.audit.findings import Verification
+from appliance.audit.moment import parse_moment
+from appliance.audit.output import Entry, rfc3339
+from appliance.audit.query import Filter, FilterError
+from appliance.audit.record import Record
+from appliance.audit.search import Page, Shown
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.audit_source import Progress
+from appliance.cli.rest import ProblemError, RestClient
+
+_PATH = "/v1/audit"
+_PAGE = 1000
+_NOT_THE_RECORDS = ("schema", "sequence")
+_VERIFY_SECONDS = 3600.0
+_SILENCE_SECONDS = 60.0  # a stream says something every 15 s
+_AGAIN_SECONDS = 1.0
+_MOST_FAILURES = 5
+
+
+class RestLog:
+    """Reads the log with the token of a client."""
+
+    def __init__(self, client: RestClient) -> None:
+        self._client = client
+
+    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> Page:
+        """A page of records."""
+        entries: list[Entry] = []
+        order = "newest" if newest_first else "oldest"
+        while True:
+            size = min(_PAGE, limit - len(entries))
+            params = {**_parameters(wanted), "limit": size, "order": order}
+            if cursor is not None:
+                params["cursor"] = cursor
+            page = self._get("", params)
+            entries += map(_entry, page["records"])
+            cursor = page["cursor"]
+            if cursor is None or len(entries) >= limit:
+                return Page(entries, cursor)
+
+    def show(self, record_id: str, neighbours: int) -> Shown | None:
+        """One record with its neighbours; None when there is none."""
+        if not record_id.isalnum() or not record_id.isascii():
+            return None
+        try:
+            found = self._get(f"/{record_id}", {"neighbours": neighbours})
+        except _NothingThereError:
+            return None
+        before, after = ([*map(_entry, found[name])] for name in ("before", "after"))
+        return Shown(_entry(found["record"]), before, after)
+
+    def export(self, wanted: Filter) -> Iterator[Entry]:
+        """All records that match, the oldest first."""
+        with self._client.streamed("GET", f"{_PATH}/export", params=_parameters(wanted)) as answer:
+            for line in answer.iter_lines():
+                if line:
+                    yield _entry(json.loads(line))
+
+    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
+        """The last records that match, then those that come; a connection that breaks is made anew."""
+        position = self.last()
+        if lines:
+            yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]
+        failures, pause = 0, threading.Event()
+        while on:
+            try:
+                for entry in self._stream(wanted, position):
+                    position, failures = entry.sequence, 0
+                    yield [entry]
+            except _EndedError:
+                raise
+            except NotRunningError:
+                failures += 1
+                if failures == _MOST_FAILURES:
+                    raise
+            pause.wait(_AGAIN_SECONDS)
+
+    def verify(
+        self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
+    ) -> Verification:
+        """Whether it is complete and unchanged, as the appliance finds."""
+        del progress  # REST does not say how far it is
+        if key is not None or copies is not None:
+            raise FilterError(
+                "--key and --checkpoints are held against the log's file: verify it on its machine (--state)"
+            )
+        return msgspec.convert(self._get("/verify", {}, _VERIFY_SECONDS), Verification)
+
+    def checkpoints(self, after: int) -> list[SignedCheckpoint]:
+        """Signed checkpoints after a number, in order."""
+        found = self._get("/checkpoints", {"after": after})["checkpoints"]
+        return msgspec.convert(found, list[SignedCheckpoint])
+
+    def last(self) -> int:
+        """The sequence of the last record."""
+        found = self._get("", {"limit": 1})["records"]
+        return int(found[0]["sequence"]) if found else 0
+
+    def _get(self, path: str, params: dict[str, Any], seconds: float = 60.0) -> dict[str, Any]:
+        try:
+            return self._client.call("GET", _PATH + path, params=params, seconds=seconds)
+        except ProblemError as problem:
+            if problem.status == 404:
+                raise _NothingThereError(str(problem)) from None
+            if problem.status == 422:
+                raise FilterError("; ".join(problem.lines)) from None
+            raise NotRunningError(f"{self._client.url}: {problem}") from None
+
+    def _stream(self, wanted: Filter, after: int) -> Iterator[Entry]:
+        params = {**_parameters(wanted), "after": after}
+        with self._client.streamed(
+            "GET", f"{_PATH}/stream", params=params, seconds=_SILENCE_SECONDS
+        ) as answer:
+            event = ""
+            for line in answer.iter_lines():
+                name, _colon, value = line.partition(": ")
+                if name == "event":
+                    event = value
+                elif name == "data" and event == "record":
+                    yield _entry(json.loads(value))
+                elif name == "data" and event == "end":
+                    raise _EndedError(f"{self._client.url}: {json.loads(value)['reason']}")
+
+
+class _NothingThereError(Exception):
+    """There is no such record."""
+
+
+class _EndedError(NotRunningError):
+    """The stream is over for good."""
+
+
+def _parameters(wanted: Filter) -> dict[str, Any]:
+    fields = {name: getattr(wanted, name) for name in Filter.__struct_fields__}
+    params = {name: value for name, value in fields.items() if value not in (None, ())}
+    for name in ("since", "until"):
+        if name in params:
+            params[name] = rfc3339(params[name])
+    if "decision" in params:
+        params["decision"] = list(wanted.decision)
+    return params
+
+
+def _entry(fields: dict[str, Any]) -> Entry:
+    """A record from its documented JSON object."""
+    own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
+    time = str(fields["time"])
+    own["time"] = int(time[1:-2]) if time.startswith("@") else parse_moment(time, 0)
+    return Entry(int(fields["sequence"]), msgspec.convert(own, Record))

@@ -1,0 +1,226 @@
+"""Asks the running appliance over REST.
+
+Invariants:
+
+1. The token leaves this machine encrypted, for a server whose certificate is trusted (`--api-ca`, else the system's
+   authorities), or not at all: there is no way to switch that off. Clear text is for loopback addresses.
+2. The token comes from the environment, never from the command line, which every user of the machine can see.
+3. Nothing is followed elsewhere: no redirect, no proxy, no credentials from `.netrc`.
+"""
+
+import ipaddress
+import json
+import ssl
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import httpx
+
+from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.rest_orders import carry_out
+
+if TYPE_CHECKING:
+    from appliance.cli.audit_source import AuditSource
+
+_SECONDS = 60.0
+_CONNECT_SECONDS = 10.0
+_LONGEST_ERROR = 1 << 20
+_MAKE = "make one on its machine: rosrv token add NAME"
+
+
+class ProblemError(Exception):
+    """REST refused what was asked; `lines` is what it says, the first line the sum of it."""
+
+    def __init__(self, status: int, kind: str, lines: list[str]) -> None:
+        super().__init__(lines[0])
+        self.status = status
+        self.kind = kind
+        self.lines = lines
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    url: str
+    secure: bool
+
+
+class RestClient:
+    """Makes requests with a token; raises `NotRunningError` and `ProblemError`."""
+
+    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
+        """Raises ValueError when it is no place to send a token to."""
+        place = _place_of(url)
+        self.url = place.url
+        self._token = _checked_token(token)
+        if authority is not None and not place.secure:
+            raise ValueError(f"--api-ca is for https, and {self.url} is clear text")
+        self._client = httpx.Client(
+            base_url=place.url,
+            headers={"Authorization": f"Bearer {self._token}", "User-Agent": "rosrv"},
+            verify=_context(authority) if place.secure else False,
+            timeout=httpx.Timeout(_SECONDS, connect=_CONNECT_SECONDS),
+            trust_env=False,
+            follow_redirects=False,
+        )
+
+    def call(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Mapping[str, Any] | None = None,
+        body: Any = None,
+        seconds: float | None = _SECONDS,
+        match: bool = False,
+    ) -> dict[str, Any]:
+        """The answer's body. `match`: whatever is in force is changed (`If-Match: *`)."""
+        headers = {"If-Match": "*"} if match else {}
+        with self.streamed(
+            method, path, params=params, body=body, seconds=seconds, headers=headers
+        ) as answer:
+            text = answer.read()
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, dict):
+            raise NotRunningError(f"{self.url} is not the REST of an appliance: its answer is no JSON object")
+        return found
+
+    @contextmanager
+    def streamed(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Mapping[str, Any] | None = None,
+        body: Any = None,
+        seconds: float | None = _SECONDS,
+        headers: Mapping[str, str] | None = None,
+    ) -> Iterator[httpx.Response]:
+        """An answer while it comes."""
+        timeout = httpx.Timeout(seconds, connect=_CONNECT_SECONDS)
+        try:
+            with self._client.stream(
+                method, path, params=params, json=body, headers=headers, timeout=timeout
+            ) as answer:
+                if answer.status_code != httpx.codes.OK:
+                    raise self._problem(answer)
+                yield answer
+        except httpx.ConnectError as error:
+            raise NotRunningError(self._why_not_connected(error)) from None
+        except httpx.TimeoutException:
+            raise NotRunningError(f"{self.url}: no answer in time; is the appliance there?") from None
+        except httpx.HTTPError as error:
+            raise NotRunningError(f"{self.url}: the connection broke: {error}") from None
+
+    def _why_not_connected(self, error: Exception) -> str:
+        text = str(error)
+        if "CERTIFICATE_VERIFY_FAILED" in text:
+            if "mismatch" in text or "not valid for" in text:
+                return (
+                    f"{self.url}: its certificate is not for this name or address: call it by one that is (api_names "
+                    "in appliance.yaml adds names)"
+                )
+            why = "has expired" if "expired" in text else "is not trusted"
+            return (
+                f"{self.url}: its certificate {why}: copy STATE/api/certificate.pem from its machine and give "
+                "it with --api-ca FILE"
+            )
+        if "SSL" in text:
+            return f"{self.url}: does not speak TLS as expected ({text}); is it http, and not https?"
+        return (
+            f"{self.url} cannot be reached: {text}; is the appliance running there, and may this machine connect "
+            "(api, api_networks in appliance.yaml)?"
+        )
+
+    def _problem(self, answer: httpx.Response) -> Exception:
+        answer.read()
+        try:
+            problem = json.loads(answer.content[:_LONGEST_ERROR])
+            kind, detail = str(problem["type"]).removeprefix("urn:rosrv:problem:"), str(problem["detail"])
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return NotRunningError(
+                f"{self.url} is not the REST of an appliance: it answers with status {answer.status_code}"
+            )
+        wait = answer.headers.get("Retry-After")
+        match answer.status_code:
+            case 401:
+                return NotRunningError(
+                    f"{self.url}: the token in ROSRV_TOKEN is not taken: {detail}; {_MAKE}"
+                )
+            case 403 | 421:
+                return NotRunningError(f"{self.url}: {detail}")
+            case 429 | 503 if wait is not None:
+                return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
+        if kind == "unknown-path":
+            return NotRunningError(f"{self.url}: this appliance's version does not know that over REST")
+        return ProblemError(answer.status_code, kind, detail.split("\n"))
+
+
+class RestWay:
+    """The appliance at a URL."""
+
+    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
+        """Raises ValueError when it is no place to send a token to."""
+        self.client = RestClient(url, token, authority)
+
+    def ask(self, request: AdminRequest) -> AdminAnswer:
+        """Ask one thing. Raises `NotRunningError`."""
+        try:
+            return AdminAnswer(True, carry_out(self.client, request))
+        except ProblemError as problem:
+            return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:])
+
+    def audit(self) -> "AuditSource":
+        """Its audit log."""
+        from appliance.cli.audit_rest import RestLog  # noqa: PLC0415  only for the verbs that read it
+
+        return RestLog(self.client)
+
+
+def _place_of(url: str) -> _Place:
+    try:
+        parts = urlsplit(url)
+        host, _port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ValueError(f"--api {url!r} is no URL: {error}") from None
+    if parts.scheme not in ("http", "https") or not host:
+        raise ValueError(f"--api {url!r} is no URL: write https://HOST:PORT, as `rosrv up` prints it")
+    if parts.username is not None or parts.path.strip("/") or parts.query or parts.fragment:
+        raise ValueError(f"--api {url!r}: write scheme, host and port only: {parts.scheme}://HOST:PORT")
+    if parts.scheme == "http" and not _is_loopback(host):
+        raise ValueError(f"--api {url!r} would send the token in clear text: use https")
+    return _Place(f"{parts.scheme}://{parts.netloc}", parts.scheme == "https")
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _checked_token(token: str | None) -> str:
+    text = (token or "").strip()
+    if not text:
+        raise ValueError(f"no access token: put it into the environment as ROSRV_TOKEN; {_MAKE}")
+    if not text.isascii() or not text.isprintable() or " " in text:
+        raise ValueError(f"what is in ROSRV_TOKEN is no access token; {_MAKE}")
+    return text
+
+
+def _context(authority: Path | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=authority)
+    except ssl.SSLError:
+        raise ValueError(f"--api-ca {authority}: has no certificate in PEM") from None
+    except OSError as error:
+        raise ValueError(f"--api-ca {authority}: {error.strerror}") from None

@@ -1,0 +1,237 @@
+"""Every verb over REST (`--api`) says what it says over the state directory (`--state`), with the same exit status."""
+
+import json
+import os
+import subprocess
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.processes import LIMIT
+
+SPEED = "speed() { event said() /chatter std_msgs/String '{}' { } }\n"
+COUNT = "hold count() { event said() /chatter std_msgs/String '{}' { } }\n"
+WRONG = "wrong() {\n    event said() /chatter std_msgs/Strong '{}' { }\n}\n"
+WITHOUT_PUBLISHERS = OPEN_POLICY.replace("[Publishers]\ndefault = *\n", "")
+Done = subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """An appliance with TLS and a monitor, which has refused something."""
+    appliance = Appliance(policy=WITHOUT_PUBLISHERS)
+    folder = appliance.directory / "monitors"
+    folder.mkdir()
+    (folder / "speed.rv").write_text(SPEED)
+    appliance.options = ("--api", "127.0.0.1:0", "--monitors", str(folder))
+    with appliance as running:
+        running.rest()
+        with xmlrpc.client.ServerProxy(running.master_uri) as master:
+            for name in ("/a", "/b", "/c"):
+                master.registerPublisher(f"/node{name}", name, "std_msgs/String", "http://127.0.0.1:9/")
+            master.registerSubscriber("/hearer", "/a", "std_msgs/String", "http://127.0.0.1:9/")
+        yield running
+
+
+def run(appliance: Appliance, way: str, *arguments: str, env: dict[str, str] | None = None) -> Done:
+    """A verb, one way or the other."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
+    place = ["--state", str(appliance.state)]
+    if way == "api":
+        certificate = appliance.state / "api" / "certificate.pem"
+        place = ["--api", str(appliance.ready["api"]), "--api-ca", str(certificate)]
+        kept["ROSRV_TOKEN"] = str(appliance.ready["token"])
+    return subprocess.run(
+        [ROSRV, *arguments, *place],
+        env=kept | (env or {}), capture_output=True, text=True, timeout=LIMIT, check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+LOOKING = [
+    ("status",), ("policy", "revisions"), ("policy", "revisions", "--json"), ("monitor", "list"),
+    ("monitor", "list", "--json"), ("token", "list"), ("token", "list", "--json"),
+    ("audit", "search", "--deny", "--category", "publish"), ("audit", "search", "--deny", "--json", "--limit", "2"),
+    ("audit", "search", "--event", "policy loaded", "--oldest-first"), ("audit", "search", "--topic", "/nowhere"),
+    ("audit", "search", "--since", "never"), ("audit", "search", "--cursor", "nonsense"),
+    ("audit", "search", "--text", "publish /a", "--json"), ("audit", "show", "1"), ("audit", "show", "1", "--json"),
+    ("audit", "show", "999999"), ("audit", "show", "../x"),
+    ("audit", "tail", "--no-follow", "--deny", "--lines", "2"), ("audit", "export", "--category", "publish"),
+]  # fmt: skip
+
+
+def comparable(done: Done) -> list[object]:
+    """What was said, without what a moment changes."""
+    lines = [line for line in done.stdout.splitlines() if not line.startswith(("appliance", "audit log"))]
+    shown = [json.loads(line) if line.startswith("{") else line for line in lines]
+    running = [
+        " ".join(str(line).split()[:2]) if " min" in str(line) or " s " in str(line) else line
+        for line in shown
+    ]
+    return [done.returncode, running, done.stderr.splitlines()]
+
+
+@pytest.mark.parametrize("verb", LOOKING, ids=" ".join)
+def test_looking_is_the_same(appliance: Appliance, verb: tuple[str, ...]) -> None:
+    """Output, errors and exit status of what only looks are equal."""
+    over_socket, over_rest = (comparable(run(appliance, way, *verb)) for way in ("state", "api"))
+    assert over_socket == over_rest
+    assert over_socket[1] or over_socket[2] or "/nowhere" in verb
+
+
+def test_checkpoints_are_the_same(appliance: Appliance) -> None:
+    """What is written over REST begins with what was in the file before, and is the beginning of what is there after."""
+    before, over_rest, after = (
+        run(appliance, way, "audit", "checkpoints").stdout for way in ("state", "api", "state")
+    )
+    assert over_rest.startswith(before)
+    assert after.startswith(over_rest)
+
+
+def test_status_has_the_same_fields(appliance: Appliance) -> None:
+    """`status --json`: every field, and whatever stands still has the same value."""
+    over_socket, over_rest = (
+        json.loads(run(appliance, way, "status", "--json").stdout) for way in ("state", "api")
+    )
+    assert over_socket.keys() == over_rest.keys()
+    for name in ("version", "since", "policy", "monitors", "nodes", "topics", "isolation", "ipsec"):
+        assert over_socket[name] == over_rest[name], name
+
+
+def test_the_log_is_proven_both_ways(appliance: Appliance) -> None:
+    """`audit verify` finds it whole; a key or copies of one's own are held against the file only, which is said."""
+    for way in ("state", "api"):
+        done = run(appliance, way, "audit", "verify", "--json")
+        assert (done.returncode, json.loads(done.stdout)["ok"]) == (0, True)
+        assert "complete and unchanged" in run(appliance, way, "audit", "verify").stdout
+    key = next(appliance.state.glob("control/*.pub*"), appliance.state / "control" / "audit.pub")
+    done = run(appliance, "api", "audit", "verify", "--key", str(key))
+    assert done.returncode == 2
+    assert "--state" in done.stderr
+
+
+@pytest.mark.parametrize("way", ["state", "api"])
+def test_changing_is_the_same(appliance: Appliance, way: str, tmp_path: Path) -> None:
+    """Policy and monitors: what a change says, refusals with their places, and exit statuses, one way and the other."""
+    files = {name: tmp_path / name for name in ("count.rv", "wrong.rv")}
+    files["count.rv"].write_text(COUNT)
+    files["wrong.rv"].write_text(WRONG)
+
+    def said(*arguments: str) -> tuple[int, str, str]:
+        done = run(appliance, way, *arguments)
+        return done.returncode, done.stdout.strip(), done.stderr.strip()
+
+    assert said("monitor", "disable", "speed") == (0, "disabled: speed", "")
+    assert said("monitor", "disable", "speed") == (0, "disabled: nothing, it was so already", "")
+    assert said("monitor", "enable", "speed", "nobody")[0] == 1
+    assert "no monitor is named nobody; there are: speed" in said("monitor", "enable", "speed", "nobody")[2]
+    assert said("monitor", "enable", "speed") == (0, "enabled: speed", "")
+    status, shown, _ = said("monitor", "load", str(files["count.rv"]), "--note", "trial")
+    assert (status, shown.endswith("added count.rv")) == (0, True)
+    status, shown, error = said("monitor", "load", str(files["wrong.rv"]))
+    assert (status, shown) == (1, "")
+    assert error.startswith("wrong.rv:2:") and "error: " in error.splitlines()[0]
+    assert error.splitlines()[-1].startswith("rosrv: refused; revision ")
+    told = json.loads(said("monitor", "load", str(files["wrong.rv"]), "--json")[1])
+    assert told["findings"][0].startswith("wrong.rv:2:")
+    assert said("monitor", "resume", "count") == (0, "resumed: none was held", "")
+    assert said("monitor", "remove", "count")[1].endswith("removed count.rv")
+    assert said("monitor", "reload")[1].endswith("nothing is different")
+
+    assert said("policy", "confirm")[0] == 1
+    status, shown, _ = said("policy", "reload", "--confirm-within", "1h")
+    assert status == 0
+    assert "is in force (was " in shown and "rosrv policy confirm" in shown
+    assert said("policy", "confirm")[1].endswith("stays in force")
+    assert said("policy", "rollback")[0] == 0
+    assert said("policy", "rollback", "7777")[0] == 1
+    good = appliance.policy_file.read_text()
+    appliance.policy_file.write_text("[Nodes]\nnonsense\n")
+    try:
+        status, shown, error = said("policy", "reload")
+    finally:
+        appliance.policy_file.write_text(good)
+    assert (status, shown) == (1, "")
+    assert error.startswith(f"{appliance.policy_file}:2:1")
+    assert said("policy", "reload")[0] == 0
+
+
+def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_path: Path) -> None:
+    """`policy diff` and `policy learn` take the audit log (and what is registered) from either place."""
+    open_policy = tmp_path / "open.ini"
+    open_policy.write_text(OPEN_POLICY)
+    for verb in (
+        ("policy", "diff", str(appliance.policy_file), str(open_policy)),
+        ("policy", "diff", str(appliance.policy_file), str(open_policy), "--json"),
+        ("policy", "learn"),
+    ):
+        over_socket, over_rest = (comparable(run(appliance, way, *verb)) for way in ("state", "api"))
+        assert over_socket == over_rest
+        assert over_socket[1]
+
+
+def test_tokens_end_over_rest_and_are_made_on_the_machine(appliance: Appliance) -> None:
+    """`token revoke` works both ways, and at once; `token add` over REST says where it can be done."""
+    refused = run(appliance, "api", "token", "add", "bob")
+    assert refused.returncode == 2
+    assert "on the appliance's machine" in refused.stderr
+    made = json.loads(run(appliance, "state", "token", "add", "bob", "--json").stdout)
+    bob = {"ROSRV_TOKEN": made["token"]}
+    assert run(appliance, "api", "policy", "revisions", env=bob).returncode == 0
+    assert "for admins" in run(appliance, "api", "token", "list", env=bob).stderr
+    gone = run(appliance, "api", "token", "revoke", "bob")
+    assert (gone.returncode, gone.stdout) == (0, "token bob (viewer) is revoked\n")
+    late = run(appliance, "api", "policy", "revisions", env=bob)
+    assert late.returncode == 2
+    assert "is not taken" in late.stderr
+    unknown = [run(appliance, way, "token", "revoke", "bob") for way in ("state", "api")]
+    assert unknown[0].stderr == unknown[1].stderr
+    assert [one.returncode for one in unknown] == [1, 1]
+
+
+def test_following_goes_on_over_a_restart_of_the_api(appliance: Appliance) -> None:
+    """`audit tail --api` shows what is recorded after the api was killed, once, and ends with its token."""
+    made = json.loads(run(appliance, "state", "token", "add", "tail", "--json").stdout)
+    certificate = str(appliance.state / "api" / "certificate.pem")
+    place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]
+    env = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
+    follower = subprocess.Popen(
+        [ROSRV, "audit", "tail", "--event", "monitor *abled", "--lines", "0", "--json", *place],
+        env=env | {"ROSRV_TOKEN": made["token"]}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    stop = threading.Event()
+
+    def switch() -> None:
+        words = ("disable", "enable")
+        for number in range(200):
+            run(appliance, "state", "monitor", words[number % 2], "speed")
+            if stop.wait(0.1):
+                return
+
+    switching = threading.Thread(target=switch)
+    try:
+        switching.start()
+        assert follower.stdout is not None
+        first = [json.loads(follower.stdout.readline())["sequence"] for _ in range(3)]
+        appliance.kill("api")
+        then = [json.loads(follower.stdout.readline())["sequence"] for _ in range(3)]
+        stop.set()
+        switching.join()
+        assert [*first, *then] == sorted(set(first + then))
+        wanted = appliance.audit("--event", "monitor *abled", "--oldest-first")
+        known = [one["sequence"] for one in wanted if first[0] <= one["sequence"] <= then[-1]]
+        assert known == [*first, *then]
+        run(appliance, "state", "token", "revoke", "tail")
+        _rest, said = follower.communicate(timeout=LIMIT)
+        assert follower.returncode == 2, said
+        assert "token" in said
+    finally:
+        stop.set()
+        switching.join()
+        if follower.poll() is None:
+            follower.kill()
+            follower.communicate()
+    run(appliance, "state", "monitor", "enable", "speed")
