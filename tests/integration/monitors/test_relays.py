@@ -1,0 +1,170 @@
+"""Several relay processes: monitors and topics are spread over them, and one knows nothing of another's death."""
+
+import json
+import os
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.processes import Process
+from tests.support.relay_driver import wait_until
+from tests.support.requirements import needs
+
+SPECIFICATION = """
+NAME() {
+    int heard = 0;
+    std_msgs::String report;
+    event said(std::string text) /TOPIC std_msgs/String '{data:text}' {
+        heard = heard + 1;
+        text = "NAME " + std::to_string(heard) + " " + text;
+        if (heard == 3) { report.data = "three on TOPIC"; PUBLISH(/NAME/alarm, std_msgs/String, report); }
+    }
+}
+"""
+
+
+def specification(name: str, topic: str) -> str:
+    """Numbers what it hears, and publishes an alarm at the third message."""
+    return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """Two relays, and a monitor for each: `left` on /left, `right` on /right."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with tempfile.TemporaryDirectory(prefix="rosrv-relays-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        for one in ("left", "right"):
+            (folder / f"{one}.rv").write_text(specification(one, one))
+        config = folder / "appliance.yaml"
+        config.write_text("relays: 2\n")
+        options = ("--config", str(config), "--monitors", str(folder), "--api", "off")
+        with Appliance(options=options) as appliance:
+            yield appliance
+
+
+@pytest.fixture
+def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
+    """Nodes of one test."""
+    with RosSession(appliance.master_uri, tmp_path) as session:
+        yield session
+
+
+def rows(appliance: Appliance) -> dict[str, dict[str, object]]:
+    """The rows of `rosrv monitor list`, by name."""
+    lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
+    return {row["name"]: row for row in map(json.loads, lines)}
+
+
+def numbers(listener: Process) -> list[int]:
+    """The numbers of the talker's messages that came."""
+    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
+
+
+def without_gap(heard: list[int]) -> bool:
+    """Whether nothing is missing between the first and the last, and the order is kept."""
+    return heard == list(range(heard[0], heard[0] + len(heard)))
+
+
+def relay_of(appliance: Appliance, number: int) -> int:
+    """The process id of a relay, counted from 1, by what processes are called."""
+    name = "rosrv: relay" if number == 1 else f"rosrv: relay-{number}"
+    for pid in appliance.pids("relay"):
+        if Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0 ").decode() == name:
+            return pid
+    raise AssertionError(f"no process is called {name}")
+
+
+def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: RosSession) -> None:
+    """The dead one's topics go on as after any restart; its monitors begin anew, the other's keep their state."""
+    left, right = ros.listener("rospy", "/left"), ros.listener("roscpp", "/right")
+    alarms = [ros.listener("rospy", f"/{one}/alarm") for one in ("left", "right")]
+    ros.talker("roscpp", "/left", name="one")
+    ros.talker("rospy", "/right", name="other")
+    for alarm, word in zip(alarms, ("left", "right"), strict=True):
+        told = alarm.wait_for(event="received")
+        assert (told["data"], told["publisher"]) == (f"three on {word}", "/rosrv")
+    for listener in (left, right):
+        listener.wait_for_count(5, event="received")
+    assert len(appliance.pids("relay")) == 2
+    killed = relay_of(appliance, 1)
+    os.kill(killed, signal.SIGKILL)
+    before = len(left.seen(event="received"))
+    left.wait_for_count(before + 5, event="received")
+    right.wait_for_count(len(right.seen(event="received")) + 5, event="received")
+    heard = [event["data"].split() for event in right.seen(event="received")]
+    assert without_gap(numbers(right))
+    assert without_gap([int(words[1]) for words in heard])
+    restarted = appliance.audit(event="monitors restarted")
+    assert [record["detail"]["monitors"] for record in restarted] == [["left"]]
+    wait_until(lambda: int(str(rows(appliance)["right"]["events"])) > 5, "the counters of the second relay")
+    assert set(rows(appliance)) == {"left", "right"}
+
+
+def test_loading_a_specification_that_joins_two_relays_moves_as_little_as_it_can(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """The monitor that has to move begins anew, which is an alarm; nodes are told to connect again and do."""
+    listeners = {
+        (one, client): ros.listener(client, f"/{one}")
+        for one in ("left", "right")
+        for client in ("rospy", "roscpp")
+    }
+    for one in ("left", "right"):
+        ros.talker("roscpp", f"/{one}", name=f"talks_{one}")
+    for listener in listeners.values():
+        listener.wait_for_count(5, event="received")
+    path = tmp_path / "both.rv"
+    path.write_text(
+        "both() { int n = 0;"
+        " event a() /left std_msgs/String '{}' { n++; }"
+        " event b(std::string text) /right std_msgs/String '{data:text}' { text = \"both \" + text; } }"
+    )
+    done = appliance.rosrv("monitor", "load", str(path))
+    for listener in listeners.values():
+        listener.wait_for_count(len(listener.seen(event="received")) + 5, event="received")
+    for client in ("rospy", "roscpp"):
+        said = listeners["right", client].wait_for(lambda event: "both" in event.get("data", ""))
+        assert " right " in f" {said['data']}"
+    moved = appliance.audit(event="topics moved")[0]
+    assert moved["detail"]["monitors"] == ["right"]
+    assert moved["severity"] == "alarm"
+    assert "right" in done.stdout + done.stderr
+    stayed = [event["data"].split() for event in listeners["left", "roscpp"].seen(event="received")]
+    assert without_gap([int(words[1]) for words in stayed])
+    appliance.rosrv("monitor", "remove", "both")
+    for listener in listeners.values():
+        before = len(listener.seen(event="received"))
+        listener.wait_for_count(before + 5, event="received")
+    assert set(rows(appliance)) == {"left", "right"}
+
+
+def test_services_are_carried_by_the_relay_of_their_monitor(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """Before and after it was loaded, and after a control that died; what is kept is where it was."""
+    ros.service_server("rospy", "/mode")
+    ros.service_server("roscpp", "/other_mode")
+    clients = [ros.service_client("roscpp", "/mode"), ros.service_client("rospy", "/other_mode")]
+    path = tmp_path / "gate.rv"
+    path.write_text(
+        "gate() { event wish(bool data) service /mode std_srvs/SetBool request '{data:data}'"
+        ' { ROS_WARN("seen"); }'
+        " event other(bool data) service /other_mode std_srvs/SetBool request '{data:data}' { } }"
+    )
+    for client in clients:
+        client.send("true")
+        client.wait_for(event="answered")
+    appliance.rosrv("monitor", "load", str(path))
+    appliance.kill("control")
+    wait_until(lambda: len(rows(appliance)) == 3, "control is back")
+    for client in clients:
+        client.send("true")
+        client.wait_for_count(2, event="answered")
+    wait_until(lambda: int(str(rows(appliance)["gate"]["events"])) == 2, "the monitor has seen both requests")
