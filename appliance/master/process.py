@@ -209,7 +209,7 @@ class _Control:
         lifeline.links["charon"] = lambda _index, descriptor: base.hosts.attach(
             Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
         )
-        lifeline.links["syslog"] = lambda descriptor: self._forwarded.attach(
+        lifeline.links["syslog"] = lambda _index, descriptor: self._forwarded.attach(
             Channel(socket.socket(fileno=descriptor), messages.ForwardingLink)
         )
         lifeline.probed = base.doors.probed
