@@ -5,6 +5,7 @@ firewall lets this user reach the receiver and nobody else. It outlives control:
 """
 
 import asyncio
+import contextvars
 import os
 import socket
 import threading
@@ -47,7 +48,10 @@ class _Process:
         """Forward from start to end."""
         self._lifeline.attach(asyncio.get_running_loop(), self._received, self._stopping.set)
         # A daemon: when a receiver hangs, the end does not wait for it; its batch is sent again at the next start.
-        thread = threading.Thread(target=self._forward, name="forward", daemon=True)
+        said_with_logs = contextvars.copy_context()  # which process this is
+        thread = threading.Thread(
+            target=said_with_logs.run, args=(self._forward,), name="forward", daemon=True
+        )
         thread.start()
         self._say(messages.Ready())
         while not self._stopping.is_set():
