@@ -1,0 +1,121 @@
+"""The audit log of the real appliance, forwarded to a syslog receiver that comes and goes."""
+
+import json
+import os
+import signal
+import time
+import xmlrpc.client
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.support.appliance import Appliance
+from tests.support.syslog import StreamCollector, eventually
+
+
+@contextmanager
+def forwarding(port: int, tmp_path: Path, **syslog: Any) -> Iterator[Appliance]:
+    """An appliance that forwards to this port on loopback, and seals its log every second."""
+    file = tmp_path / "appliance.yaml"
+    settings = {"syslog": {"to": f"tcp://127.0.0.1:{port}", **syslog}, "checkpoint_seconds": 1}
+    file.write_text(json.dumps({"audit": settings}))
+    with Appliance(options=("--config", str(file))) as appliance:
+        yield appliance
+
+
+def work(appliance: Appliance, count: int) -> None:
+    """Calls of a node: each is a record."""
+    with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        for number in range(count):
+            assert master.setParam("/worker", f"/value{number}", number)[0] == 1
+
+
+def all_sequences(appliance: Appliance) -> set[int]:
+    """What the log has now."""
+    lines = appliance.rosrv("audit", "export").stdout.splitlines()
+    return {int(json.loads(line)["sequence"]) for line in lines}
+
+
+def forwarding_status(appliance: Appliance) -> dict[str, Any]:
+    """How it stands, by `rosrv status`."""
+    status = json.loads(appliance.rosrv("status", "--json", check=False).stdout)
+    return dict(status["audit"]["forwarding"])
+
+
+def test_everything_arrives_and_proves(tmp_path: Path) -> None:
+    """What the receiver has is the whole log in order, and its checkpoints prove the log against root himself."""
+    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
+        work(appliance, 50)
+        wanted = all_sequences(appliance)
+        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+        assert collector.sequences() == sorted(set(collector.sequences()))
+        collector.wait_for(lambda messages: any(one.event == "checkpoint-signed" for one in messages))
+        kept = tmp_path / "receiver.ndjson"
+        checkpoints = [one for one in collector.messages if one.event == "checkpoint-signed"]
+        kept.write_text("".join(json.dumps(one.fields) + "\n" for one in checkpoints))
+        assert "kept elsewhere agree" in appliance.rosrv("audit", "verify", "--checkpoints", str(kept)).stdout
+        status = forwarding_status(appliance)
+        assert status["trouble"] == ""
+        assert status["to"] == f"tcp://127.0.0.1:{collector.port}"
+        samples = appliance.rest().get("/metrics").body.decode()
+        assert "rosrv_syslog_up 1.0" in samples
+        if os.geteuid() == 0:
+            (pid,) = appliance.pids("syslog")
+            owner = Path(f"/proc/{pid}").stat()
+            assert (owner.st_uid, owner.st_gid) == (61017, 61014)
+
+
+def test_a_receiver_that_is_away(tmp_path: Path) -> None:
+    """While nobody receives, nodes are served as ever, the state says so; then everything arrives."""
+    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
+        collector.wait_for(lambda messages: messages)
+        collector.close()
+        start = time.monotonic()
+        work(appliance, 200)
+        assert time.monotonic() - start < 10
+        eventually(lambda: forwarding_status(appliance)["trouble"])
+        told = appliance.rosrv("status", check=False)
+        assert told.returncode == 1
+        assert "the audit log is not forwarded to tcp://" in told.stdout
+        eventually(lambda: appliance.audit(event="forwarding failed"))
+        collector.open()
+        eventually(lambda: not forwarding_status(appliance)["trouble"])
+        eventually(lambda: appliance.audit(event="forwarding resumed"))
+        wanted = all_sequences(appliance)
+        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+
+
+def test_deaths(tmp_path: Path) -> None:
+    """The forwarder killed again and again, control too, the appliance stopped and started: nothing is missing."""
+    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
+        for role in ("syslog", "control", "syslog"):
+            work(appliance, 60)
+            before = appliance.pids(role)
+            os.kill(before[0], signal.SIGKILL)
+            eventually(lambda role=role, before=before: appliance.pids(role) not in ([], before))
+        work(appliance, 60)
+        assert appliance.stop() == 0
+        appliance.start()
+        work(appliance, 10)
+        wanted = all_sequences(appliance)
+        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+        assert collector.problems == []
+
+
+def test_only_denials(tmp_path: Path) -> None:
+    """With `send: denials` what was allowed stays here; what was refused arrives, with who and why."""
+    with (
+        StreamCollector() as collector,
+        forwarding(collector.port, tmp_path, send="denials", facility=10) as appliance,
+    ):
+        work(appliance, 20)
+        with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+            assert master.noSuchCall("/rogue\u202e]\n")[0] == 0
+        (denial,) = collector.wait_for(lambda messages: [one for one in messages if one.event == "decision"])[
+            :1
+        ]
+        assert (denial.fields["decision"], denial.fields["host"]) == ("deny", "127.0.0.1")
+        assert denial.facility == 10
+        assert denial.fields["caller_id"] == "/rogue\\u202e]\\n"
+        assert all(one.fields.get("decision") != "allow" for one in collector.messages)
