@@ -1,0 +1,317 @@
+"""A Docker engine of the tests' own: started, used and ended here, beside whatever else the machine runs.
+
+    with Lab("rosrv-engine") as lab, images():
+        with Engine(lab.host("machine", "10.79.0.1/24")) as engine:
+            engine.docker("ps")
+            compose = engine.compose(project_directory, "rosrv")
+            compose("up", "--detach")
+
+The engine lives on a host of the lab: that is the machine that the product's containers run on, and the engine's
+bridges and rules are in the namespace of that host, not in this machine's. Images are built before, by an engine in
+this machine's own network that changes nothing of it (no bridge, no rules); both use the same data, kept under
+`build/docker`, so that a second build is quick.
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network.namespaces import Namespace
+from tests.support.debian_base import base_archive
+from tests.support.processes import Host, ThisMachine
+from tests.support.requirements import need_program, need_root
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "build" / "docker"
+BASE = "rosrv-test/debian:12-slim"
+APPLIANCE, DEMO = "rosrv/appliance", "rosrv/demo"
+START_SECONDS = 60.0
+BUILD_SECONDS = 900.0
+HEALTHY_SECONDS = 120.0
+Output = subprocess.CompletedProcess[str]
+
+
+class DockerError(AssertionError):
+    """A command of the engine or of compose failed; the text has what it said."""
+
+
+class Engine:
+    """A running dockerd; a context manager. With `builds`, one that only builds images."""
+
+    def __init__(self, host: Host | None = None, *, builds: bool = False) -> None:
+        need_root()
+        self._program = need_program("dockerd", "docker.io")
+        self._client = need_program("docker", "docker.io")
+        self._compose = need_program("docker-compose", "docker-compose")
+        self.host: Host = host or ThisMachine()
+        self._builds = builds
+        # Short, for the sockets in it.
+        self.directory = Path(tempfile.mkdtemp(prefix="rosrv-engine-"))
+        self._log = self.directory / "log"
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock: int | None = None
+
+    @property
+    def address(self) -> str:
+        """Where its clients find it."""
+        return f"unix://{self.directory}/sock"
+
+    def docker(
+        self, *arguments: str, check: bool = True, timeout: float = 120, text: str | None = None
+    ) -> Output:
+        """`docker …`; `text` is its standard input."""
+        return self._run([self._client, *arguments], check=check, timeout=timeout, text=text)
+
+    def inspect(self, name: str) -> dict[str, Any]:
+        """What the engine knows of a container, image, network or volume."""
+        found: list[dict[str, Any]] = json.loads(self.docker("inspect", name).stdout)
+        return found[0]
+
+    def compose(self, directory: Path, project: str, *files: str, **environment: str) -> "Compose":
+        """The services of the compose files in `directory`; without files, of the one compose finds itself."""
+        return Compose(self, directory, project, files, environment)
+
+    def build(self, target: str, tag: str, context: Path = ROOT) -> None:
+        """`docker build` of one target of the Dockerfile, on the base made here."""
+        arguments = ("--network", "host", "--build-arg", f"BASE={BASE}", "--target", target, "--tag", tag)
+        self.docker("build", *arguments, str(context), timeout=BUILD_SECONDS)
+
+    def has_image(self, name: str) -> bool:
+        """Whether there is an image of this name."""
+        return self.docker("image", "inspect", name, check=False).returncode == 0
+
+    def clear(self) -> None:
+        """Remove every container, network and volume that an earlier run may have left; images stay."""
+        left = self.docker("ps", "--all", "--quiet").stdout.split()
+        if left:
+            self.docker("rm", "--force", "--volumes", *left)
+        self.docker("network", "prune", "--force")
+        self.docker("volume", "prune", "--force")
+
+    def start(self) -> Self:
+        """Start it; returns when it answers."""
+        DATA.mkdir(parents=True, exist_ok=True)
+        self._lock = os.open(DATA.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)  # the data is for one engine at a time
+        command = [self._program, "--data-root", str(DATA), "--exec-root", str(self.directory / "exec")]
+        command += ["--pidfile", str(self.directory / "pid"), "--host", self.address]
+        if self._builds:
+            command += ["--bridge=none", "--iptables=false", "--ip-forward=false", "--ip-masq=false"]
+        with self._log.open("ab") as log:
+            self._process = self.host.popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        deadline = time.monotonic() + START_SECONDS
+        while self.docker("version", check=False).returncode:
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                raise DockerError(f"the engine did not start:\n{self.story()}")
+        self.clear()
+        return self
+
+    def stop(self) -> None:
+        """End it, by its own process id, and remove what it left; its data stays."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(60)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait(60)
+        for mount in _mounts_below(self.directory):
+            subprocess.run(["umount", "--lazy", mount], check=False)
+        shutil.rmtree(self.directory, ignore_errors=True)
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def story(self) -> str:
+        """The last of what it said."""
+        lines = self._log.read_text(errors="backslashreplace").splitlines() if self._log.exists() else []
+        return "\n".join(["--- dockerd", *(line for line in lines[-200:] if "level=info" not in line)][-40:])
+
+    def _run(self, command: Sequence[str], *, check: bool, timeout: float, text: str | None = None) -> Output:
+        return self.run_client(command, {}, Path("/"), check=check, timeout=timeout, text=text)
+
+    def run_client(
+        self,
+        command: Sequence[str],
+        environment: dict[str, str],
+        directory: Path,
+        *,
+        check: bool,
+        timeout: float,
+        text: str | None = None,
+    ) -> Output:
+        """A program that speaks to this engine. Raises `DockerError`."""
+        kept = {
+            key: value
+            for key, value in os.environ.items()
+            if not key.startswith(("DOCKER_", "ROSRV_", "ROS_"))
+        }
+        done = subprocess.run(
+            command,
+            env=kept | {"DOCKER_HOST": self.address, "COMPOSE_HTTP_TIMEOUT": "120"} | environment,
+            cwd=directory,
+            input=text if text is not None else "",
+            capture_output=True,
+            text=True,
+            errors="backslashreplace",
+            timeout=timeout,
+            check=False,
+        )
+        if check and done.returncode:
+            said = "\n".join((done.stdout + done.stderr).splitlines()[-40:])
+            raise DockerError(
+                f"{' '.join(command)} ended with status {done.returncode}\n{said}\n{self.story()}"
+            )
+        return done
+
+    def __enter__(self) -> Self:
+        try:
+            return self.start()
+        except BaseException:
+            self.stop()
+            raise
+
+    def __exit__(self, *exc: object) -> None:
+        with contextlib.suppress(DockerError):
+            self.clear()
+        self.stop()
+
+
+class Compose:
+    """One project of docker-compose; `compose("up", "-d")` runs its commands."""
+
+    def __init__(
+        self, engine: Engine, directory: Path, project: str, files: Sequence[str], environment: dict[str, str]
+    ) -> None:
+        self.engine = engine
+        self.directory = directory
+        self.project = project
+        self.environment = environment
+        self._options = ["--project-name", project, "--no-ansi"]
+        for file in files:
+            self._options += ["--file", file]
+
+    def __call__(self, *arguments: str, check: bool = True, timeout: float = 180) -> Output:
+        """`docker-compose …`."""
+        command = [shutil.which("docker-compose") or "docker-compose", *self._options, *arguments]
+        return self.engine.run_client(command, self.environment, self.directory, check=check, timeout=timeout)
+
+    def container(self, service: str) -> str:
+        """The id of a service's container."""
+        found = self("ps", "--quiet", service).stdout.split()
+        assert len(found) == 1, f"{service} has {len(found)} containers\n{self.story()}"
+        return found[0]
+
+    def exec(self, service: str, *command: str, check: bool = True, timeout: float = 60) -> Output:
+        """Run a command in a service's container, as `docker compose exec` does."""
+        return self("exec", "-T", service, *command, check=check, timeout=timeout)
+
+    def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
+        """Until the service's health check has passed."""
+        container = self.container(service)
+        deadline = time.monotonic() + timeout
+        while (state := self.engine.inspect(container)["State"])["Health"]["Status"] != "healthy":
+            if not state["Running"] or time.monotonic() > deadline:
+                raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
+
+    def wait_for_log(self, service: str, text: str, *, timeout: float = 60, since: str = "0s") -> str:
+        """The first line of a service's output that contains `text`; `since` is a moment, as Docker writes it."""
+        command = [
+            shutil.which("docker") or "docker",
+            "logs",
+            "--follow",
+            container := self.container(service),
+        ]
+        command[3:3] = [] if since == "0s" else ["--since", since]
+        environment = os.environ | {"DOCKER_HOST": self.engine.address}
+        with subprocess.Popen(
+            ["timeout", str(timeout), *command],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="backslashreplace",
+        ) as follow:
+            assert follow.stdout is not None
+            try:
+                for line in follow.stdout:
+                    if text in line:
+                        return line.rstrip("\n")
+            finally:
+                follow.terminate()
+        raise DockerError(
+            f"{service} ({container}) did not say {text!r} within {timeout:.0f} s\n{self.story()}"
+        )
+
+    def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
+        """`rosrv audit search --json` in the appliance; of its records those that have these fields."""
+        lines = self.exec("appliance", "rosrv", "audit", "search", "--json", "--limit", "1000", *flags).stdout
+        records: list[dict[str, Any]] = [
+            json.loads(line) for line in lines.splitlines() if line.startswith("{")
+        ]
+        return [one for one in records if all(one.get(key) == value for key, value in fields.items())]
+
+    def status(self) -> dict[str, Any]:
+        """`rosrv status --json` in the appliance."""
+        status: dict[str, Any] = json.loads(
+            self.exec("appliance", "rosrv", "status", "--json", check=False).stdout
+        )
+        return status
+
+    def story(self) -> str:
+        """What the containers said last."""
+        return self("--profile", "demo", "logs", "--no-color", "--tail", "40", check=False).stdout
+
+
+@contextlib.contextmanager
+def images() -> Iterator[None]:
+    """Have the images of the appliance and of the demonstration, built from this checkout as it is."""
+    archive = base_archive()
+    with Engine(builds=True) as engine:
+        label = f"base={archive.stem}"
+        known = engine.docker("images", "--quiet", "--filter", f"label={label}", BASE).stdout.strip()
+        if not known:
+            engine.docker("import", "--change", f"LABEL {label}", str(archive), BASE, timeout=300)
+        engine.build("appliance", APPLIANCE)
+        engine.build("demo", DEMO)
+        engine.docker("image", "prune", "--force", "--filter", "until=24h")
+    yield
+
+
+def project(directory: Path) -> Path:
+    """A directory as a user has it: the compose files and the three folders he edits, his to change."""
+    for name in ("compose.yaml", "compose.host.yaml"):
+        shutil.copy(ROOT / name, directory)
+    for name in ("policies", "monitors"):
+        shutil.copytree(ROOT / name, directory / name)
+    (directory / "ipsec").mkdir()
+    return directory
+
+
+def namespace_of(engine: Engine, container: str) -> Namespace:
+    """The network namespace of a running container, to try connections from."""
+    pid = engine.inspect(container)["State"]["Pid"]
+    return _ContainerNamespace(int(pid))
+
+
+class _ContainerNamespace(Namespace):
+    """By process id instead of by name."""
+
+    def __init__(self, pid: int) -> None:
+        self.name = f"container-{pid}"
+        self.path = Path(f"/proc/{pid}/ns/net")
+
+
+def _mounts_below(directory: Path) -> list[str]:
+    lines = Path("/proc/self/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
+    below = [line.split()[1] for line in lines if line.split()[1].startswith(f"{directory}/")]
+    return sorted(below, reverse=True)

@@ -1,0 +1,53 @@
+"""A machine of the lab with a Docker engine, a laptop on its network, and the product running there as containers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.docker import Compose, Engine, images, project
+from tests.support.requirements import need_root
+
+
+@dataclass(frozen=True)
+class Site:
+    """`machine` (10.79.0.1) runs the engine; `laptop` (10.79.0.50) is another computer on its network."""
+
+    engine: Engine
+    machine: Host
+    laptop: Host
+
+
+@pytest.fixture(scope="session")
+def site() -> Iterator[Site]:
+    """The engine, with the images built from this checkout."""
+    need_root()
+    with images(), Lab("rosrv-engine") as lab:
+        machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")
+        with Engine(machine) as engine:
+            yield Site(engine, machine, laptop)
+
+
+@pytest.fixture(scope="module")
+def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
+    """`docker compose --profile demo up`: the appliance, the LandShark, its operator and a visitor."""
+    compose = site.engine.compose(project(tmp_path_factory.mktemp("project")), "demo")
+    try:
+        compose("--profile", "demo", "up", "--detach", "--no-build")
+        yield compose
+    finally:
+        compose("--profile", "demo", "down", "--volumes", "--timeout", "5")
+
+
+@pytest.fixture
+def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
+    """`docker compose up`: the appliance alone, healthy."""
+    compose = site.engine.compose(project(tmp_path), "alone")
+    try:
+        compose("up", "--detach", "--no-build")
+        compose.wait_healthy()
+        yield compose
+    finally:
+        compose("down", "--volumes", "--timeout", "5")

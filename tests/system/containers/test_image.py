@@ -1,0 +1,166 @@
+"""Tests of the images: what is in them, what is not, and where they refuse to run."""
+
+import io
+import json
+import re
+import stat
+import subprocess
+import tarfile
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.supervisor.users import NUMERIC_IDS
+from tests.support.docker import APPLIANCE, BASE, DEMO, ROOT
+from tests.system.containers.conftest import Site
+
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+TOOLS = re.compile(
+    r"/(gcc|cc|c\+\+|g\+\+|ld|make|pip3?|git|curl|wget|nc|telnet|gdb|strace|tcpdump)(-[0-9.]+)?$"
+)
+CACHES = ("/var/lib/apt/lists/", "/var/cache/apt/", "/root/.cache/", "/tmp/")
+SECRET = re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----\s+[A-Za-z0-9+/=\s]{60}")
+MOST_MEGABYTES = (
+    420  # of the appliance's image, the base of the tests (without Debian's own trimming) included
+)
+
+
+def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, bytes]]:
+    """Every file of every layer of an image, deleted ones included: path, entry, the first megabyte."""
+    saved = site.engine.directory / "image.tar"
+    site.engine.docker("save", "--output", str(saved), image, timeout=300)
+    try:
+        with tarfile.open(saved) as whole:
+            manifest = json.load(whole.extractfile("manifest.json") or io.BytesIO())
+            for layer in manifest[0]["Layers"]:
+                with tarfile.open(fileobj=whole.extractfile(layer)) as files:
+                    for entry in files:
+                        data = files.extractfile(entry) if entry.isfile() else None
+                        yield "/" + entry.name.removeprefix("./"), entry, data.read(1 << 20) if data else b""
+    finally:
+        saved.unlink()
+
+
+@pytest.fixture(scope="module")
+def contents(site: Site) -> list[tuple[str, tarfile.TarInfo, bool]]:
+    """Every file of the appliance's image: path, entry, whether there is a private key in it."""
+    return [(path, entry, bool(SECRET.search(data))) for path, entry, data in members(site, APPLIANCE)]
+
+
+def run(site: Site, *command: str, image: str = APPLIANCE) -> str:
+    """What a program says in a fresh container of the image."""
+    return site.engine.docker("run", "--rm", "--entrypoint", command[0], image, *command[1:]).stdout
+
+
+def test_the_base_image_is_pinned_by_digest() -> None:
+    """Whoever builds the image today and in a year begins with the same bytes."""
+    bases = re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)
+    assert set(bases) == {"${BASE}", "appliance"}
+    assert re.search(r"^ARG BASE=debian:12-slim@sha256:[0-9a-f]{64}$", DOCKERFILE, re.MULTILINE)
+
+
+def test_debian_packages_have_their_reasons_in_one_place() -> None:
+    """What the image takes from Debian is in packages.txt, but for what only a container needs."""
+    text = DOCKERFILE.partition("AS appliance\n")[2].partition("&& apt-get clean")[0]
+    taken = set(re.findall(r"^ {8}([a-z0-9.+-]+) \\$", text, re.MULTILINE))
+    assert len(taken) > 5
+    reasons = {line.split()[0] for line in (ROOT / "packages.txt").read_text().splitlines() if line.strip()}
+    assert taken - reasons == {"tini"}
+
+
+def test_there_is_no_compiler_and_no_way_to_fetch_programs(
+    contents: list[tuple[str, tarfile.TarInfo, bool]],
+) -> None:
+    """No layer of the image has a compiler, pip, or what fetches from the network (but apt, which Debian needs)."""
+    assert [path for path, _entry, _secret in contents if TOOLS.search(path)] == []
+    assert not any("/site-packages/pip/" in path for path, _entry, _secret in contents)
+
+
+def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
+    """No package lists, no caches, nothing of the checkout but what runs."""
+    left = [path for path, entry, _ in contents if entry.isfile() and path.startswith(CACHES)]
+    assert left == []
+    ours = [path for path, _, _ in contents if re.search(r"/(tests|\.git|requirements\.lock)(/|$)", path)]
+    assert ours == []
+
+
+def test_there_is_no_private_key(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
+    """Keys are made at the first start, in the volume: no two appliances share one."""
+    assert [path for path, _, secret in contents if secret] == []
+    assert not any(
+        path.startswith("/var/lib/rosrv/") and path != "/var/lib/rosrv/" for path, _, _ in contents
+    )
+
+
+def test_no_program_gives_its_caller_more_rights(site: Site) -> None:
+    """Nothing is set-user-id or set-group-id, and no program has capabilities of its own."""
+    found = run(site, "find", "/", "-xdev", "-type", "f", "-perm", "/6000")
+    assert found == ""
+
+
+def test_what_runs_can_be_changed_by_nobody_but_root(
+    contents: list[tuple[str, tarfile.TarInfo, bool]],
+) -> None:
+    """Every file belongs to root and only he may write it."""
+    open_to_others = [
+        path
+        for path, entry, _ in contents
+        if entry.isfile() and path.startswith(("/opt", "/etc", "/usr")) and entry.mode & stat.S_IWOTH
+    ]
+    assert open_to_others == []
+    assert [path for path, entry, _ in contents if path.startswith("/opt/") and entry.uid != 0] == []
+
+
+def test_every_process_finds_its_user(site: Site) -> None:
+    """The users of the processes have the numbers that are theirs everywhere, and nobody can log in as one."""
+    lines = run(site, "getent", "passwd").splitlines()
+    users = {fields[0]: fields for fields in (line.split(":") for line in lines)}
+    assert {name: int(users[name][2]) for name in NUMERIC_IDS} == NUMERIC_IDS
+    assert {users[name][6] for name in NUMERIC_IDS} == {"/usr/sbin/nologin"}
+
+
+def test_the_configuration_of_the_image_is_right(site: Site) -> None:
+    """The file in the image has no mistake and says `container`."""
+    shown = run(site, "rosrv", "config", "show")
+    assert "isolation: container" in shown
+    run(site, "rosrv", "config", "check", "/etc/rosrv/appliance.yaml")
+
+
+def test_the_demonstration_has_nothing_of_the_appliance(site: Site) -> None:
+    """The robot's image has unmodified ROS nodes only, and the appliance's image none of them."""
+    assert (
+        run(site, "find", "/", "-xdev", "-name", "appliance*", "-path", "*site-packages*", image=DEMO) == ""
+    )
+    assert "rospy" in run(site, "/usr/bin/python3", "-c", "import rospy; print(rospy.__name__)", image=DEMO)
+    assert run(site, "find", "/", "-xdev", "-name", "rospy") == ""
+
+
+def test_the_image_stays_small(site: Site) -> None:
+    """The size that the documentation names is not exceeded."""
+    whole, base = (int(site.engine.inspect(name)["Size"]) for name in (APPLIANCE, BASE))
+    assert whole - base < MOST_MEGABYTES * 1e6
+
+
+def test_the_machines_own_network_is_refused(site: Site) -> None:
+    """In a container that shares the machine's network it does not start, says why, and leaves no rule there."""
+    rights = (
+        "--cap-drop",
+        "ALL",
+        *(f"--cap-add={name}" for name in ("NET_ADMIN", "SETUID", "SETGID", "CHOWN")),
+    )
+    done = site.engine.docker("run", "--rm", "--network", "host", *rights, APPLIANCE, check=False)
+    assert done.returncode == 1
+    assert "this container shares the machine's network" in done.stderr
+    assert "compose.host.yaml" in done.stderr
+
+    def rules() -> str:
+        return subprocess.run(["nft", "list", "tables"], capture_output=True, text=True, check=True).stdout
+
+    assert "rosrv" not in site.machine.run(rules)
+
+
+def test_too_few_rights_are_named(site: Site) -> None:
+    """Started as anybody would first try it, without a capability, it says what it needs."""
+    done = site.engine.docker("run", "--rm", APPLIANCE, check=False, timeout=60)
+    assert done.returncode == 1
+    assert "NET_ADMIN" in done.stderr
