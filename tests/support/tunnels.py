@@ -34,6 +34,7 @@ charon-systemd {{
     output {{
       path = /dev/stdout
       default = 1
+      {log}
       flush_line = yes
     }}
   }}
@@ -50,9 +51,10 @@ def need_strongswan() -> None:
 class JoinedHost:
     """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
 
-    def __init__(self, host: Host, kit: Path, directory: Path) -> None:
-        """Unpack the kit into `directory`, which must be new."""
+    def __init__(self, host: Host, kit: Path, directory: Path, *, log: str = "") -> None:
+        """Unpack the kit into `directory`, which must be new; `log` is added to what charon logs (`chd = 4`)."""
         self.outer = host
+        self.log = log
         self.directory = directory
         directory.mkdir()
         subprocess.run(["tar", "-xzf", str(kit), "-C", str(directory)], check=True)
@@ -71,7 +73,7 @@ class JoinedHost:
         """Start charon and give it the kit; it begins to ask for the tunnel."""
         conf = self.directory / "strongswan.conf"
         text = _CONFIGURATION.format(
-            plugins=plugins(choose_esp(self.outer.namespace)), directory=self.directory
+            plugins=plugins(choose_esp(self.outer.namespace)), directory=self.directory, log=self.log
         )
         conf.write_text(text)
         environment = {"STRONGSWAN_CONF": str(conf), "PATH": os.environ["PATH"]}

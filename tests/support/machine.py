@@ -1,0 +1,223 @@
+"""A virtual machine (QEMU) with Debian's cloud kernel, to run parts of the tests in a kernel of their own.
+
+    with Machine(directory) as machine:
+        done = machine.run("ip", "xfrm", "state", seconds=10)
+
+It has no network card: what happens in it stays in it. Its disk is a snapshot that is gone when it ends. KVM is used
+where it really runs a guest, found out by trying; else QEMU computes every instruction itself (TCG), which is five to
+twenty times slower. The machine dies with the process that started it.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+from tests.support.machine_disk import ROOT, Kernel, checkout_archive, machine_disk, newest_kernel
+from tests.support.requirements import need_program, need_root
+
+BOOT_SECONDS = 240.0
+KVM = Path("/dev/kvm")
+MEGABYTES = 2048
+_TRY_SECONDS = 8.0
+_OFF_SECONDS = 30.0
+
+
+class MachineError(AssertionError):
+    """The machine did not do what it was asked to; the text has the end of its console."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a program in the machine came to."""
+
+    status: int
+    output: str
+    seconds: float
+
+
+class Machine:
+    """One machine; a context manager. `directory` keeps its sockets and its console's text."""
+
+    def __init__(self, directory: Path, *, processors: int = 2) -> None:
+        self.directory = directory
+        self.processors = processors
+        self.console = directory / "console.log"
+        self.boot_seconds = 0.0
+        self.accelerator = ""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._line: socket.socket | None = None
+        self._received = b""
+        self._number = 0
+
+    def start(self) -> Self:
+        """Boot; returns when the machine takes orders."""
+        need_root()
+        program = need_program("qemu-system-x86_64", "qemu-system-x86")
+        kernel = newest_kernel()
+        disk = machine_disk(kernel)
+        self.accelerator = accelerator(program, kernel)
+        checkout = self.directory / "checkout.tar"
+        checkout_archive(checkout)
+        port = self.directory / "agent.sock"
+        began = time.monotonic()
+        # The death signal is sent when the *thread* ends that started it: pytest's fixtures run in the main one.
+        assert threading.current_thread() is threading.main_thread()
+        self._process = subprocess.Popen(
+            [
+                "/usr/bin/setpriv",
+                "--pdeathsig=SIGKILL",
+                program,
+                *self._arguments(kernel, disk, checkout, port),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=(self.directory / "qemu.log").open("wb"),
+            start_new_session=True,
+            env=os.environ | {"TMPDIR": str(self.directory)},  # of the snapshot
+        )
+        self._line = self._connect(port)
+        assert self._hear(BOOT_SECONDS) == {"ready": True}
+        self.boot_seconds = time.monotonic() - began
+        return self
+
+    def run(self, *argv: str, seconds: float = 60.0, check: bool = True) -> Done:
+        """Run a program as root in the checkout's folder; with `check`, a status other than 0 is a failure."""
+        assert self._line is not None, "the machine is not on"
+        self._number += 1
+        order = {"number": self._number, "argv": argv, "seconds": seconds}
+        began = time.monotonic()
+        self._line.sendall(json.dumps(order).encode() + b"\n")
+        answer = self._hear(seconds + 60.0)
+        assert answer["number"] == self._number
+        done = Done(int(answer["status"]), str(answer["output"]), time.monotonic() - began)
+        if check and done.status != 0:
+            raise MachineError(f"{' '.join(argv)}: status {done.status}\n{done.output}\n{self.story()}")
+        return done
+
+    def stop(self) -> bool:
+        """Switch it off as a person would; True if it did so by itself. What does not end is killed."""
+        process, self._process = self._process, None
+        if process is None:
+            return True
+        orderly = False
+        if process.poll() is None and self._line is not None:
+            try:
+                self.run_detached("systemctl", "poweroff")
+                orderly = process.wait(_OFF_SECONDS) == 0
+            except (subprocess.TimeoutExpired, OSError):
+                os.kill(process.pid, signal.SIGKILL)
+        elif process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+        return orderly
+
+    def run_detached(self, *argv: str) -> None:
+        """Have a program run without waiting for what it comes to."""
+        assert self._line is not None
+        order = {"number": 0, "argv": ["systemd-run", "--quiet", *argv], "seconds": 20}
+        self._line.sendall(json.dumps(order).encode() + b"\n")
+
+    def story(self) -> str:
+        """The end of its console, for the message of a failure."""
+        words = self.console.read_text(errors="backslashreplace")[-3000:] if self.console.exists() else ""
+        log = self.directory / "qemu.log"
+        return f"--- the machine's console\n{words}\n--- qemu\n{log.read_text() if log.exists() else ''}"
+
+    def _arguments(self, kernel: Kernel, disk: Path, checkout: Path, port: Path) -> list[str]:
+        append = f"root=/dev/vda rw console=ttyS0 panic=-1 quiet rosrv.root={ROOT} systemd.show_status=0"
+        return [
+            *_hardware(self.accelerator),
+            *("-smp", str(self.processors), "-m", str(MEGABYTES)),
+            *("-kernel", str(kernel.image), "-initrd", str(kernel.initrd), "-append", append),
+            *("-drive", f"file={disk},if=virtio,format=raw,snapshot=on,cache=unsafe"),
+            *("-drive", f"file={checkout},if=virtio,format=raw,readonly=on"),
+            *("-device", "virtio-rng-pci"),
+            *("-device", "virtio-serial-pci"),
+            *("-chardev", f"socket,id=agent,path={port},server=on,wait=off"),
+            *("-device", "virtserialport,chardev=agent,name=rosrv.agent"),
+            *("-serial", f"file:{self.console}"),
+        ]
+
+    def _connect(self, path: Path) -> socket.socket:
+        """QEMU makes the socket before it starts the machine."""
+        assert self._process is not None
+        deadline = time.monotonic() + 20
+        line = socket.socket(socket.AF_UNIX)
+        while True:
+            try:
+                line.connect(str(path))
+            except OSError as error:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    raise MachineError(f"QEMU did not start: {error}\n{self.story()}") from error
+                threading.Event().wait(0.05)
+            else:
+                return line
+
+    def _hear(self, seconds: float) -> dict[str, Any]:
+        """The next answer."""
+        assert self._line is not None
+        deadline = time.monotonic() + seconds
+        while b"\n" not in self._received:
+            self._line.settimeout(max(0.01, deadline - time.monotonic()))
+            try:
+                part = self._line.recv(65536)
+            except TimeoutError:
+                raise MachineError(f"no answer in {seconds:.0f} s\n{self.story()}") from None
+            if not part:
+                raise MachineError(f"the machine ended\n{self.story()}")
+            self._received += part
+        line, _, self._received = self._received.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def __enter__(self) -> Self:
+        try:
+            return self.start()
+        except BaseException:
+            self.stop()
+            raise
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+
+@cache
+def accelerator(program: str, kernel: Kernel) -> str:
+    """`kvm` where a kernel comes to its first line with it, else `tcg`; a device file alone proves nothing."""
+    if not KVM.exists():
+        return "tcg"
+    arguments = [*_hardware("kvm"), "-m", "256", "-kernel", str(kernel.image), "-serial", "stdio"]
+    # Without a root file system the kernel panics, and the machine ends.
+    process = subprocess.Popen(
+        [program, *arguments, "-append", "console=ttyS0 earlyprintk=ttyS0 panic=-1"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        said, _ = process.communicate(timeout=_TRY_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        said, _ = process.communicate()
+    return "kvm" if b"Linux version" in said else "tcg"
+
+
+def _hardware(accelerator: str) -> list[str]:
+    """A machine with nothing that the tests do not use."""
+    processor = "host" if accelerator == "kvm" else "max"
+    how = "kvm" if accelerator == "kvm" else "tcg,thread=multi"
+    return [
+        *("-machine", "q35", "-accel", how, "-cpu", processor),
+        *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none"),
+    ]

@@ -1,0 +1,177 @@
+"""The disk of the tests' virtual machine: Debian, its cloud kernel's modules, the project's environment, the agent.
+
+Made under `build/machine/`, named by all that it was made from, and never written to afterwards: a machine works on a
+snapshot. The checkout is not on it, but on a disk of its own that is made for each start (`checkout_archive`).
+"""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tarfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.support.debian_base import base_archive
+from tests.support.requirements import need_program, needs
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "build" / "machine"
+AGENT = Path(__file__).with_name("machine_agent.py")
+KERNEL = "linux-image-cloud-amd64"
+GIGABYTES = 4  # the file is sparse
+# A machine that is booted needs these beside what the project names in packages.txt.
+_MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump")
+_COMPILERS = ("g++", "pkg-config")  # and every -dev package: what the tests compile comes with the checkout
+# Of the environment: large, and for other tests.
+_NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")
+_UNIT = """\
+[Unit]
+Description=Runs what the test asks for
+After=dev-virtio\\x2dports-rosrv.agent.device
+Wants=dev-virtio\\x2dports-rosrv.agent.device
+
+[Service]
+ExecStart=/usr/bin/python3 /usr/local/lib/rosrv-agent.py
+StandardOutput=journal+console
+KillMode=control-group
+LimitNOFILE=65536
+
+[Install]
+WantedBy=multi-user.target
+"""
+# Not started by itself: the tests start what they need.
+_QUIET = ("strongswan.service", "nftables.service", "e2scrub_reap.service", "apt-daily.timer")
+_QUIET_TOO = ("apt-daily-upgrade.timer", "dpkg-db-backup.timer", "e2scrub_all.timer", "fstrim.timer")
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The cloud kernel of this machine, with its first RAM disk."""
+
+    release: str
+    image: Path
+    initrd: Path
+
+    @property
+    def modules(self) -> Path:
+        """The folder of its modules."""
+        return Path("/lib/modules") / self.release
+
+
+def newest_kernel() -> Kernel:
+    """The newest cloud kernel that is installed here, as `packages-system.txt` asks for it."""
+    found = [
+        Kernel(release, image, initrd)
+        for image in sorted(
+            Path("/boot").glob("vmlinuz-*-cloud-amd64"), key=lambda path: path.stat().st_mtime
+        )
+        if (release := image.name.removeprefix("vmlinuz-"))
+        and (initrd := image.with_name(f"initrd.img-{release}")).exists()
+        and Path("/lib/modules", release).is_dir()
+    ]
+    needs(found, f"a kernel for the virtual machine (Debian: sudo apt install {KERNEL})")
+    return found[-1]
+
+
+def machine_disk(kernel: Kernel) -> Path:
+    """The disk's image (ext4 without partitions), made now if there is none."""
+    need_program("mke2fs", "e2fsprogs")
+    base = base_archive(_packages())
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    disk = FOLDER / f"disk-{_key(base, kernel)}.ext4"
+    if disk.exists():
+        return disk
+    tree = FOLDER / f"tree.{os.getpid()}"
+    making = disk.with_suffix(f".{os.getpid()}")
+    try:
+        tree.mkdir()
+        _run("tar", "--extract", "--numeric-owner", "--file", str(base), "--directory", str(tree))
+        _furnish(tree, kernel)
+        making.unlink(missing_ok=True)
+        _run("mke2fs", "-q", "-t", "ext4", "-d", str(tree), str(making), f"{GIGABYTES}G")
+        for older in FOLDER.glob("disk-*.ext4"):
+            older.unlink()
+        making.rename(disk)
+    finally:
+        shutil.rmtree(tree, ignore_errors=True)
+        making.unlink(missing_ok=True)
+    return disk
+
+
+def checkout_archive(path: Path) -> None:
+    """Write the checkout as it stands, with what its tests have compiled, as a tar archive to `path`."""
+    for folder in ("appliance", "tests"):
+        _compile(ROOT / folder, as_if_in=ROOT / folder)
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    names = {os.fsdecode(name) for name in listed.stdout.split(b"\0") if name}
+    names |= {
+        str(code.relative_to(ROOT)) for one in ("appliance", "tests") for code in (ROOT / one).rglob("*.pyc")
+    }
+    names |= {str(program.relative_to(ROOT)) for program in (ROOT / "build" / "tests").glob("*")}
+    with tarfile.open(path, "w") as tar:
+        for name in sorted(names):
+            if (ROOT / name).is_file():
+                tar.add(ROOT / name, arcname=name, recursive=False)
+
+
+def _packages() -> tuple[str, ...]:
+    lines = (ROOT / "packages.txt").read_text().splitlines()
+    named = [line.partition("#")[0].strip() for line in lines]
+    kept = [name for name in named if name and name not in _COMPILERS and not name.endswith("-dev")]
+    return (*kept, *_MACHINES_OWN)
+
+
+def _furnish(tree: Path, kernel: Kernel) -> None:
+    """Put into a Debian tree what makes it this machine."""
+    shutil.copytree(kernel.modules, tree / "lib" / "modules" / kernel.release, symlinks=True)
+    environment = tree / str(ROOT / ".venv").lstrip("/")
+    shutil.copytree(ROOT / ".venv", environment, symlinks=True, ignore=_too_large)
+    _compile(environment, as_if_in=ROOT / ".venv")
+    agent = tree / "usr/local/lib/rosrv-agent.py"
+    agent.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(AGENT, agent)
+    units = tree / "etc/systemd/system"
+    (units / "rosrv-agent.service").write_text(_UNIT)
+    wanted = units / "multi-user.target.wants"
+    wanted.mkdir(exist_ok=True)
+    (wanted / "rosrv-agent.service").symlink_to("/etc/systemd/system/rosrv-agent.service")
+    for name in (*_QUIET, *_QUIET_TOO):
+        for place in units.glob(f"*.wants/{name}"):
+            place.unlink()
+    (tree / "etc/machine-id").write_text("")  # one of its own at each start
+    (tree / "etc/hostname").write_text("rosrv-machine\n")
+    (tree / "etc/resolv.conf").write_text("")
+
+
+def _too_large(_folder: str, names: list[str]) -> Iterable[str]:
+    return [name for name in names if name in _NOT_IN_THE_MACHINE]
+
+
+def _compile(folder: Path, *, as_if_in: Path) -> None:
+    """Compile what is not compiled yet: the machine would need ten times as long, in every process it starts."""
+    command = [str(ROOT / ".venv/bin/python"), "-m", "compileall", "-q", "-j", "2"]
+    done = subprocess.run(
+        [*command, "-s", str(folder), "-p", str(as_if_in), str(folder)], capture_output=True, check=False
+    )
+    # Some packages carry templates and examples that no interpreter takes; those are imported by nobody.
+    assert done.returncode in (0, 1), done.stderr
+
+
+def _key(base: Path, kernel: Kernel) -> str:
+    """All that the disk is made from. An environment is named by the lock file it was made from."""
+    parts = [base.name, kernel.release, str(ROOT), AGENT.read_text(), Path(__file__).read_text()]
+    parts.append((ROOT / "requirements-dev.lock").read_text())
+    parts.append((ROOT / "pyproject.toml").read_text())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, errors="backslashreplace", check=False)
+    assert done.returncode == 0, f"{' '.join(command)}: {done.stderr[-2000:]}"

@@ -1,0 +1,28 @@
+"""This whole machine as a host of a lab: its own network namespace on the lab's Ethernet.
+
+Only for a machine that belongs to the test (tests/support/machine.py): what runs there changes the network of the
+machine itself.
+"""
+
+import contextlib
+from collections.abc import Iterator
+
+from appliance.network import links
+from appliance.network.lab import INTERFACE, Host, Lab
+from appliance.network.namespaces import Namespace
+
+_PORT = "port-root"
+
+
+@contextlib.contextmanager
+def root_host(lab: Lab, address: str) -> Iterator[Host]:
+    """The machine, connected to the lab under an address such as `10.77.0.2/24`, until the block ends."""
+    own = Namespace.own()
+    switch = lab._switch  # the lab gives its hosts away, not what they are plugged into
+    links.create_veth(own, INTERFACE, switch, _PORT)
+    try:
+        links.attach(switch, _PORT, "br0")
+        links.add_address(own, INTERFACE, address)
+        yield Host("machine", own, _PORT, (address,))
+    finally:
+        links.delete_link(own, INTERFACE)

@@ -1,0 +1,143 @@
+"""An appliance with hosts around it on one Ethernet: some behind tunnels, some in clear text, and an attacker.
+
+`trail` is the appliance's audit log as it is written: what a test waits for.
+"""
+
+import contextlib
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import ROSRV, Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import Event, Process, ThisMachine
+from tests.support.tunnels import JoinedHost
+
+MIDDLE, ROBOT, OCU, ATTACKER = "10.88.0.2", "10.88.0.10", "10.88.0.20", "10.88.0.66"
+MASTER = f"http://{MIDDLE}:11311"
+OWN = "10.113.11.1"  # the appliance's address in the tunnels
+LONG = 60.0  # seconds
+POLICY = f"""\
+[Groups]
+trusted = host:ocu-1, {ROBOT}
+[Nodes]
+default = trusted
+[Publishers]
+default = trusted
+[Subscribers]
+default = trusted
+[Commands]
+default = trusted
+"""
+
+
+class TunnelSite:
+    """The appliance and its neighbours; a context manager."""
+
+    trail: Process
+
+    def __init__(self, lab: Lab, home: Path, *, policy: str = POLICY, options: tuple[str, ...] = ()) -> None:
+        self.lab, self.home = lab, home
+        self.appliance = Appliance(
+            lab.host("appliance", f"{MIDDLE}/24"),
+            policy=policy,
+            options=("--listen", "0.0.0.0:11311", *options),
+        )
+        self.robot = lab.host("robot", f"{ROBOT}/24")
+        self.ocu = lab.host("ocu", f"{OCU}/24")
+        self.attacker = lab.host("attacker", f"{ATTACKER}/24")
+        self.kits = 0
+
+    def kit(self, verb: str = "add", name: str = "ocu-1", *options: str) -> Path:
+        """Enrol a host, or give it a new certificate: its kit."""
+        self.kits += 1
+        path = self.home / f"kit-{self.kits}.tar.gz"
+        self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--out", str(path), *options)
+        return path
+
+    def join(self, kit: Path, host: Host | None = None, *, log: str = "") -> JoinedHost:
+        """A host with a kit, not started."""
+        return JoinedHost(host or self.ocu, kit, self.home / f"joined-{time.monotonic_ns()}", log=log)
+
+    @contextlib.contextmanager
+    def joined(
+        self, kit: Path, host: Host | None = None, *, log: str = "", settings: str = ""
+    ) -> Iterator[JoinedHost]:
+        """A host with its tunnel up, as both sides see it; down again afterwards, as both sides see it.
+
+        `settings` are added to those of the tunnel in the kit.
+        """
+        mark = self.mark
+        joined = self.join(kit, host, log=log)
+        conf = joined.folder / "swanctl" / "swanctl.conf"
+        conf.write_text(conf.read_text() + settings)
+        with joined:
+            joined.wait_until_up()
+            self.recorded(mark, event="tunnel up", host=joined.address)
+            yield joined
+            mark = self.mark
+            stands = joined.address in [row["address"] for row in self.hosts() if row["state"] == "up"]
+        if stands:
+            self.recorded(mark, event="tunnel down", host=joined.address)
+
+    @contextlib.contextmanager
+    def talking(self, joined: JoinedHost, rate: int = 10) -> Iterator[tuple[Process, Process]]:
+        """A talker on the host behind its tunnel and a listener on the robot that hears it."""
+        with (
+            RosSession(joined.master, self.home, joined) as there,
+            RosSession(MASTER, self.home, self.robot) as here,
+        ):
+            talker = there.talker("rospy", "/orders", "--rate", str(rate), name="boss")
+            listener = here.listener("rospy", "/orders", name="arm")
+            listener.wait_for(event="received")
+            yield talker, listener
+
+    def hosts(self) -> list[dict[str, Any]]:
+        """`rosrv host list`."""
+        return list(map(json.loads, self.appliance.rosrv("host", "list", "--json").stdout.splitlines()))
+
+    def state(self, name: str = "ocu-1") -> str:
+        """The state of a host by `rosrv host list`."""
+        return next(str(row["state"]) for row in self.hosts() if row["name"] == name)
+
+    def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
+        """The first audit record with these fields that came after `mark` was taken."""
+        return self.trail.wait_for(since=since, timeout=timeout, **fields)
+
+    def story(self) -> str:
+        """What the appliance said, for the message of a failure."""
+        return self.appliance.story()
+
+    @property
+    def mark(self) -> int:
+        """How many records there are."""
+        return len(self.trail.events)
+
+    def __enter__(self) -> Self:
+        self.appliance.__enter__()
+        try:
+            self.watch()
+        except BaseException:
+            self.appliance.close()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.trail.stop()
+        self.appliance.close()
+
+    def watch(self) -> None:
+        """Read the audit log from now on."""
+        command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
+        self.trail = Process(
+            ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail"
+        ).__enter__()
+
+
+def numbers(listener: Process) -> list[int]:
+    """The numbers of the messages that a listener has heard from a talker, in the order of their arrival."""
+    return [int(re.split(r"\s", str(event["data"]))[-1]) for event in listener.seen(event="received")]

@@ -1,0 +1,392 @@
+"""What somebody tries who has no tunnel, or has one and wants more: all of it on the wire, against real tunnels."""
+
+import contextlib
+import os
+import queue
+import re
+import secrets
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network import links
+from appliance.network.lab import INTERFACE, Host, Lab
+from tests.support.esp_packets import initiators_keys
+from tests.support.processes import LIMIT, Event
+from tests.support.requirements import need_program, need_root
+from tests.support.tunnel_site import ATTACKER, MASTER, MIDDLE, OCU, OWN, TunnelSite
+from tests.support.tunnels import JoinedHost, need_strongswan
+from tests.support.wire import Capture, Frame, send_frames, udp_packet
+
+OTHER = "10.88.0.30"
+STRANGER = 61055  # a user that nothing else here has
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
+    """One appliance for all tests here."""
+    need_root()
+    need_strongswan()
+    need_program("nft", "nftables")
+    with Lab("rosrv-attack") as lab, TunnelSite(lab, tmp_path_factory.mktemp("attack")) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def kit(site: TunnelSite) -> Path:
+    """The kit of `ocu-1`, which the policy trusts."""
+    return site.kit()
+
+
+@pytest.fixture(scope="module")
+def other(site: TunnelSite) -> Host:
+    """Another host."""
+    return site.lab.host("other", f"{OTHER}/24")
+
+
+@pytest.fixture(scope="module")
+def others_kit(site: TunnelSite) -> Path:
+    """The kit of `ocu-2`, enrolled as well, which the policy trusts with nothing."""
+    return site.kit("add", "ocu-2")
+
+
+class Datagrams:
+    """What arrives at a UDP port of the appliance's address in the tunnels: data and sender."""
+
+    def __init__(self, host: Host) -> None:
+        with host.entered():
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((OWN, 0))
+        self.port: int = self._socket.getsockname()[1]
+        self._arrived: queue.SimpleQueue[tuple[bytes, str]] = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def next(self) -> tuple[bytes, str]:
+        """The next one."""
+        return self._arrived.get(timeout=LIMIT)
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):
+            while data := self._socket.recvfrom(2048):
+                self._arrived.put((data[0], data[1][0]))
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._socket.close()
+
+
+@pytest.fixture
+def datagrams(site: TunnelSite, kit: Path) -> Iterator[Datagrams]:
+    """A port that takes everything, so that what the tunnel lets through is seen."""
+    host = site.appliance.host
+    assert isinstance(host, Host)
+    listening = Datagrams(host)
+    yield listening
+    listening.close()
+
+
+def send(joined: JoinedHost, port: int, data: bytes) -> None:
+    """One datagram through a tunnel."""
+    with joined.outer.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((joined.address, 0))
+        sender.sendto(data, (OWN, port))
+
+
+def lab_host(site: TunnelSite) -> Host:
+    """The appliance's host."""
+    assert isinstance(site.appliance.host, Host)
+    return site.appliance.host
+
+
+@contextlib.contextmanager
+def deaf(host: Host) -> Iterator[None]:
+    """Nothing of ESP in UDP reaches the host's programs; what arrives is seen on the wire all the same."""
+    table = "add table ip hold; add chain ip hold in { type filter hook prerouting priority -400; };"
+    _nft(host, table + "add rule ip hold in udp dport 4500 drop")
+    try:
+        yield
+    finally:
+        _nft(host, "delete table ip hold")
+
+
+def _nft(host: Host, command: str) -> None:
+    done = host.popen(["nft", command])
+    assert done.wait(LIMIT) == 0
+
+
+def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Datagrams) -> None:
+    """A packet of a tunnel that is sent again, or changed, from anywhere, does not arrive a second time."""
+    with site.joined(kit) as joined, Capture(lab_host(site).namespace) as wire:
+        send(joined, datagrams.port, b"first")
+        assert datagrams.next() == (b"first", joined.address)
+        with deaf(lab_host(site)):
+            mark = len(wire.frames)
+            send(joined, datagrams.port, b"second")
+            taken = wire.wait_for(lambda frame: frame.esp and frame.source == OCU, since=mark)
+        # That what the attacker sends can arrive is shown by a packet that has not yet been there.
+        again = taken.with_payload(taken.udp_payload)
+        send_frames(site.attacker, [again])
+        assert datagrams.next() == (b"second", joined.address)
+        sealed = taken.udp_payload
+        changed = taken.with_payload(sealed[:-1] + bytes([sealed[-1] ^ 1]))
+        newer = taken.with_payload(sealed[:4] + (int.from_bytes(sealed[4:8]) + 9).to_bytes(4) + sealed[8:])
+        mark = len(wire.frames)
+        send_frames(site.attacker, [again] * 50 + [changed] * 50 + [newer] * 50)
+        wire.wait_for(lambda frame: frame.data[14:] == newer[14:], since=mark)
+        send(joined, datagrams.port, b"third")
+        assert datagrams.next() == (b"third", joined.address)
+        send(joined, datagrams.port, b"fourth")
+        assert datagrams.next() == (b"fourth", joined.address)
+
+
+def test_the_wire_shows_ike_and_esp_only(site: TunnelSite, kit: Path) -> None:
+    """On the outside nothing is seen of a tunnelled host but UDP 500 and 4500, and of its messages nothing at all."""
+    with (
+        Capture(site.ocu.namespace) as wire,
+        site.joined(kit) as joined,
+        site.talking(joined) as (_, listener),
+    ):
+        listener.wait_for_count(20, event="received")
+    packets = [frame for frame in wire.frames if frame.ipv4]
+    strange = [frame.data.hex() for frame in packets if frame.protocol != socket.IPPROTO_UDP]
+    assert strange == []
+    assert {frame.source for frame in packets} | {frame.destination for frame in packets} == {OCU, MIDDLE}
+    assert all(set(frame.ports) & {500, 4500} for frame in packets)
+    assert len([frame for frame in packets if frame.esp]) > 20
+    assert not any(b"hello" in frame.data for frame in wire.frames)
+    # What is neither IPv4 nor ARP is the kernel's own talk with its IPv6 neighbours.
+    rest = [frame for frame in wire.frames if not frame.ipv4 and not frame.arp]
+    assert all(frame.data[12:14] == b"\x86\xdd" and frame.data[20] in (0, 58) for frame in rest)
+
+
+def test_a_host_in_a_tunnel_cannot_send_as_another(
+    site: TunnelSite, kit: Path, other: Host, others_kit: Path, datagrams: Datagrams
+) -> None:
+    """With the keys of one's own tunnel one can seal any packet; those from another's address do not arrive."""
+    with site.joined(kit) as trusted, site.joined(others_kit, other, log="chd = 4") as dishonest:
+        assert dishonest.charon is not None
+        keys = initiators_keys(dishonest.charon)
+
+        def forge(number: int, source: str, data: bytes) -> None:
+            inner = udp_packet((source, 4000), (OWN, datagrams.port), data)
+            with other.entered(), socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW) as raw:
+                outer = udp_packet((OTHER, 4500), (MIDDLE, 4500), keys.seal(1000 + number, inner))
+                raw.sendto(outer, (MIDDLE, 0))
+
+        forge(1, dishonest.address, b"as myself")
+        assert datagrams.next() == (b"as myself", dishonest.address)
+        for number, source in enumerate((trusted.address, OWN, "10.113.11.99", OTHER, "127.0.0.1")):
+            forge(2 + number, source, b"as somebody else")
+        forge(20, dishonest.address, b"as myself again")
+        assert datagrams.next() == (b"as myself again", dishonest.address)
+        send(trusted, datagrams.port, b"the real one")
+        assert datagrams.next() == (b"the real one", trusted.address)
+
+
+def test_a_host_cannot_ask_for_anothers_address(
+    site: TunnelSite, kit: Path, other: Host, others_kit: Path
+) -> None:
+    """Who asks for another's virtual address is given his own; who insists in his selectors gets no tunnel."""
+    insisting = site.join(others_kit, other)
+    conf = insisting.folder / "swanctl" / "swanctl.conf"
+    theirs = site.join(kit).address
+    conf.write_text(conf.read_text().replace("vips = 0.0.0.0", f"vips = {theirs}"))
+    mark = site.mark
+    with insisting:
+        insisting.wait_until_up()
+        assert site.recorded(mark, event="tunnel up")["host"] == insisting.address != theirs
+        mark = site.mark
+    site.recorded(mark, event="tunnel down")
+    conf.write_text(conf.read_text().replace("local_ts = dynamic", f"local_ts = {theirs}/32"))
+    mark = site.mark
+    with insisting:
+        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+    assert "traffic that is not allowed" in refused["reason"]
+
+
+def test_a_name_must_be_the_certificates(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:
+    """With one's own certificate under another's name one is refused, and the log says so."""
+    thief = site.join(others_kit, other)
+    conf = thief.folder / "swanctl" / "swanctl.conf"
+    conf.write_text(conf.read_text().replace("id = fqdn:ocu-2", "id = fqdn:ocu-1"))
+    mark = site.mark
+    with thief:
+        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+    assert refused["decision"] == "deny"
+    assert site.state() == "down"
+
+
+def test_the_right_address_without_a_tunnel_is_nobody(site: TunnelSite, kit: Path) -> None:
+    """The trusted host itself is refused in clear text: under its own address by the policy, under its virtual
+    one by the firewall."""
+    with site.joined(kit) as joined:
+        virtual = joined.address
+    links.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")
+    links.add_route(site.ocu.namespace, f"{OWN}/32", MIDDLE)
+    try:
+        assert _ask(site.ocu, OCU, MIDDLE) == "answered"
+        mark = site.mark
+        done = site.ocu.popen(
+            ["/usr/bin/rostopic", "list"],
+            env={"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": MASTER, "ROS_IP": OCU, "HOME": str(site.home)},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        assert done.wait(LIMIT) != 0
+        assert site.recorded(mark, decision="deny", host=OCU)
+        assert _ask(site.ocu, virtual, MIDDLE) == "nothing"
+        assert _ask(site.ocu, virtual, OWN) == "nothing"
+    finally:
+        for command in (
+            ["ip", "addr", "del", f"{virtual}/32", "dev", INTERFACE],
+            ["ip", "route", "del", f"{OWN}/32"],
+        ):
+            assert site.ocu.popen(command).wait(LIMIT) == 0
+
+
+ASK = """
+import socket, sys
+with socket.socket() as client:
+    client.settimeout(3)
+    if sys.argv[4] == "free":
+        client.setsockopt(socket.SOL_IP, 15, 1)  # IP_FREEBIND
+    try:
+        client.bind((sys.argv[1], 0))
+    except OSError:
+        sys.exit(print("not bound"))
+    try:
+        client.connect((sys.argv[2], int(sys.argv[3])))
+    except OSError:
+        sys.exit(print("nothing"))
+    print("answered")
+"""
+
+
+def _ask(host: Host, source: str, target: str, *, user: int | None = None, free: bool = False) -> str:
+    """What comes of a connection to RVMaster from this source address."""
+    asking = host.popen(
+        [sys.executable, "-c", ASK, source, target, "11311", "free" if free else "plain"],
+        stdout=subprocess.PIPE,
+        text=True,
+        user=user,
+        extra_groups=None if user is None else [],
+    )
+    return str(asking.communicate(timeout=LIMIT)[0]).strip()
+
+
+def test_a_program_on_the_appliances_machine_is_no_tunnelled_host(site: TunnelSite, kit: Path) -> None:
+    """Beside the appliance, as another user or as root, an address of the tunnels opens nothing."""
+    host = lab_host(site)
+    with site.joined(kit) as joined:
+        assert _ask(host, MIDDLE, MIDDLE, user=STRANGER) == "answered", "the way there is open"
+        assert _ask(host, joined.address, OWN, user=STRANGER) == "not bound"
+        assert _ask(host, joined.address, OWN, user=STRANGER, free=True) == "nothing"
+        assert _ask(host, joined.address, MIDDLE, free=True) == "nothing"
+        assert _ask(host, OWN, OWN, user=STRANGER) == "nothing"
+        assert _ask(host, OWN, MIDDLE) == "nothing"
+
+
+def test_two_hosts_with_one_certificate(site: TunnelSite, kit: Path) -> None:
+    """A copied kit takes the tunnel from its owner, never beside him; the log has both addresses."""
+    with site.joined(kit) as owner:
+        mark = site.mark
+        thief = site.join(kit, site.attacker)
+        with thief:
+            site.trail.wait_for(_up_from(ATTACKER), since=mark)
+            mark = site.mark
+            # The owner's host asks again, as any host that has lost its tunnel.
+            site.trail.wait_for(_up_from(OCU), since=mark)
+            assert len([row for row in site.hosts() if row["address"] == owner.address]) == 1
+        assert thief.address == owner.address
+        mark = site.mark
+        if site.state() != "up":
+            site.trail.wait_for(_up_from(OCU), since=mark)
+
+
+def _up_from(remote: str) -> Callable[[Event], bool]:
+    return lambda event: event.get("event") == "tunnel up" and event["detail"]["remote"] == remote
+
+
+def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -> None:
+    """When its certificate ends, a host's tunnel is closed, and it is let in no more; the log says why."""
+    mark = site.mark
+    expiring = site.kit("add", "visitor", "--days", str(20 / 86400))
+    with site.join(expiring, other) as visitor:
+        site.recorded(mark, event="tunnel up", host=visitor.address)
+        site.recorded(mark, event="tunnel down", host=visitor.address)
+        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+        assert refused["decision"] == "deny"
+    assert site.state("visitor") == "expired"
+    site.appliance.rosrv("host", "revoke", "visitor")
+
+
+def charon_of(site: TunnelSite) -> int:
+    """The process id of the appliance's charon itself."""
+    (parent,) = site.appliance.pids("charon")
+    (child,) = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return int(child)
+
+
+def kilobytes(pid: int) -> int:
+    """The memory a process holds."""
+    found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+    assert found is not None
+    return int(found[1])
+
+
+def test_garbage_on_the_ports_of_ike(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:
+    """Garbage, huge packets and a flood of begun handshakes: charon lives, does not grow, and tunnels come and stay."""
+    with (
+        Capture(lab_host(site).namespace) as wire,
+        site.joined(kit) as joined,
+        site.talking(joined) as (_, ear),
+    ):
+        first = next(
+            frame for frame in wire.frames if frame.ipv4 and frame.ports[1] == 500 and frame.source == OCU
+        )
+        before, memory = charon_of(site), kilobytes(charon_of(site))
+        downs = len(site.trail.seen(event="tunnel down"))
+        _throw_garbage(site.attacker)
+        _begin_handshakes(site.attacker, first, 5000)
+        mark = len(ear.events)
+        with site.joined(others_kit, other):
+            pass
+        ear.wait_for(event="received", since=mark)
+        assert charon_of(site) == before
+        assert kilobytes(before) - memory < 24 << 10
+        lost = [one for one in site.trail.seen(event="tunnel down")[downs:] if one["host"] == joined.address]
+        assert lost == [], "the honest host's tunnel was never lost"
+
+
+def _throw_garbage(host: Host) -> None:
+    with host.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thrower:
+        for port in (500, 4500):
+            for size in [*range(1, 1400, 3), 9000, 30000, 65507, 65507]:
+                noise = secrets.token_bytes(size)
+                # As it is, and behind a header of IKEv2 (an IKE_SA_INIT request) that names a length of its own.
+                marker = bytes(4) if port == 4500 else b""
+                header = os.urandom(8) + bytes(8) + bytes([33, 0x20, 34, 8]) + bytes(4)
+                for length in (size + 28, 0, 28, 0xFFFFFFFF):
+                    whole = marker + header + length.to_bytes(4) + noise
+                    thrower.sendto(whole[:65507], (MIDDLE, port))
+                thrower.sendto(noise, (MIDDLE, port))
+
+
+def _begin_handshakes(host: Host, first: Frame, count: int) -> None:
+    """The first packet of a real handshake again and again, each from another address and with another SPI."""
+    start = first.header
+    frames = []
+    for number in range(count):
+        data = bytearray(first.data)
+        data[start + 8 : start + 16] = os.urandom(8)
+        source = socket.inet_aton(f"10.88.{1 + number // 250 % 250}.{1 + number % 250}")
+        packet = udp_packet(
+            (socket.inet_ntoa(source), 500), (MIDDLE, 500), bytes(data[start + 8 :])[: len(first.udp_payload)]
+        )
+        frames.append(bytes(data[:14]) + packet)
+    send_frames(host, frames)
