@@ -4,7 +4,9 @@ The appliance has no certificate authority yet; when it has one, its certificate
 a client is given `certificate.pem` by hand, or pins its fingerprint.
 """
 
+import base64
 import datetime
+import hashlib
 import ipaddress
 import os
 import socket
@@ -52,7 +54,7 @@ def _still_good(path: Path, names: Iterable[str], now: datetime.datetime) -> boo
 
 
 def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: datetime.datetime) -> None:
-    key = ec.generate_private_key(ec.SECP256R1())
+    key = _kept_key(key_path)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ROSRV appliance")])
     certificate = (
         x509.CertificateBuilder()
@@ -72,6 +74,24 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
     )
     _write(key_path, secret, 0o600)
     _write(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def pin_of(home: Path) -> str:
+    """By what the server is recognised whatever its certificate says: curl's `--pinnedpubkey`."""
+    certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
+    public = certificate.public_key().public_bytes(
+        serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    return "sha256//" + base64.b64encode(hashlib.sha256(public).digest()).decode("ascii")
+
+
+def _kept_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    """The key that is there already, which enrolled hosts have pinned; a new one when there is none."""
+    if path.exists():
+        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+        if isinstance(key, ec.EllipticCurvePrivateKey):
+            return key
+    return ec.generate_private_key(ec.SECP256R1())
 
 
 def _general_name(name: str) -> x509.GeneralName:

@@ -9,6 +9,7 @@ Invariants:
 """
 
 import asyncio
+import contextlib
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -39,6 +40,7 @@ class ControlLink:
         self._number = 0
         self._kept: deque[messages.RestCalled] = deque()
         self._dropped = 0
+        self._pin = ""
         self.known = False  # whether the tokens were told on this link
         self.lost: Callable[[], None] = lambda: None
 
@@ -59,6 +61,19 @@ class ControlLink:
             lambda: self._closed(channel, "control ended"),
             lambda reason: self._closed(channel, reason),
         )
+        self._tell_pin()
+
+    def state_pin(self, pin: str) -> None:
+        """Say by what hosts recognise this server, now and to every control that comes."""
+        self._pin = pin
+        self._tell_pin()
+
+    def _tell_pin(self) -> None:
+        if self._pin and self._channel is not None:
+            with contextlib.suppress(
+                ChannelFullError, ChannelClosedError
+            ):  # the link ends, and the next is told
+                self._channel.send(messages.RestServed(self._pin))
 
     async def ask(self, request: AdminRequest, who: str, seconds: float = ANSWER_SECONDS) -> AdminAnswer:
         """Control's answer to a request on behalf of the token `who`. Raises `ControlAwayError`."""

@@ -15,6 +15,7 @@ Order: rate → Host → Origin → size of the body → token. Invariants:
 
 import asyncio
 import ipaddress
+import re
 import time
 from collections.abc import Iterable
 
@@ -30,11 +31,18 @@ from appliance.api.rates import Buckets
 from appliance.config import ApiLimits
 
 _log = structlog.get_logger()
-PUBLIC = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json"})
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+PUBLIC = frozenset({
+    "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json",
+    "/v1/enrol", "/v1/revocations", "/v1/authority",
+})  # fmt: skip
 BEARER = "rosrv.bearer"  # the key of a request's scope that has who asks
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
 _BODY_SECONDS = 30.0
 _NOBODYS_BODY = 1024  # bytes of a body that somebody without a token may send
+_REQUEST_BODY = 24 << 10  # of a host that brings a signing request
+_RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for a host in its tunnel, which is who it is
+_IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -55,8 +63,13 @@ class Gate:
         doorkeeper: Doorkeeper,
         journal: Journal,
         names: Iterable[str],
+        tunnels: ipaddress.IPv4Network | None = None,
+        networks: Iterable[Network] = (),
     ) -> None:
+        """Hosts in `tunnels` that are in none of `networks` may do no more than renew their certificates."""
         self._app = app
+        self._tunnels = tunnels
+        self._networks = tuple(networks)
         self._limits = limits
         self._doorkeeper = doorkeeper
         self._journal = journal
@@ -94,11 +107,28 @@ class Gate:
         headers = Headers(scope=scope)
         self._check_host(headers)
         _check_origin(scope, headers)
-        bearer = None
-        if scope["path"] not in PUBLIC and not is_console(scope["path"]):
+        path, bearer = scope["path"], None
+        renewal = _RENEWAL.fullmatch(path) is not None
+        self._check_tunnel(host, path, renewal=renewal)
+        if path not in PUBLIC and not renewal and not is_console(path):
             bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
         limit = int(self._limits.body_bytes) if bearer is not None else _NOBODYS_BODY
+        if renewal or path == "/v1/enrol":
+            limit = _REQUEST_BODY
         return bearer, await _read(headers, receive, limit)
+
+    def _check_tunnel(self, host: str, path: str, *, renewal: bool) -> None:
+        address = ipaddress.ip_address(host)
+        if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
+            address = address.ipv4_mapped
+        if self._tunnels is None or address not in self._tunnels or renewal or path in _IN_TUNNELS:
+            return
+        if not any(address in network for network in self._networks):
+            raise ProblemError(
+                403,
+                "not-from-a-tunnel",
+                f"through tunnels REST only renews certificates: add {self._tunnels} to api_networks for more",
+            )
 
     def _check_host(self, headers: Headers) -> None:
         given = headers.getlist("host")

@@ -147,7 +147,9 @@ class EnrolmentToken(Model):
     url: str = Field(description="where the host brings it: POST /v1/enrol there")
     pin: str = Field(description="of the key of that server, as curl's --pinnedpubkey takes it")
     authority: str = Field(description="SHA-256 of the authority's certificate, in hexadecimal")
-    script: str = Field(description="join.sh: makes the key on the host, enrols it, starts and checks the tunnel")
+    script: str = Field(
+        description="join.sh: makes the key on the host, enrols it, starts and checks the tunnel"
+    )
 
 
 class Enrolment(Model):

@@ -18,7 +18,7 @@ import uvloop
 
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
-from appliance.api.certificate import tls_context
+from appliance.api.certificate import pin_of, tls_context
 from appliance.api.console_history import History, measures_of
 from appliance.api.control import ControlLink
 from appliance.api.gate import Gate
@@ -71,6 +71,8 @@ class _Api:
             doorkeeper=self._doorkeeper,
             journal=self._journal,
             names=[*self._settings.api_names, socket.gethostname()],
+            tunnels=self._settings.ipsec.pool,
+            networks=self._settings.api_networks,
         )
         listener = Listener(gate, self._settings.api_limits)
         await self._given.wait()
@@ -78,6 +80,8 @@ class _Api:
             return
         try:
             context = await asyncio.to_thread(self._context) if self._settings.api_tls else None
+            if context is not None:
+                self._control.state_pin(pin_of(self._settings.state / "api"))
             await listener.start(self._socket, context)
         except (OSError, ValueError) as error:
             self._say(messages.Failed(f"REST cannot be served: {error}"))

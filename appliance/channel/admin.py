@@ -147,6 +147,31 @@ class HostAdd(AdminRequest, frozen=True, tag="host add"):
     request: str
     days: float = 90
     address: str | None = None
+    expected: int | None = None
+
+
+class HostToken(AdminRequest, frozen=True, tag="host token"):
+    """Make a token by which a host enrols itself once within `seconds`; an earlier one of the name ends.
+
+    Its text is in the answer and nowhere else. `kit` is kept with it for whoever makes the host's kit. With `new`
+    it is refused for a host that is enrolled; else such a host may come with another key.
+    """
+
+    name: str
+    kit: dict[str, str]
+    seconds: float = 3600
+    days: float = 90
+    address: str | None = None
+    expected: int | None = None
+    new: bool = False
+
+
+class HostEnrol(AdminRequest, frozen=True, tag="host enrol"):
+    """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
+
+    token: str
+    request: str
+    peer: str
 
 
 class HostRenew(AdminRequest, frozen=True, tag="host renew"):
@@ -155,35 +180,90 @@ class HostRenew(AdminRequest, frozen=True, tag="host renew"):
     name: str
     request: str
     days: float = 90
+    expected: int | None = None
+
+
+class HostRenewItself(AdminRequest, frozen=True, tag="host renew itself"):
+    """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
+
+    `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
+    `HostRenewed`.
+    """
+
+    name: str
+    request: str
+    proof: bytes
+    peer: str
+
+
+class HostRenewed(AdminRequest, frozen=True, tag="host renewed"):
+    """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
+
+    name: str
+    peer: str
 
 
 class HostList(AdminRequest, frozen=True, tag="host list"):
     """All hosts that were enrolled or declared, with their tunnels."""
 
 
-class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
-    """Let a host in no more, and cut what it has, now."""
+class HostKit(AdminRequest, frozen=True, tag="host kit"):
+    """What an enrolled host's kit is made of, without its private key."""
 
     name: str
 
 
+class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
+    """Let a host in no more, and cut what it has, now."""
+
+    name: str
+    expected: int | None = None
+
+
+class HostPorts(AdminRequest, frozen=True, tag="host ports"):
+    """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch).
+
+    `name` is an enrolled or declared host's, or an address of a machine that nodes run on.
+    """
+
+    name: str
+    state: Literal["closed", "open", "unknown"]
+    open: list[int]
+    checked: float
+    expected: int | None = None
+
+
+class HostsReload(AdminRequest, frozen=True, tag="hosts reload"):
+    """Read `ipsec/hosts.yaml` again."""
+
+    expected: int | None = None
+
+
+class RevocationsWanted(AdminRequest, frozen=True, tag="host revocations"):
+    """The authority's certificate and its signed list of revoked certificates, in PEM."""
+
+
+HostRequest = (
+    HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | HostRenewed | HostList | HostKit | HostRevoke
+    | HostPorts | HostsReload | RevocationsWanted
+)  # fmt: skip
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
     | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange | TokenList | TokenRevoke
+    | HostRequest
 )  # fmt: skip
-HostRequest = HostAdd | HostRenew | HostList | HostRevoke
-AnyRequest = RestRequest | TokenAdd | HostRequest
+AnyRequest = RestRequest | TokenAdd
 
 
-Trouble = Literal["", "request", "refused", "conflict", "unknown", "busy", "failed"]
+Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]
 
 
 class AdminAnswer(msgspec.Struct, frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
     `trouble` says whose fault an error is: `request` (it makes no sense), `refused` (the policy or name given is
-    wrong), `conflict` (another revision is in force than was expected), `unknown` (there is no such thing), `busy`
-    (too much at once), `failed` (the appliance cannot do it now).
+    wrong), `conflict` (another revision is in force than was expected), `unknown` (there is no such thing),
+    `forbidden` (whoever asks may not), `busy` (too much at once), `failed` (the appliance cannot do it now).
     """
 
     ok: bool

@@ -2,13 +2,15 @@
 
 Invariants:
 
-1. The key (ECDSA on P-384) is made at the first use in the signer's own directory, mode 0600, and never leaves the
-   process. A key without its certificate, a certificate of another key, or a key that others may read is an error,
-   never replaced.
+1. The key (ECDSA on P-384, or Ed25519) is made at the first use in the signer's own directory, mode 0600, encrypted
+   when there is a passphrase, and never leaves the process. A key without its certificate, a certificate of another
+   key, or a key that others may read is an error, never replaced.
 2. Of a request only the public key counts: the names, times and uses in a certificate are this module's.
    The request must be signed by its own key, and the key must be ECDSA on P-384 or Ed25519.
 3. No certificate lives longer than the authority's own, or than `LONGEST_DAYS`.
-4. A list of revoked certificates is complete each time; its number only grows (it is the time).
+4. With a proof, a request is only good when the key of a certificate in the same name, which this authority made and
+   which has not ended, signed it.
+5. A list of revoked certificates is complete each time; its number only grows (it is the time).
 """
 
 import datetime
@@ -22,15 +24,12 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.authority_key import Kind, load_key, make_key, write_key
+from appliance.ipsec.files import SignerKeyError, write_whole
+from appliance.ipsec.proof import RequestRefusedError, require_proof
 
 KEY_FILE = "ca.key"
 CERTIFICATE_FILE = "ca.pem"
@@ -43,10 +42,6 @@ _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
-class RequestRefusedError(Exception):
-    """No certificate is made; the message says why."""
-
-
 @dataclass(frozen=True)
 class Issued:
     """A certificate that was made: PEM, serial number in hexadecimal, end in seconds since the epoch."""
@@ -57,13 +52,17 @@ class Issued:
 
 
 class Authority:
-    """The authority in `directory`, made when there is none. Raises `SignerKeyError`, `OSError`."""
+    """The authority in `directory`, made with a key of this kind when there is none.
 
-    def __init__(self, directory: Path) -> None:
+    Raises `SignerKeyError`, `OSError`.
+    """
+
+    def __init__(self, directory: Path, kind: Kind = "ecdsa", passphrase: bytes | None = None) -> None:
         key_path, certificate_path = directory / KEY_FILE, directory / CERTIFICATE_FILE
         if not key_path.exists() and not certificate_path.exists():
-            _create(key_path, certificate_path)
-        self._key = _load_key(key_path)
+            _create(key_path, certificate_path, kind, passphrase)
+        self._key = load_key(key_path, CERTIFICATE_FILE, kind, passphrase)
+        self._hash = None if isinstance(self._key, ed25519.Ed25519PrivateKey) else hashes.SHA384()
         self._certificate = _load_certificate(certificate_path)
         if self._certificate.public_key() != self._key.public_key():
             raise SignerKeyError(
@@ -75,8 +74,13 @@ class Authority:
         """The authority's own certificate, in PEM."""
         return self._certificate.public_bytes(Encoding.PEM)
 
-    def issue(self, request: bytes, name: str, days: float) -> Issued:
-        """A certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`."""
+    def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> Issued:
+        """A certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`.
+
+        `proof`: the signature over the request by the key of the certificate `former` (PEM).
+        """
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
                 f"{name[:80]!r} is no name for a certificate: letters, digits and . _ -, at most 63"
@@ -85,6 +89,8 @@ class Authority:
             raise RequestRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
         public_key = _key_of(request)
         now = datetime.datetime.now(datetime.UTC)
+        if proof or former:
+            require_proof(request, proof, former, name=name, authority=self._certificate, now=now)
         end = min(now + datetime.timedelta(days=days), self._certificate.not_valid_after_utc)
         certificate = (
             x509.CertificateBuilder()
@@ -103,7 +109,7 @@ class Authority:
             .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
             .add_extension(self._identifier(), critical=False)
-            .sign(self._key, hashes.SHA384())
+            .sign(self._key, self._hash)
         )
         return Issued(
             certificate.public_bytes(Encoding.PEM),
@@ -129,7 +135,7 @@ class Authority:
                 .revocation_date(datetime.datetime.fromtimestamp(moment, datetime.UTC))
                 .build()
             )
-        return builder.sign(self._key, hashes.SHA384()).public_bytes(Encoding.PEM)
+        return builder.sign(self._key, self._hash).public_bytes(Encoding.PEM)
 
     def _identifier(self) -> x509.AuthorityKeyIdentifier:
         return x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
@@ -156,8 +162,8 @@ def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519Public
     )
 
 
-def _create(key_path: Path, certificate_path: Path) -> None:
-    key = ec.generate_private_key(ec.SECP384R1())
+def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: bytes | None) -> None:
+    key = make_key(kind)
     serial = x509.random_serial_number()
     subject = _subject(f"ROSRV appliance authority {serial % 0x1000000:06x}")
     now = datetime.datetime.now(datetime.UTC)
@@ -172,29 +178,11 @@ def _create(key_path: Path, certificate_path: Path) -> None:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(authority=True), critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA384())
+        .sign(key, hashes.SHA384() if kind == "ecdsa" else None)
     )
     # The certificate first: one without its key (a crash in between) made nothing yet, and says what to do.
     write_whole(certificate_path, certificate.public_bytes(Encoding.PEM), 0o644)
-    write_whole(key_path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600)
-
-
-def _load_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    if not path.exists():
-        raise SignerKeyError(
-            f"{path}: missing, but its certificate is there; restore it from a backup, or remove"
-            f" {CERTIFICATE_FILE} to begin with a new authority (every host enrols again)"
-        )
-    require_private(path)
-    try:
-        key = load_pem_private_key(path.read_bytes(), password=None)
-    except (ValueError, TypeError) as error:
-        raise SignerKeyError(
-            f"{path}: not a private key in PEM: {error}; restore it from a backup"
-        ) from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise SignerKeyError(f"{path}: not an ECDSA key; restore it from a backup")
-    return key
+    write_key(key_path, key, passphrase)
 
 
 def _load_certificate(path: Path) -> x509.Certificate:

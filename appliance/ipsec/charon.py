@@ -14,7 +14,7 @@ from typing import Any
 from vici import Session
 from vici.exception import CommandException
 
-from appliance.ipsec.strongswan import Tunnel, connection, connection_name, host_of, pool
+from appliance.ipsec.strongswan import Tunnel, connection, connection_name, host_of, pool, proposals_of
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
@@ -53,6 +53,7 @@ class Vici:
         self._session = self._connect()
         self._loaded: dict[str, Tunnel] = {}
         self._material: Material | None = None
+        self.proposals = proposals_of(self._key_exchanges())
 
     def load_key(self, key: bytes) -> None:
         """Give charon the appliance's private key (PEM)."""
@@ -97,6 +98,12 @@ class Vici:
         with self._said("its version"):
             return str(self._session.version()["version"].decode())
 
+    def _key_exchanges(self) -> list[str]:
+        with self._said("the list of its algorithms"):
+            found = self._session.get_algorithms()
+        # Before strongSwan 6 the group was named after Diffie and Hellman.
+        return [str(name) for group in ("ke", "dh") for name in found.get(group, {})]
+
     def listen(self) -> Iterator[tuple[str, bool, str]]:
         """Tunnels going up and down, on a connection of its own: host, up, real address. Ends when charon does."""
         session = self._connect(timeout=None)
@@ -121,6 +128,7 @@ class Vici:
                     address=material.address,
                     certificate=material.certificate,
                     authority=material.authority,
+                    proposals=self.proposals,
                 )
             )
         self._loaded[tunnel.name] = tunnel

@@ -7,6 +7,7 @@ tunnel carries what goes to the appliance and nothing else.
 
 import io
 import tarfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from string import Template
@@ -15,12 +16,23 @@ from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
 CONNECTION = "rosrv"
-_SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "README")
+_SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Where the host renews its certificate through the tunnel: URL, and the pin of that server's key."""
+
+    url: str
+    pin: str
 
 
 @dataclass(frozen=True)
 class Kit:
-    """The parts of a kit; `key` is None where the host has made its own. `protect` is an nftables file."""
+    """The parts of a kit; `key` is None where the host has made its own. `protect` is an nftables file.
+
+    `rest` is None where the appliance's REST cannot be reached through the tunnel.
+    """
 
     name: str
     address: str
@@ -31,26 +43,39 @@ class Kit:
     authority: str
     key: str | None
     protect: str
+    rest: Rest | None = None
 
 
-def archive(kit: Kit) -> bytes:
-    """The kit as `.tar.gz`: one folder, `rosrv-NAME`."""
-    members = [
+def members(kit: Kit) -> list[tuple[str, str, int]]:
+    """The files of a kit: path, text, mode."""
+    found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
         ("swanctl/x509ca/rosrv-ca.pem", kit.authority, 0o644),
         ("swanctl/x509/rosrv.pem", kit.certificate, 0o644),
         ("protect.nft", kit.protect, 0o644),
     ]
     if kit.key is not None:
-        members.append(("swanctl/private/rosrv.key", kit.key, 0o600))
+        found.append(("swanctl/private/rosrv.key", kit.key, 0o600))
     values = {"name": kit.name, "address": kit.address, "appliance": kit.appliance, "master": kit.master}
     values |= {"endpoint": kit.endpoint, "connection": CONNECTION, "child": CHILD}
+    values |= {"rest": kit.rest.url if kit.rest else "", "pin": kit.rest.pin if kit.rest else ""}
+    values |= {"ike": ", ".join(IKE_PROPOSALS), "esp": ", ".join(ESP_PROPOSALS)}
     for script in _SCRIPTS:
-        text = files("appliance.ipsec").joinpath("kit_files", script).read_text(encoding="utf-8")
-        members.append((script, _Template(text).substitute(values), 0o644 if script == "README" else 0o755))
+        found.append((script, filled(script, values), 0o644 if script == "README" else 0o755))
+    return found
+
+
+def filled(script: str, values: Mapping[str, str]) -> str:
+    """A script of `kit_files` with its values."""
+    text = files("appliance.ipsec").joinpath("kit_files", script).read_text(encoding="utf-8")
+    return _Template(text).substitute(values)
+
+
+def archive(kit: Kit) -> bytes:
+    """The kit as `.tar.gz`: one folder, `rosrv-NAME`."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
-        for path, content, mode in members:
+        for path, content, mode in members(kit):
             data = content.encode()
             entry = tarfile.TarInfo(f"rosrv-{kit.name}/{path}")
             entry.size, entry.mode = len(data), mode

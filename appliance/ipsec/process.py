@@ -28,6 +28,7 @@ from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
     APPLIANCE_NAME,
     CertificateNeeded,
+    CharonStarted,
     Failed,
     Lifeline,
     LinkOpened,
@@ -72,6 +73,7 @@ class TunnelProcess:
         self._taken = 0
         self._charon: asyncio.subprocess.Process | None = None
         self._vici: Vici | None = None
+        self._version = ""
         self._refusals = Refusals()
         self._second = (0, 0)  # of the last refusals, and how many they were
         self._tasks: set[asyncio.Future[Any]] = set()
@@ -112,6 +114,8 @@ class TunnelProcess:
         link = self._control = Channel(socket.socket(fileno=descriptor), TunnelLink)
         link.attach(self._loop, self._control_said, lambda: self._link_closed(link))
         self._ask()
+        if self._vici is not None:
+            self._say_what_it_is(self._vici)
 
     def _link_closed(self, link: Channel) -> None:
         if self._control is link:
@@ -166,8 +170,13 @@ class TunnelProcess:
         self._spawn(self._read_log(self._charon))
         vici = await self._connect(sock)
         await asyncio.to_thread(vici.load_key, self._key)
+        self._version = await asyncio.to_thread(vici.version)
+        self._say_what_it_is(vici)
         self._loop.run_in_executor(None, self._listen, vici)
         return vici
+
+    def _say_what_it_is(self, vici: Vici) -> None:
+        self._tell(CharonStarted(self._version, vici.proposals.key_exchange))
 
     async def _connect(self, path: Path) -> Vici:
         deadline = time.monotonic() + _START_SECONDS

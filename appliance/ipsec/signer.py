@@ -47,9 +47,10 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
-from appliance.ipsec.authority import Authority, RequestRefusedError
+from appliance.ipsec.authority import Authority
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.proof import RequestRefusedError
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
@@ -148,8 +149,8 @@ class Signer:
                 return self._sign(number, text)
             case AuthorityWanted(number):
                 return AuthorityStated(number, self._authority.certificate)
-            case CertificateWanted(number, request, name, days):
-                return self._issue(number, request, name, days)
+            case CertificateWanted():
+                return self._issue(message)
             case RevocationsWanted(number, revoked):
                 rows = [(one.serial, one.moment) for one in revoked]
                 return RevocationsMade(number, self._authority.revocations(rows))
@@ -163,12 +164,14 @@ class Signer:
             return SignatureRefused(number, str(error))
         return SignatureMade(number, self._key.sign(text), self._public_key)
 
-    def _issue(self, number: int, request: bytes, name: str, days: float) -> Message:
+    def _issue(self, wanted: CertificateWanted) -> Message:
         try:
-            issued = self._authority.issue(request, name, days)
+            issued = self._authority.issue(
+                wanted.request, wanted.name, wanted.days, proof=wanted.proof, former=wanted.former
+            )
         except RequestRefusedError as error:
-            return CertificateRefused(number, str(error))
-        return CertificateMade(number, issued.certificate, issued.serial, issued.expires)
+            return CertificateRefused(wanted.number, str(error))
+        return CertificateMade(wanted.number, issued.certificate, issued.serial, issued.expires)
 
 
 def main(lifeline_fd: int, directory: Path) -> None:

@@ -2,14 +2,15 @@
 
 Invariants:
 
-1. AES-256-GCM, SHA-384 and Curve25519 or ECP-384; nothing weaker is offered or accepted.
+1. AES-256-GCM, SHA-384 and Curve25519 or ECP-384, with ML-KEM-768 beside Curve25519 where charon has it; nothing
+   weaker is offered or accepted.
 2. A host is let in by a certificate of the appliance's own authority that is on no list of revoked ones (without a
    valid list: nobody), under the name in it; it gets the one address that is kept for this name, and nothing but
    the appliance's address on the other side. A host that is not enrolled has no configuration that could match.
 3. charon loads the plugins named here and no others: none that runs programs or asks the network for lists.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from appliance.channel.messages import APPLIANCE_NAME, Esp
 USER_SPACE_INTERFACE = "ipsec0"
 IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")
 ESP_PROPOSALS = ("aes256gcm16-x25519", "aes256gcm16-ecp384")
+ML_KEM = "ke1_mlkem768"  # an additional key exchange (RFC 9370); beside the first proposal of each list
+_ML_KEM_ALGORITHM = "ML_KEM_768"
 CHILD = "ros"
 _PLUGINS = ("random", "nonce", "openssl", "pem", "x509", "revocation", "constraints", "pubkey", "kdf")
 _PREFIX = "host-"
@@ -68,6 +71,29 @@ charon-systemd {{
 """
 
 
+@dataclass(frozen=True)
+class Proposals:
+    """What is offered and accepted, the best first."""
+
+    ike: tuple[str, ...] = IKE_PROPOSALS
+    esp: tuple[str, ...] = ESP_PROPOSALS
+
+    @property
+    def key_exchange(self) -> list[str]:
+        """The methods of key exchange, for status: `x25519+mlkem768`, `x25519`, `ecp384`."""
+        words = [one.removeprefix("aes256gcm16-prfsha384-") for one in self.ike]
+        return [word.replace("-ke1_", "+") for word in words]
+
+
+def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
+    """What a charon with these key exchanges (its own names) is let offer."""
+    if _ML_KEM_ALGORITHM not in key_exchanges:
+        return Proposals()
+    return Proposals(
+        (f"{IKE_PROPOSALS[0]}-{ML_KEM}", *IKE_PROPOSALS), (f"{ESP_PROPOSALS[0]}-{ML_KEM}", *ESP_PROPOSALS)
+    )
+
+
 def connection_name(host: str) -> str:
     """The name of a host's connection and pool in charon."""
     return _PREFIX + host
@@ -83,19 +109,26 @@ def pool(tunnel: Tunnel) -> dict[str, Any]:
     return {connection_name(tunnel.name): {"addrs": f"{tunnel.address}-{tunnel.address}"}}
 
 
-def connection(tunnel: Tunnel, *, address: str, certificate: bytes, authority: bytes) -> Mapping[str, Any]:
+def connection(
+    tunnel: Tunnel,
+    *,
+    address: str,
+    certificate: bytes,
+    authority: bytes,
+    proposals: Proposals = Proposals(),
+) -> Mapping[str, Any]:
     """The tunnel of a host, for vici's `load-conn`; `address` is the appliance's own in the tunnel."""
     child = {
         "local_ts": [f"{address}/32"],
         "remote_ts": ["dynamic"],
-        "esp_proposals": list(ESP_PROPOSALS),
+        "esp_proposals": list(proposals.esp),
         "dpd_action": "clear",
         "close_action": "none",
     }
     return {
         connection_name(tunnel.name): {
             "version": "2",
-            "proposals": list(IKE_PROPOSALS),
+            "proposals": list(proposals.ike),
             "unique": "replace",
             "encap": "yes",
             "mobike": "yes",

@@ -14,7 +14,15 @@ import msgspec
 import appliance
 from appliance.channel import admin
 from appliance.master.core import Master
-from appliance.master.hosts import HostRefusedError, Hosts
+from appliance.master.host_orders import MINE as HOST_ORDERS
+from appliance.master.host_orders import manage_hosts
+from appliance.master.host_table import (
+    HostForbiddenError,
+    HostRefusedError,
+    HostsChangedError,
+    UnknownHostError,
+)
+from appliance.master.hosts import Hosts
 from appliance.master.measures import measures_of
 from appliance.master.monitor_orders import change_monitors, monitors_body, monitors_status
 from appliance.master.monitors import MonitorsChangedError, UnknownMonitorError
@@ -89,15 +97,16 @@ class Administration:
         except SpecificationsRefusedError as error:
             text = f"refused; revision {self._master.monitors.revision} of the specifications stays in force"
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
-        except (RevisionChangedError, MonitorsChangedError) as error:
+        except (RevisionChangedError, MonitorsChangedError, HostsChangedError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="conflict")
-        except (TokenRefusedError, HostRefusedError) as error:
-            ours = isinstance(error, HostRefusedError) and error.ours
-            return admin.AdminAnswer(False, error=str(error), trouble="failed" if ours else "refused")
-        except (UnknownThingError, UnknownMonitorError) as error:
+        except (UnknownThingError, UnknownMonitorError, UnknownHostError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="unknown")
+        except (TokenRefusedError, HostRefusedError) as error:
+            return admin.AdminAnswer(False, error=str(error), trouble=_trouble(error))
 
     async def _carry_out(self, request: admin.AnyRequest, who: str) -> dict[str, Any]:
+        if isinstance(request, HOST_ORDERS):
+            return await manage_hosts(self._hosts, request, who)
         match request:
             case admin.PolicyReload() | admin.PolicyRollback() | admin.PolicyConfirm() | admin.PolicyLoad():
                 async with self._changing:
@@ -106,8 +115,6 @@ class Administration:
                     return body
             case admin.TokenAdd() | admin.TokenList() | admin.TokenRevoke():
                 return await self._manage_tokens(request)
-            case admin.HostAdd() | admin.HostRenew() | admin.HostList() | admin.HostRevoke():
-                return await self._manage_hosts(request, who)
             case (
                 admin.MonitorLoad()
                 | admin.MonitorReload()
@@ -137,6 +144,7 @@ class Administration:
                 return {
                     "status": self._status(),
                     "queued_deliveries": self._queued_deliveries(),
+                    "hosts": self._hosts.rows(),
                     **measures_of(self._master),
                 }
 
@@ -149,17 +157,6 @@ class Administration:
                 return {"tokens": [_token(row) for row in self._tokens.rows()]}
             case admin.TokenRevoke(name):
                 return _token(await self._tokens.revoke(name))
-
-    async def _manage_hosts(self, request: admin.HostRequest, who: str) -> dict[str, Any]:
-        match request:
-            case admin.HostAdd(name, text, days, address):
-                return await self._hosts.add(name, text, days, address, who)
-            case admin.HostRenew(name, text, days):
-                return await self._hosts.renew(name, text, days, who)
-            case admin.HostList():
-                return {"hosts": self._hosts.rows()}
-            case admin.HostRevoke(name):
-                return await self._hosts.revoke(name, who)
 
     # --- the policy ---
 
@@ -273,6 +270,12 @@ class Administration:
             for incarnation, registration in self._master.registry.in_order()
             if registration.kind in _CATEGORIES and not incarnation.own
         ]
+
+
+def _trouble(error: TokenRefusedError | HostRefusedError) -> admin.Trouble:
+    if isinstance(error, HostForbiddenError):
+        return "forbidden"
+    return "failed" if isinstance(error, HostRefusedError) and error.ours else "refused"
 
 
 def _loaded(loaded: Loaded) -> dict[str, Any]:

@@ -7,6 +7,7 @@ through `Wires`, the one place where the circles are.
 
 import asyncio
 import socket
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -40,7 +41,7 @@ from appliance.master.publisher import OwnPublisher
 from appliance.master.reconcile import Reconciler
 from appliance.master.recorder import Recorder
 from appliance.master.registration import withdraw
-from appliance.master.registry import Incarnation, Registration, Registry
+from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.master.reminders import Reminders
 from appliance.master.revocation import Revocation
@@ -290,6 +291,9 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
     reconciler = wires.reconciler()
     revocation = Revocation(master, put_back=reconciler.put_back)
     base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
+    base.hosts.machines = lambda: Counter(
+        str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own
+    )
 
     def policy_changed(ports: range) -> int:
         reach.places.set_range(ports)

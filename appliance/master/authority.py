@@ -56,9 +56,15 @@ class Authority:
         """The authority's own certificate, in PEM."""
         return (await self._ask(AuthorityWanted(self._next()), AuthorityStated)).certificate
 
-    async def issue(self, request: bytes, name: str, days: float) -> CertificateMade:
-        """A certificate in this name for the key of a signing request."""
-        return await self._ask(CertificateWanted(self._next(), request, name, days), CertificateMade)
+    async def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """A certificate in this name for the key of a signing request.
+
+        `proof`: the request's signature by the key of the certificate `former` (PEM), without which none is made.
+        """
+        wanted = CertificateWanted(self._next(), request, name, days, proof, former)
+        return await self._ask(wanted, CertificateMade)
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
         """The signed list (PEM) of these: serial number and moment."""

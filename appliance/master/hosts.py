@@ -1,70 +1,52 @@
-"""The hosts that come through tunnels: enrolled, renewed, listed and revoked here.
+"""The hosts that come through tunnels: enrolled, renewed, revoked here.
 
 Invariants:
 
-1. A name has one virtual address for good; the address of a revoked host is given to no other.
-2. `addresses` (what `host:NAME` means in the policy) is empty until the supervisor has said that these addresses
+1. `addresses` (what `host:NAME` means in the policy) is empty until the supervisor has said that these addresses
    are taken through IPsec only: where clear text is not kept out, they stand for nobody.
-3. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
-4. What charon is to have is stated whole each time, in the order in which it came about.
+2. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited. Whatever is
+   under way for its name (an enrolment, a renewal) is refused when it comes to its end.
+3. Who renews himself is at the virtual address of the name he says, and has its present key.
+4. No answer but the one to `token` has a token in it, and no answer has a private key.
 """
 
 import asyncio
 import contextlib
+import hashlib
 import ipaddress
-import re
+import ssl
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.channel.messages import (
-    APPLIANCE_NAME,
-    CertificateMade,
-    CertificateNeeded,
-    Message,
-    TunnelChanged,
-    TunnelHost,
-    TunnelRefused,
-    TunnelSeen,
-    TunnelsEnclosed,
-    TunnelsReported,
-    TunnelsStated,
-    TunnelsWanted,
-)
+from appliance.channel.messages import CertificateMade
 from appliance.master.authority import Authority, AuthorityError
-from appliance.master.declared import DeclaredHost, DeclaredHostsError, read_declared
+from appliance.master.awaited import LONGEST_SECONDS, MOST, Awaited, BadEnrolmentTokenError
+from appliance.master.declared import DeclaredHostsError
+from appliance.master.host_table import HostForbiddenError, HostRefusedError, HostTable
+from appliance.master.host_view import HostView, soon
 from appliance.master.recorder import Recorder
+from appliance.master.rest_place import RestPlace
+from appliance.master.tunnels import Tunnels
 from appliance.policy.model import Address
-from appliance.store.state import HostRow, StateStore
+from appliance.store.hosts import AwaitedRow, HostRow, PortsRow
+from appliance.store.state import StateStore
 
 _log = structlog.get_logger()
-_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
-_APPLIANCE_DAYS = 90.0
-_OPEN_SECONDS = 20.0
-_TAKEN_SECONDS = 10.0
-_RESTATE_SECONDS = 3600.0
-_AGAIN_SECONDS = 5.0
-_SOON_SECONDS = 14 * 86_400.0
-
-
-class HostRefusedError(Exception):
-    """It is not done; the text says why. `ours`: the appliance cannot do it now."""
-
-    def __init__(self, reason: str, *, ours: bool = False) -> None:
-        super().__init__(reason)
-        self.ours = ours
+_ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
+_RENEWALS_SECONDS = 3600.0
+_CLOCKS_DIFFER = 86_400.0
 
 
 class Hosts:
     """All hosts.
 
     `changed()` is called when `addresses` has changed, `expel(address, reason)` takes back what a host has; both
-    say how much that was.
+    say how much that was. `machines()` is the number of nodes by address.
     """
 
     def __init__(
@@ -72,130 +54,177 @@ class Hosts:
         store: StateStore,
         recorder: Recorder,
         authority: Authority,
+        table: HostTable,
+        tunnels: Tunnels,
         *,
-        pool: ipaddress.IPv4Network,
-        declared: Path,
-        listen: tuple[str, int],
-        say: Callable[[Message], None],
+        master_port: int,
+        rest: RestPlace,
     ) -> None:
         self._store = store
         self._recorder = recorder
         self._authority = authority
-        self._pool = pool
-        self._declared_file = declared
-        self._listen = listen
-        self._say = say
-        self._rows = {row.name: row for row in store.hosts()}
-        self._revoked = store.revoked_certificates()
-        self._seen: dict[str, TunnelSeen] = {}
-        self._last: dict[str, float] = {}
-        self._enclosed: TunnelsEnclosed | None = None
-        self._answered = asyncio.Event()
-        self._opening = asyncio.Lock()
+        self._table = table
+        self._tunnels = tunnels
+        self._master_port = master_port
+        self._rest = rest
+        self._awaited = Awaited(store.hosts)
+        self._view = HostView(table, self._awaited, tunnels)
         self._changing = asyncio.Lock()
-        self._link: Channel | None = None
-        self._certificate: bytes | None = None
-        self._dirty = asyncio.Event()
-        # Of the last statement: greater than any of an earlier life, which charon's process may still report.
-        self._number = time.time_ns()
-        self._wake = asyncio.Event()
-        self._taken_number = 0
+        self._revocations: Counter[str] = Counter()  # of each name, in this life
+        self._renewals: dict[str, float] = {}
+        self._warned: set[str] = set()  # serials
+        self._pin = ""
         self.changed: Callable[[], int] = lambda: 0
         self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
+        self.machines: Callable[[], dict[str, int]] = dict
+        tunnels.each_hour = self._each_hour
 
     # --- what others ask ---
 
     @property
-    def own_address(self) -> str:
-        """The appliance's address in the tunnels: the first of the pool."""
-        return str(self._pool.network_address + 1)
-
-    @property
     def addresses(self) -> dict[str, Address]:
         """What `host:NAME` means now."""
-        if self._enclosed is None or self._enclosed.esp is None:
+        if not self._tunnels.enclosed:
             return {}
-        return {row.name: ipaddress.ip_address(row.address) for row in self._admitted()}
+        return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Every host, enrolled or declared, as `rosrv host list` shows it."""
-        declared, _error = self._declared()
-        rows = [self._row(row, declared) for row in self._rows.values()]
-        rows += [
-            {**_NOBODY, "name": one.name, "address": one.address, "declared": True, "state": "not enrolled"}
-            for one in declared.values()
-            if one.name not in self._rows
-        ]
-        return sorted(rows, key=lambda row: str(row["name"]))
+    def overview(self) -> dict[str, Any]:
+        """Every host and machine, and how the tunnels stand."""
+        machines = self._machines()
+        status = self._view.status(machines)
+        return {
+            "revision": self._table.revision,
+            "hosts": self._view.rows(),
+            "machines": self._view.machines(machines),
+            **{name: status[name] for name in _OVERVIEW},
+        }
 
     def status(self) -> dict[str, Any]:
-        """For `rosrv status`: where ESP runs, how many tunnels stand, what a person should look at."""
-        _hosts, error = self._declared()
-        enclosed = self._enclosed
-        return {
-            "esp": None if enclosed is None else enclosed.esp,
-            "pool": str(self._pool),
-            "address": self.own_address,
-            "enrolled": len(self._admitted()),
-            "up": len(self._seen),
-            "troubles": [*self._troubles(), *([error] if error else [])],
-        }
+        """For `rosrv status`."""
+        return self._view.status(self._machines())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Every host, enrolled, awaited or declared."""
+        return self._view.rows()
+
+    def served_by(self, pin: str) -> None:
+        """The api says by what hosts recognise it."""
+        self._pin = pin
+
+    async def start(self) -> None:
+        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
+        if not self._table.admitted():
+            return
+        try:
+            await self._tunnels.open()
+        except HostRefusedError as error:
+            _log.error("enrolled hosts stay outside", reason=str(error))
 
     # --- what operators do ---
 
     async def add(
-        self, name: str, request: str, days: float, address: str | None, who: str
+        self,
+        name: str,
+        request: str,
+        *,
+        days: float,
+        who: str,
+        address: str | None = None,
+        expected: int | None = None,
     ) -> dict[str, Any]:
-        """Enrol a host; what its kit is made of. Raises `HostRefusedError`."""
+        """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
         async with self._changing:
-            row = self._rows.get(name)
-            if row is not None and row.revoked is None:
+            self._table.require(expected)
+            self._require_not_enrolled(name)
+            self._table.require_name(name)
+            wanted = self._table.address_for(name, address, self._awaited.addresses())
+            await self._tunnels.open()
+            with self._unless_revoked(name):
+                made = await self._issue(name, request, days)
+            self._enrolled(name, wanted, made, who)
+            return await self._finish(name)
+
+    async def renew(
+        self, name: str, request: str, *, days: float, who: str, expected: int | None = None
+    ) -> dict[str, Any]:
+        """A new certificate for a host, the one before revoked. Raises as `add`."""
+        async with self._changing:
+            self._table.require(expected)
+            row = self._table.enrolled_row(name)
+            await self._tunnels.open()
+            with self._unless_revoked(name):
+                made = await self._issue(name, request, days)
+            self._keep(name, row.address, made)
+            self._renewed(name, row.serial, made.serial, made.expires, who)
+            return await self._finish(name)
+
+    async def token(
+        self,
+        name: str,
+        *,
+        kit: dict[str, str],
+        seconds: float,
+        days: float,
+        address: str | None,
+        new: bool,
+        who: str,
+        expected: int | None = None,
+    ) -> dict[str, Any]:
+        """A one-time token for a host. Raises as `add`."""
+        async with self._changing:
+            self._table.require(expected)
+            self._table.require_name(name)
+            if new:
+                self._require_not_enrolled(name)
+            if not 0 < seconds <= LONGEST_SECONDS:
                 raise HostRefusedError(
-                    f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
+                    f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
                 )
-            self._require_name(name)
-            wanted = self._address_for(name, address)
-            await self._open()
-            made = await self._issue(name, request, days)
-            self._keep(HostRow(name, wanted, made.serial, made.expires, time.time(), None))
+            if self._rest.port is None:
+                raise HostRefusedError(self._rest.trouble)
+            if len(self._awaited.rows()) >= MOST:
+                raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
+            promised = self._table.address_for(name, address, self._awaited.addresses())
+            await self._tunnels.open()
+            authority = await self._certificate_of_authority()
+            row, text = self._awaited.add(
+                name, seconds=seconds, address=promised, days=days, kit=kit, who=who
+            )
+            self._table.changed()
             self._recorder.happened(
-                "host enrolled",
-                f"{name} may come through its tunnel as {wanted}",
+                "host awaited",
+                f"whoever brings the one-time token {row.id} is enrolled as {name}",
                 severity=Severity.NOTICE,
                 name=name,
-                address=wanted,
-                serial=made.serial,
-                expires=made.expires,
+                address=promised,
+                id=row.id,
+                expires=row.expires,
                 who=who,
             )
-            return await self._finish(name, made)
+            await self._store.settled()
+            return {
+                **self._places(),
+                "revision": self._table.revision,
+                "name": name,
+                "address": promised,
+                "token": text,
+                "token_expires": row.expires,
+                "authority_fingerprint": _fingerprint(authority),
+            }
 
-    async def renew(self, name: str, request: str, days: float, who: str) -> dict[str, Any]:
-        """A new certificate for a host, the one before revoked. Raises `HostRefusedError`."""
-        async with self._changing:
-            row = self._admitted_row(name)
-            await self._open()
-            made = await self._issue(name, request, days)
-            self._admitted_row(name)  # it may have been revoked meanwhile
-            self._revoke_serial(row.serial)
-            self._keep(HostRow(name, row.address, made.serial, made.expires, row.enrolled, None))
-            self._recorder.happened(
-                "host renewed",
-                f"{name} has a new certificate; its tunnel comes back with it",
-                severity=Severity.NOTICE,
-                name=name,
-                serial=made.serial,
-                replaced=row.serial,
-                expires=made.expires,
-                who=who,
-            )
-            return await self._finish(name, made)
-
-    async def revoke(self, name: str, who: str) -> dict[str, Any]:
-        """Let a host in no more and cut what it has. Raises `HostRefusedError`."""
-        row = self._admitted_row(name)
-        self._revoke_serial(row.serial)
-        taken = self._keep(HostRow(name, row.address, row.serial, row.expires, row.enrolled, time.time()))
+    async def revoke(self, name: str, who: str, expected: int | None = None) -> dict[str, Any]:
+        """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
+        self._table.require(expected)
+        self._revocations[name] += 1
+        awaited = self._awaited.rows().get(name)
+        self._awaited.forget(name)
+        if awaited is not None and (
+            name not in self._table.rows or self._table.rows[name].revoked is not None
+        ):
+            return await self._await_no_longer(awaited, who)
+        row = self._table.revoke(name)
+        self._tunnels.state_anew()
+        taken = self.changed()
         taken += self.expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
         self._recorder.happened(
             "host revoked",
@@ -208,310 +237,337 @@ class Hosts:
             who=who,
         )
         await self._store.settled()
-        return {"name": name, "address": row.address, "serial": row.serial, "taken_back": taken}
+        return {
+            "revision": self._table.revision,
+            "name": name,
+            "address": row.address,
+            "serial": row.serial,
+            "taken_back": taken,
+        }
 
-    # --- the supervisor ---
-
-    async def start(self) -> None:
-        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
-        if not self._admitted():
-            return
+    async def reload(self, who: str, expected: int | None = None) -> dict[str, Any]:
+        """Read hosts.yaml again: which tunnels are wanted. Raises as `add`; a bad file changes nothing."""
+        self._table.require(expected)
+        before = {row.name for row in self._table.admitted()}
         try:
-            await self._open()
-        except HostRefusedError as error:
-            _log.error("enrolled hosts stay outside", reason=str(error))
-
-    def enclosed(self, message: TunnelsEnclosed) -> None:
-        """The supervisor's answer."""
-        self._enclosed = message
-        self._answered.set()
-
-    async def _open(self) -> None:
-        async with self._opening:
-            if self._enclosed is not None and self._enclosed.esp is not None:
-                return
-            if self._listen[0] not in ("0.0.0.0", self.own_address):  # noqa: S104  compared only
-                raise HostRefusedError(
-                    f"hosts in tunnels reach the appliance at {self.own_address}, but it listens on"
-                    f" {self._listen[0]} only: set `listen: 0.0.0.0:{self._listen[1]}`"
-                )
-            self._answered.clear()
-            self._say(TunnelsWanted(str(self._pool), self.own_address))
-            try:
-                await asyncio.wait_for(self._answered.wait(), _OPEN_SECONDS)
-            except TimeoutError:
-                raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
-            if self._enclosed is None or self._enclosed.esp is None:
-                reason = self._enclosed.reason if self._enclosed else "no answer"
-                raise HostRefusedError(reason, ours=True)
-
-    # --- the process that runs charon ---
-
-    def attach(self, link: Channel) -> None:
-        """A new life of that process; it asks for its certificate first."""
-        if self._link is not None:
-            self._link.close()
-        self._link, self._certificate = link, None
-        link.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._received(message),
-            lambda: self._lost(link),
-        )
-
-    async def run(self) -> None:
-        """State what charon is to have whenever it changes, and every hour (expired hosts, the list's age)."""
-        while True:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._dirty.wait(), _RESTATE_SECONDS)
-            self._dirty.clear()
-            try:
-                await self._state()
-            except AuthorityError as error:
-                _log.warning("charon is told later", reason=str(error))
-                asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
-
-    def _lost(self, link: Channel) -> None:
-        if self._link is not link:
-            return
-        self._link = self._certificate = None
-        for name in list(self._seen):
-            self._went_down(name, "the process that runs charon ended")
-
-    def _received(self, message: object) -> None:
-        match message:
-            case CertificateNeeded(request):
-                task = asyncio.get_running_loop().create_task(self._certify(request))
-                task.add_done_callback(lambda done: done.exception())
-            case TunnelChanged(name, up, remote):
-                self._tunnel_changed(name, up, remote)
-            case TunnelRefused(remote, reason):
-                self._recorder.happened(
-                    "tunnel refused", reason, severity=Severity.WARNING, decision="deny", host=remote
-                )
-            case TunnelsReported(taken, rows):
-                self._reported(rows)
-                self._taken_number = taken
-                self._wake.set()
-
-    async def _certify(self, request: bytes) -> None:
-        link = self._link
-        while link is self._link:
-            try:
-                made = await self._authority.issue(request, APPLIANCE_NAME, _APPLIANCE_DAYS)
-            except AuthorityError as error:
-                _log.warning("charon waits for its certificate", reason=str(error))
-                await asyncio.sleep(_AGAIN_SECONDS)
-                continue
-            self._certificate = made.certificate
-            self._dirty.set()
-            return
-
-    async def _state(self) -> None:
-        enclosed = self._enclosed
-        link, certificate = self._link, self._certificate
-        if link is None or certificate is None or enclosed is None or enclosed.esp is None:
-            return
-        authority = await self._authority.certificate()
-        revocations = await self._authority.revocations(list(self._revoked))
-        now = time.time()
-        hosts = [
-            TunnelHost(row.name, row.address, row.serial) for row in self._admitted() if row.expires > now
-        ]
-        self._number += 1
-        message = TunnelsStated(
-            self._number, enclosed.esp, self.own_address, authority, certificate, revocations, hosts
-        )
-        try:
-            link.send(message)
-        except ChannelClosedError:
-            self._lost(link)
-
-    def _tunnel_changed(self, name: str, up: bool, remote: str) -> None:
-        row = self._rows.get(name)
-        if row is None:
-            return
-        if not up:
-            self._went_down(name, "closed")
-        elif name not in self._seen:
-            self._seen[name] = TunnelSeen(name, remote, 0, 0, 0)
-            self._last[name] = time.time()
-            self._recorder.happened(
-                "tunnel up",
-                f"{name} is here, from {remote}",
-                severity=Severity.NOTICE,
-                host=row.address,
-                name=name,
-                remote=remote,
-            )
-
-    def _reported(self, rows: list[TunnelSeen]) -> None:
-        now = time.time()
-        standing = {row.name: row for row in rows if row.name in self._rows}
-        for name in set(self._seen) - set(standing):
-            self._went_down(name, "gone")
-        for name, row in standing.items():
-            self._tunnel_changed(name, True, row.remote)
-            if row.bytes_in > self._seen[name].bytes_in:
-                self._last[name] = now
-            self._seen[name] = row
-
-    def _went_down(self, name: str, reason: str) -> None:
-        seen = self._seen.pop(name, None)
-        if seen is None:
-            return
+            self._table.declared.reload()
+        except DeclaredHostsError as error:
+            raise HostRefusedError(f"{error}; what was declared before holds") from error
+        after = {row.name for row in self._table.admitted()}
+        self._table.changed()
+        taken = 0
+        if before != after:
+            taken = self.changed()
+            self._tunnels.state_anew()
+        for name in sorted(before - after):
+            address = ipaddress.ip_address(self._table.rows[name].address)
+            taken += self.expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
+        divergence = [f"{row['name']}: {row['divergence']}" for row in self._view.rows() if row["divergence"]]
         self._recorder.happened(
-            "tunnel down",
-            f"the tunnel of {name} is down: {reason}",
+            "hosts reloaded",
+            f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
             severity=Severity.NOTICE,
-            host=self._rows[name].address,
-            name=name,
-            remote=seen.remote,
+            opened=sorted(after - before),
+            closed=sorted(before - after),
+            taken_back=taken,
+            divergence=divergence,
+            who=who,
         )
+        await self.start()
+        return {
+            "revision": self._table.revision,
+            "declared": sorted(self._table.declared.hosts),
+            "opened": sorted(after - before),
+            "closed": sorted(before - after),
+            "divergence": divergence,
+        }
+
+    async def kit(self, name: str) -> dict[str, Any]:
+        """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
+        self._table.enrolled_row(name)
+        return await self._kit(name, None)
+
+    async def tell_ports(
+        self,
+        name: str,
+        state: str,
+        opened: list[int],
+        *,
+        checked: float,
+        who: str,
+        expected: int | None = None,
+    ) -> dict[str, Any]:
+        """What somebody saw of a machine's ports from outside. Raises as `add`."""
+        self._table.require(expected)
+        key = self._known_machine(name)
+        now = time.time()
+        if checked > now + _CLOCKS_DIFFER:
+            raise HostRefusedError("the moment of the check is more than a day ahead")
+        row = PortsRow(key, state, sorted(set(opened))[:100], min(checked, now), who)
+        self._table.keep_ports(row)
+        self._recorder.happened(
+            "ports checked",
+            f"the ROS ports of {key} are {state}" + (f": {row.open}" if row.open else ""),
+            severity=Severity.WARNING if state == "open" else Severity.NOTICE,
+            name=key,
+            state=state,
+            open=row.open,
+            checked=row.checked,
+            who=who,
+        )
+        await self._store.settled()
+        return {"revision": self._table.revision, "name": key, "ports": self._view.ports(key)}
+
+    async def revocations(self) -> dict[str, Any]:
+        """The authority's certificate and its list of revoked certificates, in PEM."""
+        try:
+            authority = await self._authority.certificate()
+            listed = await self._authority.revocations(list(self._table.revoked))
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=True) from error
+        return {"authority": authority.decode(), "revocations": listed.decode()}
+
+    # --- what hosts do ---
+
+    async def enrol(self, token: str, request: str, peer: str) -> dict[str, Any]:
+        """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
+        async with self._changing:
+            try:
+                awaited = self._awaited.take(token)
+            except BadEnrolmentTokenError as error:
+                self._recorder.happened(
+                    "enrolment refused", str(error), severity=Severity.WARNING, decision="deny", host=peer
+                )
+                raise HostForbiddenError(str(error)) from error
+            name = awaited.name
+            try:
+                await self._tunnels.open()
+                with self._unless_revoked(name):
+                    made = await self._issue(name, request, awaited.days)
+            except HostForbiddenError:
+                raise
+            except HostRefusedError:
+                self._awaited.give_back(awaited)
+                raise
+            self._enrolled(name, awaited.address, made, awaited.who, token=awaited.id, peer=peer)
+            return {**await self._finish(name), "kit": awaited.kit}
+
+    async def renew_itself(self, name: str, request: str, proof: bytes, peer: str) -> dict[str, Any]:
+        """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
+        async with self._changing:
+            row = self._in_its_tunnel(name, peer)
+            certificate = self._table.certificates.get(name)
+            if certificate is None or not certificate.certificate:
+                raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+            life = row.expires - certificate.made
+            self._require_patience(name, life)
+            with self._unless_revoked(name):
+                made = await self._issue(
+                    name, request, life / 86_400, proof=proof, former=certificate.certificate.encode()
+                )
+            self._table.keep_next(name, made)
+            self._renewals[name] = time.monotonic()
+            await self._store.settled()
+            authority = await self._certificate_of_authority()
+            return {
+                "name": name,
+                "serial": made.serial,
+                "expires": made.expires,
+                "certificate": made.certificate.decode(),
+                "authority": authority.decode(),
+            }
+
+    async def renewed(self, name: str, peer: str) -> dict[str, Any]:
+        """A host has put its next certificate in place. Raises `HostRefusedError`."""
+        before = self._in_its_tunnel(name, peer).serial
+        row = self._table.take_next(name)
+        if row is None:
+            raise HostRefusedError(f"{name} was given no certificate that is to follow: renew first")
+        self._renewed(name, before, row.serial, row.expires, name)
+        await self._store.settled()
+        asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
+        return {"name": name}
 
     # --- inside ---
 
-    def _admitted(self) -> list[HostRow]:
-        return [row for row in self._rows.values() if row.revoked is None]
-
-    def _admitted_row(self, name: str) -> HostRow:
-        row = self._rows.get(name)
-        if row is None or row.revoked is not None:
-            known = ", ".join(one.name for one in self._admitted()) or "none"
-            raise HostRefusedError(f"no host {name[:80]!r} is enrolled; enrolled are: {known}")
-        return row
-
-    def _require_name(self, name: str) -> None:
-        if not _NAME.fullmatch(name) or name == APPLIANCE_NAME:
+    def _require_not_enrolled(self, name: str) -> None:
+        row = self._table.rows.get(name)
+        if row is not None and row.revoked is None:
             raise HostRefusedError(
-                f"{name[:80]!r} is no name for a host: letters, digits and . _ -, beginning and ending with a"
-                f" letter or digit, at most 63, and not {APPLIANCE_NAME}"
+                f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
             )
 
-    def _address_for(self, name: str, wanted: str | None) -> str:
-        declared = self._declared()[0].get(name)
-        before = self._rows.get(name)
-        kept = before.address if before else declared.address if declared else None
-        if wanted is None and kept is not None:
-            wanted = kept
-        taken = {row.address: row.name for row in self._rows.values() if row.name != name}
-        if wanted is None:
-            reserved = {one.address for one in self._declared()[0].values()}
-            for one in list(self._pool.hosts())[1:]:
-                if str(one) not in taken and str(one) not in reserved:
-                    return str(one)
-            raise HostRefusedError(f"every address of {self._pool} is a host's: take a larger ipsec.pool")
-        try:
-            address = ipaddress.IPv4Address(wanted)
-        except ValueError:
-            raise HostRefusedError(f"{wanted[:80]!r} is no IPv4 address") from None
-        if address not in self._pool or str(address) == self.own_address:
-            raise HostRefusedError(f"{address} is not an address of a host in {self._pool}")
-        if str(address) in taken:
-            raise HostRefusedError(f"{address} is the address of {taken[str(address)]}")
-        return str(address)
+    def _in_its_tunnel(self, name: str, peer: str) -> HostRow:
+        address = ipaddress.ip_address(peer)
+        mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+        row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
+        if row is None or row.name != name or not self._table.declared.wants(name):
+            self._recorder.happened(
+                "renewal refused",
+                f"not in the tunnel of {name[:80]}",
+                severity=Severity.WARNING,
+                decision="deny",
+                host=peer,
+            )
+            raise HostForbiddenError(f"{peer} is not the address of {name} in its tunnel")
+        return row
 
-    async def _issue(self, name: str, request: str, days: float) -> CertificateMade:
+    def _require_patience(self, name: str, life: float) -> None:
+        wait = min(_RENEWALS_SECONDS, life / 10)
+        since = time.monotonic() - self._renewals.get(name, -wait)
+        if since < wait:
+            raise HostRefusedError(f"{name} renewed {since:.0f} s ago: again in {wait - since:.0f} s")
+
+    @contextlib.contextmanager
+    def _unless_revoked(self, name: str) -> Iterator[None]:
+        """What a block awaits comes to nothing when the name is revoked meanwhile."""
+        before = self._revocations[name]
+        yield
+        if self._revocations[name] != before:
+            raise HostForbiddenError(f"{name} was revoked meanwhile")
+
+    async def _issue(
+        self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
         try:
-            return await self._authority.issue(request.encode(), name, days)
+            return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
-    def _revoke_serial(self, serial: str) -> None:
-        now = time.time()
-        self._revoked.append((serial, now))
-        self._store.save_revoked_certificate(serial, now)
+    def _enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
+        self._awaited.forget(name)
+        self._keep(name, address, made)
+        self._recorder.happened(
+            "host enrolled",
+            f"{name} may come through its tunnel as {address}",
+            severity=Severity.NOTICE,
+            name=name,
+            address=address,
+            serial=made.serial,
+            expires=made.expires,
+            who=who,
+            **more,
+        )
 
-    def _keep(self, row: HostRow) -> int:
-        self._rows[row.name] = row
-        self._store.save_host(row)
-        self._dirty.set()
-        return self.changed()
+    def _renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
+        self._recorder.happened(
+            "host renewed",
+            f"{name} has a new certificate; its tunnel comes back with it",
+            severity=Severity.NOTICE,
+            name=name,
+            serial=serial,
+            replaced=before,
+            expires=expires,
+            who=who,
+        )
 
-    async def _finish(self, name: str, made: CertificateMade) -> dict[str, Any]:
+    async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> dict[str, Any]:
+        self._table.changed()
+        self._recorder.happened(
+            "host awaited no longer",
+            f"the one-time token {awaited.id} of {awaited.name} was revoked",
+            severity=Severity.NOTICE,
+            name=awaited.name,
+            id=awaited.id,
+            who=who,
+        )
         await self._store.settled()
-        row = self._rows[name]
-        try:
-            authority = await self._authority.certificate()
-        except AuthorityError as error:
-            raise HostRefusedError(f"{error}; then `rosrv host kit {name}`", ours=True) from error
-        taken = await self._until_taken()
         return {
+            "revision": self._table.revision,
+            "name": awaited.name,
+            "address": awaited.address,
+            "serial": "",
+            "taken_back": 0,
+        }
+
+    def _keep(self, name: str, address: str, made: CertificateMade) -> None:
+        self._table.keep(name, address, made)
+        self._tunnels.state_anew()
+        self.changed()
+
+    async def _finish(self, name: str) -> dict[str, Any]:
+        await self._store.settled()
+        taken = await self._tunnels.until_taken()
+        return await self._kit(
+            name, None if taken else "charon does not know it yet; `rosrv status` and the log say why"
+        )
+
+    async def _kit(self, name: str, warning: str | None) -> dict[str, Any]:
+        authority = await self._certificate_of_authority()
+        row, certificate = self._table.rows[name], self._table.certificates.get(name)
+        if certificate is None or not certificate.certificate:
+            raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+        return {
+            **self._places(),
+            "revision": self._table.revision,
             "name": name,
             "address": row.address,
-            "warning": None if taken else "charon does not know it yet; `rosrv status` and the log say why",
-            "appliance": self.own_address,
-            "master": f"http://{self.own_address}:{self._listen[1]}",
-            "serial": made.serial,
-            "expires": made.expires,
-            "certificate": made.certificate.decode(),
-            "authority": authority.decode(),
-        }
-
-    async def _until_taken(self) -> bool:
-        """Wait until charon has what was stated after now; False when it does not come in time."""
-        wanted = self._number + 1
-        deadline = time.monotonic() + _TAKEN_SECONDS
-        while self._taken_number < wanted:
-            self._wake.clear()
-            try:
-                await asyncio.wait_for(self._wake.wait(), deadline - time.monotonic())
-            except TimeoutError:
-                return False
-        return True
-
-    def _row(self, row: HostRow, declared: dict[str, DeclaredHost]) -> dict[str, Any]:
-        now, seen = time.time(), self._seen.get(row.name)
-        if row.revoked is not None:
-            state = "revoked"
-        elif row.expires <= now:
-            state = "expired"
-        else:
-            state = "up" if seen else "down"
-        return {
-            "name": row.name,
-            "address": row.address,
-            "state": state,
-            "declared": row.name in declared,
+            "warning": warning,
             "serial": row.serial,
             "expires": row.expires,
-            "enrolled": row.enrolled,
-            "revoked": row.revoked,
-            "remote": seen.remote if seen else None,
-            "seconds": seen.seconds if seen else None,
-            "bytes_in": seen.bytes_in if seen else None,
-            "bytes_out": seen.bytes_out if seen else None,
-            "last_seen": self._last.get(row.name),
+            "certificate": certificate.certificate,
+            "authority": authority.decode(),
+            "authority_fingerprint": _fingerprint(authority),
         }
 
-    def _troubles(self) -> list[str]:
-        now, found = time.time(), []
-        if self._admitted() and not self.addresses:
-            reason = self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
-            found.append(f"enrolled hosts stay outside: {reason}")
-        for row in self._admitted():
-            left = row.expires - now
-            if left <= 0:
-                found.append(f"the certificate of {row.name} has ended: rosrv host kit {row.name}")
-            elif left < _SOON_SECONDS:
-                days = int(left // 86_400)
-                found.append(f"the certificate of {row.name} ends in {days} days: rosrv host kit {row.name}")
-        return found
+    def _places(self) -> dict[str, Any]:
+        own, rest = self._table.own_address, self._rest
+        return {
+            "appliance": own,
+            "master": f"http://{own}:{self._master_port}",
+            "rest_port": rest.port,
+            "rest_trouble": rest.trouble,
+            "rest_url": f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
+            "pin": self._pin,
+        }
 
-    def _declared(self) -> tuple[dict[str, DeclaredHost], str]:
+    async def _certificate_of_authority(self) -> bytes:
         try:
-            return read_declared(self._declared_file), ""
-        except DeclaredHostsError as error:
-            return {}, str(error)
+            return await self._authority.certificate()
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=True) from error
+
+    def _known_machine(self, name: str) -> str:
+        if name in self._table.rows or name in self._table.declared.hosts:
+            return name
+        try:
+            address = str(ipaddress.ip_address(name))
+        except ValueError:
+            self._table.enrolled_row(name)  # says which there are
+            raise
+        row = self._table.at(address)
+        return row.name if row is not None else address
+
+    def _machines(self) -> dict[str, int]:
+        pool = self._table.pool
+        return {
+            address: nodes
+            for address, nodes in self.machines().items()
+            if not (one := ipaddress.ip_address(address)).is_loopback and one not in pool
+        }
+
+    def _each_hour(self) -> None:
+        """Certificates that follow ended ones count; those that end soon are recorded, once each."""
+        now = time.time()
+        for row in self._table.enrolled():
+            if row.expires <= now:
+                self._table.take_next(row.name)
+        for row in self._table.enrolled():
+            if soon(self._table, row, now) and row.serial not in self._warned:
+                self._warned.add(row.serial)
+                self._recorder.happened(
+                    "certificate ends soon" if row.expires > now else "certificate ended",
+                    f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
+                    severity=Severity.WARNING,
+                    name=row.name,
+                    serial=row.serial,
+                    expires=row.expires,
+                )
 
 
-_NOBODY: dict[str, Any] = {
-    "serial": None,
-    "expires": None,
-    "enrolled": None,
-    "revoked": None,
-    "remote": None,
-    "seconds": None,
-    "bytes_in": None,
-    "bytes_out": None,
-    "last_seen": None,
-}
+_OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")
+
+
+def _fingerprint(certificate: bytes) -> str:
+    """SHA-256 of a certificate (PEM), in hexadecimal."""
+    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()

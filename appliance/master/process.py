@@ -24,8 +24,10 @@ from appliance.master.allocation import TOPIC, Allocation
 from appliance.master.assembly import INNER, RVMASTER, Foundation, Parts, assemble
 from appliance.master.authority import Authority
 from appliance.master.calls import MASTER_CALLS
+from appliance.master.declared import Declared
 from appliance.master.doors import Doors
 from appliance.master.forwarded import Forwarded
+from appliance.master.host_table import HostTable
 from appliance.master.hosts import Hosts
 from appliance.master.http import listen
 from appliance.master.journal import restore
@@ -36,10 +38,12 @@ from appliance.master.policies import Policies, PolicyRefusedError
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Life
 from appliance.master.rest import RestLink
+from appliance.master.rest_place import rest_place
 from appliance.master.robot import own_address, robot_addresses
 from appliance.master.signing import Signing
 from appliance.master.specifications import SpecificationsRefusedError
 from appliance.master.tokens import Tokens
+from appliance.master.tunnels import Tunnels
 from appliance.ros.uris import node_uri
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
@@ -124,9 +128,7 @@ class _Control:
             store,
             recorder,
             on_fault=self._settings.on_fault,
-            allocation=Allocation(
-                self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)
-            ),
+            allocation=Allocation(self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)),
         )
         monitors.start(restarted=restarted)
         return Foundation(
@@ -144,16 +146,19 @@ class _Control:
 
     async def _make_hosts(self, store: StateStore, recorder: Recorder) -> Hosts:
         """Before the policy, which names them: their addresses count once clear text is kept out."""
+        table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
+        listen = self._settings.listen_address
+        self._tunnels = Tunnels(table, recorder, self._authority, listen=listen, say=self._lifeline.say)
         hosts = Hosts(
             store,
             recorder,
             self._authority,
-            pool=self._settings.ipsec.pool,
-            declared=self._settings.hosts,
-            listen=self._settings.listen_address,
-            say=self._lifeline.say,
+            table,
+            self._tunnels,
+            master_port=listen[1],
+            rest=rest_place(self._settings),
         )
-        self._lifeline.tunnels_enclosed = hosts.enclosed
+        self._lifeline.tunnels_enclosed = self._tunnels.answered
         await hosts.start()
         return hosts
 
@@ -194,6 +199,7 @@ class _Control:
             forwarded=self._forwarded.status,
         )
         self._rest = RestLink(administration, self._tokens, base.recorder)
+        self._rest.served = base.hosts.served_by
         if _ADMIN in sockets:
             self._admin = AdminServer(administration)
             await self._admin.start(sockets[_ADMIN].dup())
@@ -206,7 +212,7 @@ class _Control:
         lifeline.links["api"] = lambda _index, descriptor: self._rest.attach(
             Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
         )
-        lifeline.links["charon"] = lambda _index, descriptor: base.hosts.attach(
+        lifeline.links["charon"] = lambda _index, descriptor: self._tunnels.attach(
             Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
         )
         lifeline.links["syslog"] = lambda _index, descriptor: self._forwarded.attach(
@@ -224,7 +230,7 @@ class _Control:
             parts.master.liveness.run(),
             base.doors.visitors.sweep(),
             self._save_parameters(),
-            base.hosts.run(),
+            self._tunnels.run(),
             parts.publisher.run(parts.reconciler.ready),
         ):
             self._tasks.append(asyncio.get_running_loop().create_task(work))

@@ -5,11 +5,12 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
 1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
    nodes.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
-3. Nothing that can be asked here makes a token, and no decision of RVMaster depends on the api.
+3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
 """
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 
 import structlog
 
@@ -17,6 +18,14 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
+    HostAdd,
+    HostEnrol,
+    HostPorts,
+    HostRenew,
+    HostRenewed,
+    HostRenewItself,
+    HostsReload,
+    HostToken,
     MonitorChange,
     PolicyConfirm,
     PolicyLoad,
@@ -31,7 +40,10 @@ from appliance.master.tokens import Tokens
 _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
-_CHANGES = PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange
+_CHANGES = (
+    PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange | HostAdd | HostToken | HostEnrol
+    | HostRenew | HostRenewItself | HostRenewed | HostPorts | HostsReload
+)  # fmt: skip
 
 
 class RestLink:
@@ -45,6 +57,7 @@ class RestLink:
         self._waiting: deque[messages.RequestMade] = deque()
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
+        self.served: Callable[[str], None] = lambda pin: None  # noqa: ARG005 - set by control
         tokens.changed = self._state_tokens
 
     def attach(self, channel: Channel) -> None:
@@ -79,6 +92,8 @@ class RestLink:
                     self._worker.add_done_callback(self._workers.discard)
             case messages.RestCalled():
                 self._record(message)
+            case messages.RestServed(pin):
+                self.served(pin)
             case _:
                 channel.close()
                 self._lost(channel, f"it sent {type(message).__name__}")

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from appliance.store import hosts
 from appliance.store.database import Database
 from appliance.store.tokens import TokenRow
 
@@ -39,11 +40,6 @@ CREATE TABLE IF NOT EXISTS token (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
     created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
 ) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS host (
-    name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE, serial TEXT NOT NULL, expires REAL NOT NULL,
-    enrolled REAL NOT NULL, revoked REAL
-) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS revoked_certificate (serial TEXT PRIMARY KEY, moment REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
 
@@ -103,21 +99,6 @@ class RevisionRow:
 
 
 @dataclass(frozen=True, slots=True)
-class HostRow:
-    """An enrolled host: its virtual address, its certificate's serial number (hexadecimal) and end.
-
-    Times are seconds since the epoch; `revoked` is None while it may come. The address stays its name's.
-    """
-
-    name: str
-    address: str
-    serial: str
-    expires: float
-    enrolled: float
-    revoked: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class MonitorRevisionRow:
     """Specifications that were in force (`sources` is JSON); `loaded` is seconds since the epoch."""
 
@@ -132,7 +113,8 @@ class StateStore:
     """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
 
     def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
-        self._database = Database(directory / "state.db", _SCHEMA, failed=failed)
+        self._database = Database(directory / "state.db", _SCHEMA + hosts.SCHEMA, failed=failed)
+        self.hosts = hosts.HostTables(self._database)
 
     async def settled(self) -> None:
         """Wait until everything saved so far is in the file."""
@@ -271,27 +253,6 @@ class StateStore:
     def tokens(self) -> list[TokenRow]:
         """All tokens that were ever made, the oldest first."""
         return [TokenRow(*row) for row in self._database.query("SELECT * FROM token ORDER BY created")]
-
-    # --- hosts that come through tunnels ---
-
-    def save_host(self, row: HostRow) -> None:
-        """Keep a host, its new certificate, or that it is revoked."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO host VALUES (?, ?, ?, ?, ?, ?)",
-            (row.name, row.address, row.serial, row.expires, row.enrolled, row.revoked),
-        )
-
-    def hosts(self) -> list[HostRow]:
-        """All hosts that were ever enrolled, by name."""
-        return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
-
-    def save_revoked_certificate(self, serial: str, moment: float) -> None:
-        """Keep for good that a certificate is revoked."""
-        self._database.submit("INSERT OR IGNORE INTO revoked_certificate VALUES (?, ?)", (serial, moment))
-
-    def revoked_certificates(self) -> list[tuple[str, float]]:
-        """Serial numbers of all revoked certificates, and since when."""
-        return list(self._database.query("SELECT serial, moment FROM revoked_certificate ORDER BY moment"))
 
     # --- settings ---
 

@@ -262,7 +262,7 @@ class InNamespace(Contained):
 
     def _api_networks(self) -> tuple[str, ...]:
         # The host's own loopback arrives under the address of its end of the link.
-        return (*(ends.host for ends in self._isolation.ends.values()), *self._ports.api_networks)
+        return (*(ends.host for ends in self._isolation.ends.values()), *super()._api_networks())
 
     def route_to(self, host: str) -> str | None:
         """The host's address by which the peer reaches it; a peer in a tunnel reaches the appliance itself."""

@@ -12,6 +12,7 @@ from appliance.channel.messages.api import (
     RequestAnswered,
     RequestMade,
     RestCalled,
+    RestServed,
     TokenKept,
     TokensStated,
 )
@@ -92,6 +93,7 @@ from appliance.channel.messages.signer import (
 from appliance.channel.messages.tunnels import (
     APPLIANCE_NAME,
     CertificateNeeded,
+    CharonStarted,
     Esp,
     TunnelChanged,
     TunnelHost,
@@ -114,6 +116,7 @@ __all__ = [
     "CertificateNeeded",
     "CertificateRefused",
     "CertificateWanted",
+    "CharonStarted",
     "ClientGranted",
     "ClientRevoked",
     "ConnectionClosed",
@@ -152,6 +155,7 @@ __all__ = [
     "RequestAnswered",
     "RequestMade",
     "RestCalled",
+    "RestServed",
     "RevocationsMade",
     "RevocationsWanted",
     "RevokedCertificate",

@@ -3,6 +3,8 @@
 What it may ask is the union `RestRequest`, which has no way to make a token.
 """
 
+from typing import Annotated
+
 import msgspec
 
 from appliance.channel.admin import AdminAnswer, RestRequest
@@ -57,4 +59,10 @@ class RestCalled(Message):
     count: int = 1
 
 
-ApiLink = RequestMade | RequestAnswered | TokensStated | RestCalled
+class RestServed(Message):
+    """The api says first by what it is recognised: the pin of its key (`sha256//…`), empty in clear text."""
+
+    pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
+
+
+ApiLink = RequestMade | RequestAnswered | TokensStated | RestCalled | RestServed

@@ -43,12 +43,18 @@ class AuthorityStated(Message):
 
 
 class CertificateWanted(Message):
-    """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM)."""
+    """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM).
+
+    With `proof` it is only made when that is a signature, over the bytes of `request`, by the key of the certificate
+    `former` (PEM) of the same name, which the authority must have made.
+    """
 
     number: int
     request: bytes
     name: str
     days: float
+    proof: bytes = b""
+    former: bytes = b""
 
 
 class CertificateMade(Message):

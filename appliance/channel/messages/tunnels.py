@@ -32,6 +32,13 @@ class CertificateNeeded(Message):
     request: bytes
 
 
+class CharonStarted(Message):
+    """charon runs, in this version; `key_exchange` are the methods that it is let offer, the best first."""
+
+    version: str
+    key_exchange: list[str]
+
+
 class TunnelHost(msgspec.Struct, frozen=True):
     """A host that may come: its name, the virtual address kept for it, the serial of its certificate."""
 
@@ -85,5 +92,5 @@ class TunnelsReported(Message):
 
 
 TunnelLink = (
-    CertificateNeeded | TunnelsStated | TunnelChanged | TunnelRefused | TunnelsReported
+    CertificateNeeded | CharonStarted | TunnelsStated | TunnelChanged | TunnelRefused | TunnelsReported
 )  # fmt: skip

@@ -16,9 +16,9 @@ from appliance.ipsec.authority import (
     KEY_FILE,
     LONGEST_REQUEST,
     Authority,
-    RequestRefusedError,
 )
 from appliance.ipsec.files import SignerKeyError
+from appliance.ipsec.proof import RequestRefusedError
 
 
 def request_of(

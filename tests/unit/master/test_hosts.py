@@ -11,10 +11,15 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.ipsec import authority as ipsec
+from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.master.authority import Authority, AuthorityError
-from appliance.master.hosts import HostRefusedError, Hosts
+from appliance.master.declared import Declared
+from appliance.master.host_table import HostRefusedError, HostTable
+from appliance.master.hosts import Hosts
 from appliance.master.recorder import Recorder
+from appliance.master.rest_place import RestPlace
+from appliance.master.tunnels import Tunnels
 from appliance.policy.model import Address
 from appliance.store.state import StateStore
 
@@ -25,16 +30,21 @@ class NearAuthority(Authority):
     def __init__(self, directory: Path) -> None:
         super().__init__()
         self._near = ipsec.Authority(directory)
+        self.meanwhile: Callable[[], object] = lambda: None
 
     async def certificate(self) -> bytes:
         """Its certificate."""
         return self._near.certificate
 
-    async def issue(self, request: bytes, name: str, days: float) -> CertificateMade:
-        """A certificate, or the refusal as it comes over the link."""
+    async def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """A certificate, or the refusal as it comes over the link; `meanwhile` happens before."""
+        self.meanwhile()
+        await asyncio.sleep(0)
         try:
-            issued = self._near.issue(request, name, days)
-        except ipsec.RequestRefusedError as error:
+            issued = self._near.issue(request, name, days, proof=proof, former=former)
+        except RequestRefusedError as error:
             raise AuthorityError(str(error), refused=True) from error
         return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
 
@@ -49,15 +59,20 @@ class Bench:
         self.store = StateStore(directory, failed=pytest.fail)
         self.log = AuditLog(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
+        self.authority = NearAuthority(directory)
+        recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
+        self.tunnels = Tunnels(self.table, recorder, self.authority, listen=(listen, 11311), say=self._said)
         self.hosts = Hosts(
             self.store,
-            Recorder(self.log, strict=False, deny_when_failed=False),
-            NearAuthority(directory),
-            pool=ipaddress.IPv4Network(pool),
-            declared=self.declared,
-            listen=(listen, 11311),
-            say=self._said,
+            recorder,
+            self.authority,
+            self.table,
+            self.tunnels,
+            master_port=11311,
+            rest=RestPlace(8443, "", 8443),
         )
+        self.hosts.served_by("sha256//pin")
         self.hosts.changed = self._changed
         self.hosts.expel = self._expel
 
@@ -68,7 +83,7 @@ class Bench:
 
     def _said(self, message: Message) -> None:
         self.asked.append(message)
-        self.hosts.enclosed(self.answer)
+        self.tunnels.answered(self.answer)
 
     def _changed(self) -> int:
         self.order.append(f"policy {sorted(self.hosts.addresses)}")
@@ -81,13 +96,15 @@ class Bench:
 
 def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, dict[str, Any]]:
     """Enrol a host with a key of its own."""
-    return bench.hosts.add(name, signing_request(make_key(), name).decode(), 90, address, "tester")
+    return bench.hosts.add(
+        name, signing_request(make_key(), name).decode(), days=90, address=address, who="tester"
+    )
 
 
 @pytest.fixture(autouse=True)
 def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
     """There is none here: its answer is not awaited."""
-    monkeypatch.setattr("appliance.master.hosts._TAKEN_SECONDS", 0.0)
+    monkeypatch.setattr("appliance.master.tunnels._TAKEN_SECONDS", 0.0)
 
 
 def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: str) -> None:
@@ -108,6 +125,7 @@ def test_addresses_are_given_in_order_and_kept(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
+        await bench.hosts.reload("tester")
         assert (await add(bench, "a"))["address"] == "10.113.11.2"
         assert (await add(bench, "b"))["address"] == "10.113.11.4"
         assert (await add(bench, "laptop"))["address"] == "10.113.11.3"
@@ -139,7 +157,7 @@ def test_a_name_that_cannot_be_had_is_refused(tmp_path: Path, name: str) -> None
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match="no name for a host"):
-            await bench.hosts.add(name, "", 90, None, "tester")
+            await bench.hosts.add(name, "", days=90, who="tester")
 
     run(tmp_path, work)
 
@@ -183,7 +201,7 @@ def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path)
         body = await bench.hosts.revoke("a", "tester")
         assert bench.order == ["policy []", "expel 10.113.11.2"]
         assert body["taken_back"] == 3
-        assert [serial for serial, _moment in bench.store.revoked_certificates()] == [body["serial"]]
+        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [body["serial"]]
         with pytest.raises(HostRefusedError, match="enrolled are: none"):
             await bench.hosts.revoke("a", "tester")
 
@@ -197,9 +215,11 @@ def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
         first = await add(bench, "a")
         with pytest.raises(HostRefusedError, match="rosrv host kit a"):
             await add(bench, "a")
-        second = await bench.hosts.renew("a", signing_request(make_key(), "a").decode(), 90, "tester")
+        second = await bench.hosts.renew(
+            "a", signing_request(make_key(), "a").decode(), days=90, who="tester"
+        )
         assert second["address"] == first["address"]
-        assert [serial for serial, _moment in bench.store.revoked_certificates()] == [first["serial"]]
+        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [first["serial"]]
 
     run(tmp_path, work)
 
@@ -209,7 +229,7 @@ def test_a_bad_request_enrols_nobody(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.add("a", "rubbish", 90, None, "tester")
+            await bench.hosts.add("a", "rubbish", days=90, who="tester")
         assert bench.hosts.rows() == []
 
     run(tmp_path, work)
@@ -220,10 +240,14 @@ def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n")
+        await bench.hosts.reload("tester")
         await add(bench, "a")
         rows = {row["name"]: (row["state"], row["declared"]) for row in bench.hosts.rows()}
         assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
         bench.declared.write_text("hosts: [")
+        with pytest.raises(HostRefusedError, match="what was declared before holds"):
+            await bench.hosts.reload("tester")
+        assert [row["name"] for row in bench.hosts.rows()] == ["a", "laptop"]
         assert any("hosts.yaml" in trouble for trouble in bench.hosts.status()["troubles"])
 
     run(tmp_path, work)

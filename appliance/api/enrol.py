@@ -1,0 +1,154 @@
+"""What a host asks for itself, without a bearer token: to be enrolled, to have its certificate renewed, the lists.
+
+Invariants:
+
+1. Enrolment takes a one-time token and nothing else for who asks; a host that brings wrong ones has to wait, and
+   all hosts together may bring only so many a minute.
+2. Renewal is only for a host in its tunnel: control holds the peer's address against the virtual address of the
+   name, which the firewall lets come through IPsec alone, and the signer checks the signature of its present key.
+3. Signing requests are not parsed here.
+"""
+
+import base64
+import binascii
+import time
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Path, Request, Response
+
+from appliance.api.hosts_models import HOST_NAME, Enrolled, Enrolment, NewCertificate, Renewal
+from appliance.api.kits import Wishes, kit_of
+from appliance.api.problems import ProblemError
+from appliance.api.rates import Buckets
+from appliance.api.roles import answered
+from appliance.api.services import Services
+from appliance.channel.admin import AdminRequest, HostEnrol, HostRenewed, HostRenewItself, RevocationsWanted
+from appliance.ipsec.kit import archive, members
+
+_ALL = "all"
+_ALL_PER_MINUTE = 60
+_ITSELF = "the host itself"
+_ARCHIVE = {"application/gzip": {"schema": {"type": "string", "format": "binary"}}}
+_Responses = dict[int | str, dict[str, Any]]
+_KIT: _Responses = {
+    200: {
+        "description": "Enrolled; with `Accept: application/gzip` the kit as an archive",
+        "model": Enrolled,
+        "content": _ARCHIVE,
+    },
+    403: {"description": "The token is wrong, was used, or has ended."},
+    503: {"description": "The appliance cannot answer now."},
+}
+_TUNNEL: _Responses = {
+    403: {"description": "Not from this host's tunnel, or not signed by its key."},
+    503: {"description": "The appliance cannot answer now."},
+}
+_PEM: _Responses = {
+    200: {"description": "PEM", "content": {"application/x-pem-file": {"schema": {"type": "string"}}}},
+    503: {"description": "The appliance cannot answer now."},
+}
+OneName = Annotated[str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host")]
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
+    router = APIRouter(tags=["hosts"])
+    _add_enrolment(router, services)
+    _add_renewal(router, services)
+    return router
+
+
+def _add_enrolment(router: APIRouter, services: Services) -> None:
+    patience = _Patience(services.settings.api_limits.failures_per_minute)
+
+    @router.post("/v1/enrol", operation_id="enrol", responses=_KIT, response_class=Response)
+    async def enrol(
+        brought: Enrolment,
+        request: Request,
+        accept: Annotated[str, Header(max_length=200)] = "application/json",
+    ) -> Response:
+        """Enrol a host by its one-time token and a signing request for the key it made; no bearer token."""
+        peer = _peer(request)
+        patience.require(peer)
+        try:
+            body = await _ask(services, HostEnrol(brought.token, brought.request, peer))
+        except ProblemError as problem:
+            if problem.status == 403:
+                patience.failed(peer)
+            raise
+        kit = kit_of(body, Wishes.of(body["kit"]), None)
+        if "application/gzip" in accept:
+            return Response(archive(kit), media_type="application/gzip")
+        names = Enrolled.model_fields.keys() & body.keys()
+        files = {path: text for path, text, _mode in members(kit)}
+        enrolled = Enrolled.model_validate({name: body[name] for name in names} | {"files": files})
+        return Response(enrolled.model_dump_json(), media_type="application/json")
+
+
+def _add_renewal(router: APIRouter, services: Services) -> None:
+    @router.post("/v1/hosts/{name}/renew", operation_id="renew_host", responses=_TUNNEL)
+    async def renew(name: OneName, renewal: Renewal, request: Request) -> NewCertificate:
+        """For a host in its tunnel: a certificate for a new key, asked for by its present key."""
+        try:
+            proof = base64.b64decode(renewal.proof, validate=True)
+        except binascii.Error as error:
+            raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
+        order = HostRenewItself(name, renewal.request, proof, _peer(request))
+        body = await _ask(services, order)
+        return NewCertificate.model_validate({field: body[field] for field in NewCertificate.model_fields})
+
+    @router.post("/v1/hosts/{name}/renewed", operation_id="host_renewed", responses=_TUNNEL, status_code=204)
+    async def renewed(name: OneName, request: Request) -> None:
+        """For a host in its tunnel: the new certificate is in place; the one before ends, the tunnel comes anew."""
+        await _ask(services, HostRenewed(name, _peer(request)))
+
+    @router.get("/v1/revocations", operation_id="revocations", responses=_PEM, response_class=Response)
+    async def revocations() -> Response:
+        """The signed list of revoked certificates (CRL)."""
+        body = await _ask(services, RevocationsWanted())
+        return Response(body["revocations"], media_type="application/x-pem-file")
+
+    @router.get("/v1/authority", operation_id="authority", responses=_PEM, response_class=Response)
+    async def authority() -> Response:
+        """The certificate of the appliance's authority."""
+        body = await _ask(services, RevocationsWanted())
+        return Response(body["authority"], media_type="application/x-pem-file")
+
+
+class _Patience:
+    """How many wrong tokens are looked at: of one host, and of all."""
+
+    def __init__(self, per_minute: int) -> None:
+        self._one = Buckets(per_minute / 60, per_minute)
+        # Hosts are as many as an attacker has addresses.
+        self._all = Buckets(max(per_minute, _ALL_PER_MINUTE) / 60, max(per_minute, _ALL_PER_MINUTE), peers=1)
+
+    def require(self, peer: str) -> None:
+        """Raises `ProblemError` (429)."""
+        now = time.monotonic()
+        seconds = max(self._one.wait(peer, now), self._all.wait(_ALL, now))
+        if seconds:
+            raise ProblemError(
+                429,
+                "too-many-failures",
+                "too many wrong enrolment tokens were brought",
+                headers={"Retry-After": str(int(seconds) + 1)},
+            )
+
+    def failed(self, peer: str) -> None:
+        """A wrong token was brought."""
+        now = time.monotonic()
+        self._one.take(peer, now)
+        self._all.take(_ALL, now)
+
+
+async def _ask(services: Services, order: AdminRequest) -> dict[str, Any]:
+    answer = await services.control.ask(order, _ITSELF)
+    if not answer.ok and answer.trouble == "forbidden":
+        raise ProblemError(403, "not-recognised", answer.error)
+    return answered(answer)
+
+
+def _peer(request: Request) -> str:
+    assert request.client is not None  # noqa: S101  every peer of a TCP listener has an address
+    return request.client.host

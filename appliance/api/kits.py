@@ -1,0 +1,65 @@
+"""A host's kit out of control's answer and the wishes of whoever asked: the same over REST and on the command line."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from appliance.ipsec.enrolment import Enrolment
+from appliance.ipsec.kit import Kit, Rest
+from appliance.network.protect import parse_ports, parse_services, protection
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What goes into a kit besides certificates: where the host reaches the appliance, its ports, what stays open."""
+
+    endpoint: str
+    ports: str = "32768-60999"
+    opened: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError`, naming what is wrong."""
+        parse_ports(self.ports)
+        parse_services(self.opened)
+
+    def kept(self) -> dict[str, str]:
+        """As it is kept with a one-time token."""
+        return {"endpoint": self.endpoint, "ports": self.ports, "open": ",".join(self.opened)}
+
+    @classmethod
+    def of(cls, kept: Mapping[str, str]) -> "Wishes":
+        """What was kept."""
+        return cls(kept["endpoint"], kept["ports"], tuple(filter(None, kept["open"].split(","))))
+
+
+def kit_of(body: Mapping[str, Any], wishes: Wishes, key: str | None) -> Kit:
+    """The kit of a host that control has enrolled; `key` None: the host has it."""
+    return Kit(
+        name=body["name"],
+        address=body["address"],
+        appliance=body["appliance"],
+        endpoint=wishes.endpoint,
+        master=body["master"],
+        certificate=body["certificate"],
+        authority=body["authority"],
+        key=key,
+        protect=protection([body["appliance"]], parse_ports(wishes.ports), parse_services(wishes.opened)),
+        rest=rest_of(body),
+    )
+
+
+def enrolment_of(body: Mapping[str, Any], wishes: Wishes) -> Enrolment:
+    """How a host with a one-time token comes to its kit.
+
+    Raises `ValueError` when REST cannot be reached from other machines.
+    """
+    port, pin = body["rest_port"], body["pin"]
+    if port is None or not pin:
+        raise ValueError(body["rest_trouble"] or "REST is not there yet: try again in a second")
+    endpoint = f"[{wishes.endpoint}]" if ":" in wishes.endpoint else wishes.endpoint
+    return Enrolment(body["name"], f"https://{endpoint}:{port}", pin, body["authority_fingerprint"])
+
+
+def rest_of(body: Mapping[str, Any]) -> Rest | None:
+    """Where a host in its tunnel renews its certificate; None: it cannot."""
+    return Rest(body["rest_url"], body["pin"]) if body["rest_url"] and body["pin"] else None

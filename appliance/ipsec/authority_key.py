@@ -1,0 +1,90 @@
+"""The authority's private key: made, kept encrypted where there is a passphrase, loaded.
+
+A key that was kept in the clear is encrypted in its place when a passphrase is given; what is wrong with a key or a
+passphrase is an error that says what to do, and nothing is replaced.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+
+from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+
+Kind = Literal["ecdsa", "ed25519"]
+Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey
+SETTING, PASSPHRASE_SETTING = "ipsec.ca", "ipsec.ca_passphrase_file"
+_ENCRYPTED = b"-----BEGIN ENCRYPTED PRIVATE KEY-----"
+
+
+def make_key(kind: Kind) -> Key:
+    """A new key."""
+    return (
+        ec.generate_private_key(ec.SECP384R1()) if kind == "ecdsa" else ed25519.Ed25519PrivateKey.generate()
+    )
+
+
+def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
+    """Keep a key, for its owner only."""
+    encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
+    write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption), 0o600)
+
+
+def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
+    """The kept key, which must be of this kind. Raises `SignerKeyError`, `OSError`."""
+    if not path.exists():
+        raise SignerKeyError(
+            f"{path}: missing, but its certificate is there; restore it from a backup, or remove"
+            f" {certificate_file} to begin with a new authority (every host enrols again)"
+        )
+    require_private(path)
+    data = path.read_bytes()
+    encrypted = data.lstrip().startswith(_ENCRYPTED)
+    key = _decoded(path, data, passphrase if encrypted else None, encrypted=encrypted)
+    found = _kind(path, key)
+    if found != kind:
+        raise SignerKeyError(
+            f"{path} is the key of an authority of the kind {found}, and {SETTING} is {kind}: set it to {found}, or"
+            f" remove {path.name} and {certificate_file} to begin with a new authority (every host enrols again)"
+        )
+    if passphrase is not None and not encrypted:
+        write_key(path, key, passphrase)
+    return key
+
+
+def _decoded(path: Path, data: bytes, passphrase: bytes | None, *, encrypted: bool) -> Key:
+    if encrypted and passphrase is None:
+        raise SignerKeyError(
+            f"{path} is encrypted: name the file that has its passphrase by {PASSPHRASE_SETTING} or"
+            " ROSRV_CA_PASSPHRASE_FILE"
+        )
+    try:
+        key = load_pem_private_key(data, password=passphrase)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        if encrypted:
+            raise SignerKeyError(
+                f"{path} cannot be decrypted: the passphrase is wrong, or the file is damaged; correct the file that"
+                f" {PASSPHRASE_SETTING} names, or restore the key from a backup"
+            ) from error
+        raise SignerKeyError(
+            f"{path}: not a private key in PEM: {error}; restore it from a backup"
+        ) from error
+    if not isinstance(key, Key):
+        raise SignerKeyError(f"{path}: neither an ECDSA key nor an Ed25519 key; restore it from a backup")
+    return key
+
+
+def _kind(path: Path, key: Key) -> Kind:
+    if isinstance(key, ed25519.Ed25519PrivateKey):
+        return "ed25519"
+    if not isinstance(key.curve, ec.SECP384R1):
+        raise SignerKeyError(f"{path}: an ECDSA key, but not on P-384; restore it from a backup")
+    return "ecdsa"

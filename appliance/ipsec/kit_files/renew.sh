@@ -1,0 +1,62 @@
+#!/bin/sh
+# Renews the certificate of @name@ through the tunnel when a third of its life is left, and gets the list of revoked
+# certificates anew. Run daily by rosrv-renew.timer (or keep.sh, where there is no systemd). --now: whatever is left.
+set -eu
+
+rest="@rest@"
+pin="@pin@"
+swanctl=${SWANCTL_DIR:-/etc/swanctl}
+[ -n "$rest" ] || { echo "renew.sh: the appliance's REST cannot be reached through the tunnel: rosrv host kit @name@" >&2; exit 2; }
+
+die() { echo "renew.sh: $*" >&2; exit 1; }
+field() { sed -n 's/.*"'"$1"'":"\([^"]*\)".*/\1/p' "$2"; }
+call() { curl --silent --show-error --max-time 30 --insecure --pinnedpubkey "$pin" "$@"; }
+
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+umask 077
+
+if call --fail -o "$work/crl.pem" "$rest/v1/revocations" && openssl crl -in "$work/crl.pem" -noout \
+    -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>/dev/null; then
+    install -D -m 0644 "$work/crl.pem" "$swanctl/x509crl/rosrv-crl.pem"
+fi
+
+# What was left in the middle: a certificate that is in place and was not confirmed.
+confirm() {
+    status=$(call -o "$work/answer" -w '%{http_code}' -X POST "$rest/v1/hosts/@name@/renewed") || die "no answer from $rest"
+    case $status in
+        204) rm -f "$swanctl/private/rosrv.key.unconfirmed"; echo "renew.sh: the new certificate is in force" ;;
+        422) rm -f "$swanctl/private/rosrv.key.unconfirmed" ;;
+        *) die "the appliance did not take the new certificate ($status): $(cat "$work/answer")" ;;
+    esac
+}
+if [ -e "$swanctl/private/rosrv.key.unconfirmed" ]; then confirm; fi
+
+seconds() { date -u -d "$(openssl x509 -in "$swanctl/x509/rosrv.pem" -noout "$1" | cut -d= -f2)" +%s; }
+begin=$(seconds -startdate)
+end=$(seconds -enddate)
+left=$((end - $(date -u +%s)))
+if [ "${1-}" != --now ] && [ $((left * 3)) -gt $((end - begin)) ]; then
+    echo "renew.sh: nothing to do, the certificate is good for another $((left / 86400)) days"
+    exit 0
+fi
+
+openssl ecparam -name secp384r1 -genkey -noout -out "$work/new.key"
+openssl req -new -key "$work/new.key" -subj "/CN=@name@" -out "$work/new.csr"
+digest="-digest sha384"
+if openssl pkey -in "$swanctl/private/rosrv.key" -noout -text | head -1 | grep -qi ed25519; then digest=""; fi
+openssl pkeyutl -sign -rawin $digest -inkey "$swanctl/private/rosrv.key" -in "$work/new.csr" -out "$work/proof"
+printf '{"request":"%s","proof":"%s"}' "$(awk '{printf "%s\\n", $0}' "$work/new.csr")" \
+    "$(openssl base64 -A -in "$work/proof")" > "$work/body"
+status=$(call -o "$work/answer" -w '%{http_code}' -H 'Content-Type: application/json' --data-binary @"$work/body" \
+    "$rest/v1/hosts/@name@/renew") || die "no answer from $rest (is the tunnel up? swanctl --list-sas)"
+[ "$status" = 200 ] || die "the appliance refused ($status): $(cat "$work/answer")"
+printf '%b' "$(field certificate "$work/answer")" > "$work/new.pem"
+openssl verify -CAfile "$swanctl/x509ca/rosrv-ca.pem" "$work/new.pem" >/dev/null || die "what the appliance answered is not a certificate of its authority"
+
+install -m 0600 "$swanctl/private/rosrv.key" "$swanctl/private/rosrv.key.unconfirmed"
+install -m 0600 "$work/new.key" "$swanctl/private/rosrv.key"
+install -m 0644 "$work/new.pem" "$swanctl/x509/rosrv.pem"
+swanctl --load-creds --clear --noprompt ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
+swanctl --load-conns ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
+confirm

@@ -1,0 +1,54 @@
+"""Whether a signing request was made by whoever has a certificate already. No I/O."""
+
+import datetime
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.x509.oid import NameOID
+
+LONGEST_PROOF = 1024  # bytes
+
+
+class RequestRefusedError(Exception):
+    """No certificate is made; the message says why."""
+
+
+def require_proof(
+    request: bytes,
+    proof: bytes,
+    former: bytes,
+    *,
+    name: str,
+    authority: x509.Certificate,
+    now: datetime.datetime,
+) -> None:
+    """Raise `RequestRefusedError` unless the key of `former` (PEM) signed the bytes of the request.
+
+    `former` must be a certificate of the authority in this name that has not ended. ECDSA signs with SHA-384.
+    """
+    try:
+        certificate = x509.load_pem_x509_certificate(former)
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature) as error:
+        raise RequestRefusedError("the present certificate is not one of this authority") from error
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    if [one.value for one in names] != [name]:
+        raise RequestRefusedError("the present certificate is in another name")
+    if certificate.not_valid_after_utc <= now:
+        raise RequestRefusedError("the present certificate has ended: only a new kit helps (rosrv host kit)")
+    key = certificate.public_key()
+    try:
+        if len(proof) > LONGEST_PROOF:
+            raise InvalidSignature
+        if isinstance(key, ed25519.Ed25519PublicKey):
+            key.verify(proof, request)
+        elif isinstance(key, ec.EllipticCurvePublicKey):
+            key.verify(proof, request, ec.ECDSA(hashes.SHA384()))
+        else:
+            raise InvalidSignature
+    except InvalidSignature as error:
+        raise RequestRefusedError(
+            "the request is not signed by the key of the present certificate"
+        ) from error

@@ -1,0 +1,40 @@
+"""Where other machines and hosts in tunnels reach REST, as far as the configuration says. No I/O."""
+
+from dataclasses import dataclass
+
+from appliance.config import Settings, is_loopback
+
+
+@dataclass(frozen=True)
+class RestPlace:
+    """`port` is that for other machines; None: they cannot reach it, and `trouble` says what to do.
+
+    `inner_port` is that for hosts in their tunnels, at the appliance's own address there; None: they cannot.
+    """
+
+    port: int | None
+    trouble: str
+    inner_port: int | None
+
+
+def rest_place(settings: Settings) -> RestPlace:
+    """The place."""
+    if settings.api_address is None:
+        return RestPlace(None, "REST is off: hosts cannot enrol themselves; set `api: 0.0.0.0:8443`", None)
+    host, port = settings.api_address
+    if not settings.api_tls:
+        return RestPlace(None, "REST is in clear text (api_tls: off): hosts cannot enrol themselves", None)
+    if settings.isolation == "none":
+        return RestPlace(None, "isolation: none has no tunnels", None)
+    everywhere = settings.isolation == "netns" or host in ("0.0.0.0", "::")  # noqa: S104  compared only
+    inner = port if everywhere else None
+    if not everywhere and is_loopback(host):
+        trouble = f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
+        return RestPlace(None, trouble, inner)
+    if not settings.api_networks:
+        trouble = (
+            "only this machine may connect to REST: set `api_networks` to the network from which hosts enrol"
+            " themselves, such as [192.168.1.0/24]"
+        )
+        return RestPlace(None, trouble, inner)
+    return RestPlace(port, "", inner)
