@@ -1,0 +1,56 @@
+/** The console: the door, or the shell with the view that the address names. */
+
+import { Door } from "./door.js";
+import { html, useEffect } from "./html.js";
+import { retry, start, stop, live } from "./live.js";
+import { Nav } from "./nav.js";
+import { startNotable, stopNotable } from "./notable.js";
+import { Icon } from "./parts/icon.js";
+import { Toasts, clearToasts } from "./parts/toast.js";
+import { place } from "./router.js";
+import { session } from "./session.js";
+import { useShortcuts } from "./shortcuts.js";
+import { useStore } from "./store.js";
+import { Audit } from "./audit/view.js";
+import { GraphView } from "./graph/view.js";
+import { Hosts } from "./hosts/view.js";
+import { Monitors } from "./monitors/view.js";
+import { Now } from "./now/view.js";
+import { PolicyView } from "./policy/view.js";
+import { NotLive } from "./standing.js";
+
+const SHOWN = { now: Now, graph: GraphView, audit: Audit, policy: PolicyView, monitors: Monitors, hosts: Hosts };
+
+export function App() {
+  const { current } = useStore(session);
+  return current ? html`<${Shell} key=${current.token} />` : html`<${Door} />`;
+}
+
+function Shell() {
+  const { view } = useStore(place);
+  useEffect(() => {
+    start({ graph: view === "graph" });
+  }, [view]);
+  useEffect(() => {
+    startNotable();
+    return () => {
+      stop();
+      stopNotable();
+      clearToasts();
+    };
+  }, []);
+  useEffect(() => {
+    document.title = `${view[0].toUpperCase()}${view.slice(1)} · ROSRV`;
+    scrollTo(0, 0);
+  }, [view]);
+  const help = useShortcuts();
+  const View = SHOWN[/** @type {keyof typeof SHOWN} */ (view)];
+  const skip = (/** @type {Event} */ event) => {
+    event.preventDefault();
+    document.getElementById("main")?.focus();
+  };
+  return html`<a class="skip" href="#main" onClick=${skip}>Skip to the view</a>
+    <div class="shell"><${Nav} />
+      <main class="main" id="main" tabindex="-1"><${NotLive} /><${View} /></main></div>
+    <${Toasts} />${help}`;
+}

@@ -1,0 +1,53 @@
+/** What is searched for: the filters of `/v1/audit`, kept in the address so that a search can be sent to a colleague. */
+
+import { html, useState } from "../html.js";
+import { Field } from "../parts/field.js";
+import { Given } from "../parts/given.js";
+import { Icon } from "../parts/icon.js";
+import { go } from "../router.js";
+
+export const NAMES = ["text", "decision", "since", "until", "host", "caller_id", "resource", "category", "event", "severity", "rule"];
+const FEW = ["text", "decision", "since"];
+const SINCE = /** @type {[string, string][]} */ ([["", "Any time"], ["15m", "Last 15 minutes"], ["1h", "Last hour"], ["1d", "Last day"], ["1w", "Last week"]]);
+const DECISIONS = /** @type {[string, string][]} */ ([["", "Any decision"], ["deny", "Deny"], ["would deny", "Would deny"], ["allow", "Allow"]]);
+const SEVERITIES = /** @type {[string, string][]} */ ([["", "Any"], ["debug", "Debug and up"], ["info", "Info and up"], ["notice", "Notice and up"], ["warning", "Warning and up"], ["alarm", "Alarm"]]);
+const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule" };
+
+/** @param {URLSearchParams} query @returns {Record<string, string>} those that are set */
+export function filterOf(query) {
+  return Object.fromEntries(NAMES.map((name) => [name, query.get(name) ?? ""]).filter(([, value]) => value));
+}
+
+/** @param {Record<string, string>} filter @param {string} [record] */
+export function auditPath(filter, record = "") {
+  const words = new URLSearchParams(filter).toString();
+  return `/console/audit${record ? `/${record}` : ""}${words ? `?${words}` : ""}`;
+}
+
+/** @param {{filter: Record<string, string>, record: string}} given */
+export function Filters({ filter, record }) {
+  const [more, setMore] = useState(NAMES.some((name) => filter[name] && !FEW.includes(name)));
+  const set = (/** @type {string} */ name) => (/** @type {string} */ value) => {
+    const next = { ...filter, [name]: value };
+    if (!value) delete next[name];
+    go(auditPath(next, record), { replace: true });
+  };
+  const field = (/** @type {string} */ name, /** @type {any} */ extra) => html`<${Field} label=${LABELS[/** @type {keyof typeof LABELS} */ (name)]} value=${filter[name] ?? ""} set=${set(name)} ...${extra} />`;
+  const custom = filter.since && !SINCE.some(([word]) => word === filter.since) ? /** @type {[string, string][]} */ ([[filter.since, filter.since]]) : [];
+  return html`<div class="filters" role="search" aria-label="Audit log">
+    <div class="filters-few">
+      <div class="filters-text"><${Icon} name="search" size=${16} /><input class="input" type="search" data-search placeholder="Search in names, reasons and details" aria-label="Text" value=${filter.text ?? ""} onInput=${(/** @type {any} */ event) => set("text")(event.target.value)} /></div>
+      <select class="input" aria-label="Decision" value=${filter.decision ?? ""} onInput=${(/** @type {any} */ event) => set("decision")(event.target.value)}>${DECISIONS.map(([word, shown]) => html`<option value=${word} selected=${word === (filter.decision ?? "")}>${shown}</option>`)}</select>
+      <select class="input" aria-label="Since" value=${filter.since ?? ""} onInput=${(/** @type {any} */ event) => set("since")(event.target.value)}>${[...SINCE, ...custom].map(([word, shown]) => html`<option value=${word} selected=${word === (filter.since ?? "")}>${shown}</option>`)}</select>
+      <button class="button" aria-expanded=${String(more)} onClick=${() => setMore(!more)}><${Icon} name="filter" size=${16} />Filters</button>
+    </div>
+    ${more && html`<div class="form-grid">
+      ${field("host", { placeholder: "10.0.0.*", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
+      ${field("rule", { placeholder: "Publishers, or a key", mono: true })}${field("category", { placeholder: "publish, command, monitor" })}${field("event", { placeholder: "decision, message dropped" })}
+      ${field("severity", { options: SEVERITIES })}${field("until", { placeholder: "10m, or 2026-11-20T08:00", mono: true })}
+    </div>`}
+    ${Object.keys(filter).some((name) => !FEW.includes(name)) && html`<div class="row">${Object.entries(filter).filter(([name]) => !FEW.includes(name)).map(([name, value]) => html`<button key=${name} class="chip" onClick=${() => set(name)("")} aria-label=${`Remove the filter ${name}`}>
+      <span class="muted">${LABELS[/** @type {keyof typeof LABELS} */ (name)]}</span> <${Given} value=${value} most=${40} /><${Icon} name="close" size=${12} /></button>`)}
+      <button class="link small" onClick=${() => go(auditPath({}, record), { replace: true })}>Clear all</button></div>`}
+  </div>`;
+}

@@ -1,0 +1,56 @@
+/** The proof that the log is whole, and the log as a file. */
+
+import { html, useState } from "../html.js";
+import { count } from "../numbers.js";
+import { Button } from "../parts/button.js";
+import { Dialog } from "../parts/dialog.js";
+import { Given } from "../parts/given.js";
+import { Icon } from "../parts/icon.js";
+import { Failure, Notice } from "../parts/notice.js";
+import { failed } from "../parts/toast.js";
+import { get, queryText, send } from "../rest.js";
+
+export function Verify() {
+  const [shown, setShown] = useState(/** @type {{value?: any, error?: unknown} | null} */ (null));
+  const run = async () => {
+    try {
+      setShown({ value: await get("/v1/audit/verify") });
+    } catch (error) {
+      setShown({ error });
+    }
+  };
+  return html`<${Button} role="operator" onClick=${run}><${Icon} name="check" size=${16} />Verify</${Button}>
+    ${shown && html`<${Dialog} title="Is the log complete and unchanged?" close=${() => setShown(null)}>${shown.error ? html`<${Failure} error=${shown.error} />` : html`<${Verdict} value=${shown.value} />`}</${Dialog}>`}`;
+}
+
+function Verdict(/** @type {{value: any}} */ { value }) {
+  return html`${value.ok ? html`<${Notice} tone="allow" title="The chain is whole">Each of the ${count(value.records)} records is as it was written, and every signature holds.</${Notice}>`
+    : html`<${Notice} tone="deny" title="The log is not whole">Keep a copy of it now, and look at what was found below.</${Notice}>`}
+    <dl class="facts"><dt>Log</dt><dd><${Given} value=${value.log} mono /></dd><dt>Records</dt><dd>${count(value.first)} to ${count(value.last)}${value.removed ? `, ${count(value.removed)} removed by retention` : ""}</dd>
+      <dt>Checkpoints</dt><dd>${count(value.checkpoints)}, signed ${count(value.signed_checkpoints)}, the last one through record ${count(value.signed_through)}</dd><dt>Not sealed yet</dt><dd>${count(value.unsealed)}</dd><dt>Key</dt><dd><${Given} value=${value.key} mono /></dd></dl>
+    ${value.findings.length > 0 && html`<ul class="stack-tight">${value.findings.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}><${Notice} tone="deny" title=${`${one.kind}: ${one.first}${one.last === one.first ? "" : ` to ${one.last}`}`}><${Given} value=${one.message} most=${500} /></${Notice}></li>`)}</ul>`}
+    <p class="muted small">The signer's own memory of checkpoints is looked at by <code>rosrv audit verify</code> on the machine.</p>`;
+}
+
+/** @param {{filter: Record<string, string>}} given */
+export function Export({ filter }) {
+  const run = async () => {
+    try {
+      const response = await send("GET", `/v1/audit/export${queryText(filter)}`);
+      save(await response.blob(), `rosrv-audit-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}.ndjson`);
+    } catch (error) {
+      failed(error);
+    }
+  };
+  return html`<${Button} onClick=${run} title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
+}
+
+/** Give the reader a file. @param {Blob} blob @param {string} name */
+export function save(blob, name) {
+  const url = URL.createObjectURL(blob);
+  const link = document.createElement("a");
+  link.href = url;
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(url), 10_000);
+}

@@ -1,0 +1,67 @@
+/** One record: what was decided and why, the rule where it stands, what a monitor changed, what happened around it. */
+
+import { html, useEffect, useRef, useState } from "../html.js";
+import { Moment } from "../moments.js";
+import { Badge, Outcome } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Icon } from "../parts/icon.js";
+import { Failure, Loading } from "../parts/notice.js";
+import { useResource } from "../parts/resource.js";
+import { Rule } from "../parts/rule.js";
+import { get } from "../rest.js";
+import { go, Link } from "../router.js";
+import { plain } from "../words.js";
+import { Change } from "./change.js";
+import { Excerpt } from "./excerpt.js";
+import { auditPath } from "./filters.js";
+
+const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields"]);
+
+/** @param {{id: string, filter: Record<string, string>}} given */
+export function RecordPanel({ id, filter }) {
+  const { value, error, again } = useResource((signal) => get(`/v1/audit/${encodeURIComponent(id)}`, { neighbours: 6 }, signal), [id]);
+  const box = useRef(/** @type {HTMLElement | null} */ (null));
+  useEffect(() => {
+    if (matchMedia("(max-width: 1240px)").matches) box.current?.scrollIntoView({ block: "start" });
+  }, [id, value !== null]);
+  const close = () => go(auditPath(filter));
+  return html`<section class="panel record" aria-labelledby="record" ref=${box}>
+    <div class="panel-head"><h2 id="record">Record ${value ? value.record.sequence : ""}</h2><span class="end"><button class="button plain small" onClick=${close} aria-label="Close the record"><${Icon} name="close" size=${16} /></button></span></div>
+    ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${6} />` : html`<${Shown} shown=${value} filter=${filter} />`}</section>`;
+}
+
+function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { shown, filter }) {
+  const { record, before, after } = shown;
+  const [raw, setRaw] = useState(false);
+  const detail = Object.entries(record.detail).filter(([name]) => !SHOWN_APART.has(name));
+  return html`<div class="panel-body stack">
+    <div class="stack-tight"><div class="row"><${Outcome} record=${record} /><strong><${Given} value=${record.event} /></strong><span class="muted"><${Moment} at=${record.time} /></span></div>
+      <p class="record-reason"><${Given} value=${record.reason} most=${1000} none="no reason given" /></p></div>
+    <dl class="facts">
+      <dt>Node</dt><dd><${Given} value=${record.caller_id} mono most=${300} /></dd><dt>Host</dt><dd><${Given} value=${record.host} mono /></dd>
+      <dt>Category</dt><dd><${Given} value=${record.category} /></dd><dt>Resource</dt><dd><${Given} value=${record.resource} mono most=${300} /></dd>
+      <dt>Severity</dt><dd><${Badge} word=${record.severity} /></dd>
+      ${record.duration_us !== null && html`<dt>Decided in</dt><dd>${record.duration_us} µs</dd>`}
+      ${record.revision !== null && html`<dt>Policy</dt><dd>revision ${record.revision}</dd>`}
+      ${record.decision && html`<dt>Rule</dt><dd><${Rule} rule=${record.rule} revision=${record.revision} /></dd>`}
+    </dl>
+    ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
+    ${record.decision && record.category !== "rest" && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
+    ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
+    ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono /></dd>`)}</dl></div>`}
+    <${Around} title="Before it, by the same host or node" records=${before} filter=${filter} /><${Around} title="After it, by the same host or node" records=${after} filter=${filter} />
+    <div class="stack-tight"><div class="row"><button class="button small" aria-expanded=${String(raw)} onClick=${() => setRaw(!raw)}>${raw ? "Hide JSON" : "Show JSON"}</button><span class="muted small mono">${record.id}</span></div>
+      ${raw && html`<pre class="bytes">${plain(JSON.stringify(record, null, 2), 20_000).replaceAll("⟨LF⟩", "\n")}</pre>`}</div>
+  </div>`;
+}
+
+function Around(/** @type {{title: string, records: any[], filter: Record<string, string>}} */ { title, records, filter }) {
+  if (!records.length) return null;
+  return html`<div><h3>${title}</h3><ul class="around">${records.map((one) => html`<li key=${one.id}><span class="muted nowrap"><${Link} to=${auditPath(filter, one.id)}><${Moment} at=${one.time} /></${Link}></span><${Outcome} record=${one} />
+    <span><${Given} value=${one.event === "decision" ? one.category : one.event} /> <${Given} value=${one.resource} mono most=${80} none="" /></span></li>`)}</ul></div>`;
+}
+
+function explain(/** @type {any} */ record) {
+  const words = new URLSearchParams({ tab: "explain", host: record.host ?? "", node: record.caller_id ?? "", category: record.category ?? "", resource: record.resource ?? "" });
+  return `/console/policy?${words}`;
+}

@@ -1,0 +1,66 @@
+/** Pages of records, the newest first; further ones as they are made, when they are followed. */
+
+import { useCallback, useEffect, useRef, useState } from "../html.js";
+import { follow } from "../events.js";
+import { get, queryText } from "../rest.js";
+
+const PAGE = 100;
+const KEPT = 2000;
+const PAUSE = 250; // after the last key of a search
+
+/** @param {Record<string, string>} filter @param {boolean} following */
+export function useRecords(filter, following) {
+  const key = JSON.stringify(filter);
+  const [state, setState] = useState({ records: /** @type {any[] | null} */ (null), cursor: /** @type {string | null} */ (null), error: /** @type {unknown} */ (null), loading: true });
+  const [standing, setStanding] = useState(/** @type {import("../events.js").Standing | null} */ (null));
+  const [round, setRound] = useState(0);
+  const first = useRef(true);
+
+  useEffect(() => {
+    const controller = new AbortController();
+    setState((state) => ({ ...state, loading: true }));
+    const timer = setTimeout(async () => {
+      try {
+        const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE }, controller.signal);
+        setState({ records, cursor, error: null, loading: false });
+      } catch (error) {
+        if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
+      }
+    }, first.current ? 0 : PAUSE);
+    first.current = false;
+    return () => {
+      clearTimeout(timer);
+      controller.abort();
+    };
+  }, [key, round]);
+
+  const ready = state.records !== null && !state.loading;
+  useEffect(() => {
+    if (!following || !ready) return undefined;
+    const { until, since, ...rest } = filter;
+    const newest = state.records?.[0]?.sequence;
+    const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
+      if (event === "record") setState((state) => ({ ...state, records: added(state.records ?? [], record) }));
+    }, setStanding, newest ? String(newest) : null);
+    return () => {
+      running.stop();
+      setStanding(null);
+    };
+  }, [following, ready, key]);
+
+  const older = useCallback(async () => {
+    if (!state.cursor) return;
+    try {
+      const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE, cursor: state.cursor });
+      setState((state) => ({ ...state, records: [...(state.records ?? []), ...records], cursor, error: null }));
+    } catch (error) {
+      setState((state) => ({ ...state, error }));
+    }
+  }, [key, state.cursor]);
+  return { ...state, standing, older, again: () => setRound(round + 1) };
+}
+
+function added(/** @type {any[]} */ records, /** @type {any} */ record) {
+  if (records.length && record.sequence <= records[0].sequence) return records;
+  return [record, ...records].slice(0, KEPT);
+}

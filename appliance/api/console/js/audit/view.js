@@ -1,0 +1,53 @@
+/** Audit: search the log, follow it, open one record, prove it whole, take it along. */
+
+import { html, useEffect, useState } from "../html.js";
+import { counted } from "../numbers.js";
+import { Icon } from "../parts/icon.js";
+import { Empty, Failure, Loading } from "../parts/notice.js";
+import { go, place } from "../router.js";
+import { typing } from "../shortcuts.js";
+import { useStore } from "../store.js";
+import { auditPath, filterOf, Filters } from "./filters.js";
+import { Export, Verify } from "./proof.js";
+import { RecordPanel } from "./record.js";
+import { useRecords } from "./records.js";
+import { RecordTable } from "./table.js";
+
+export function Audit() {
+  const { rest: chosen, query } = useStore(place);
+  const filter = filterOf(query);
+  const [following, setFollowing] = useState(false);
+  const { records, cursor, error, loading, standing, older, again } = useRecords(filter, following);
+  useSteps(records, chosen, filter);
+  return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${cursor ? ", more below" : ""}`}</span>
+      <div class="head-actions">
+        <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
+        <${Verify} /><${Export} filter=${filter} /></div></div>
+    <${Filters} filter=${filter} record=${chosen} />
+    ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Not following now: ${standing.reason} It is tried again by itself.</div>`}
+    <div class=${`audit-grid${chosen ? " with-record" : ""}`}>
+      <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
+        ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
+        ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${Object.keys(filter).length ? "Take a filter away, or look further back." : "The log is empty; the appliance writes to it from its start on."}</${Empty}>`
+          : html`<${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
+      </section>
+      ${chosen && html`<${RecordPanel} key=${chosen} id=${chosen} filter=${filter} />`}
+    </div>`;
+}
+
+/** j and k go through the records, Escape closes the one that is open. */
+function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
+  useEffect(() => {
+    const heard = (/** @type {KeyboardEvent} */ event) => {
+      if (typing(event) || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || !records) return;
+      if (event.key === "Escape" && chosen) go(auditPath(filter));
+      const step = { j: 1, k: -1 }[event.key];
+      if (!step) return;
+      const at = records.findIndex((one) => one.id === chosen || String(one.sequence) === chosen);
+      const next = records[at < 0 ? 0 : Math.min(records.length - 1, Math.max(0, at + step))];
+      if (next) go(auditPath(filter, next.id));
+    };
+    addEventListener("keydown", heard);
+    return () => removeEventListener("keydown", heard);
+  }, [records, chosen]);
+}

@@ -1,0 +1,96 @@
+/**
+ * Where everything stands: from left to right in the direction the messages go. What stands somewhere stays there
+ * while the graph changes a little; what is new is put beside what it belongs to.
+ */
+
+import { Graph, layout } from "/console/static/vendor/dagre.js";
+
+/** @typedef {{x: number, y: number, w: number, h: number}} Spot the middle and the size */
+
+export const SIZES = {
+  node: [180, 42], topic: [216, 38], service: [216, 38], party: [180, 42], missing: [216, 38], master: [120, 42],
+};
+const GAP = 16;
+const COLUMN = 58;
+const LITTLE = 0.25; // of what is shown may be new before all is arranged afresh
+
+/**
+ * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before
+ * @returns {Map<string, Spot>}
+ */
+export function arrange(items, lines, before) {
+  const fresh = [...items.keys()].filter((key) => !before.has(key));
+  if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, lines, before, fresh);
+  if (before.size && !fresh.length) return new Map([...items.keys()].map((key) => [key, /** @type {Spot} */ (before.get(key))]));
+  return afresh(items, lines);
+}
+
+/** All of it anew. @param {Map<string, any>} items @param {Map<string, any>} lines */
+export function afresh(items, lines) {
+  const graph = new Graph({ multigraph: false });
+  graph.setGraph({ rankdir: "LR", nodesep: GAP, ranksep: COLUMN, edgesep: 8, ranker: items.size > 150 ? "longest-path" : "tight-tree", acyclicer: "greedy" });
+  graph.setDefaultEdgeLabel(() => ({}));
+  for (const key of [...items.keys()].sort()) {
+    const [width, height] = sizeOf(items.get(key));
+    graph.setNode(key, { width, height });
+  }
+  for (const key of [...lines.keys()].sort()) {
+    const line = lines.get(key);
+    if (line.from !== line.to) graph.setEdge(line.from, line.to, { weight: line.kind === "denied" ? 1 : 2 });
+  }
+  layout(graph);
+  /** @type {Map<string, Spot>} */
+  const spots = new Map();
+  for (const key of items.keys()) {
+    const { x, y } = graph.node(key);
+    const [w, h] = sizeOf(items.get(key));
+    spots.set(key, { x, y, w, h });
+  }
+  return spots;
+}
+
+/** The new ones at the nearest free place beside what they are connected to. */
+function added(/** @type {Map<string, any>} */ items, /** @type {Map<string, any>} */ lines, /** @type {Map<string, Spot>} */ before, /** @type {string[]} */ fresh) {
+  /** @type {Map<string, Spot>} */
+  const spots = new Map();
+  for (const key of items.keys()) if (before.has(key)) spots.set(key, /** @type {Spot} */ (before.get(key)));
+  for (const key of fresh.sort()) {
+    const [w, h] = sizeOf(items.get(key));
+    const near = [];
+    for (const line of lines.values()) {
+      if (line.from === key && spots.has(line.to)) near.push({ spot: /** @type {Spot} */ (spots.get(line.to)), side: -1 });
+      if (line.to === key && spots.has(line.from)) near.push({ spot: /** @type {Spot} */ (spots.get(line.from)), side: 1 });
+    }
+    const beside = near[0];
+    const x = beside ? beside.spot.x + beside.side * ((beside.spot.w + w) / 2 + COLUMN) : w / 2;
+    const y = beside ? near.reduce((sum, one) => sum + one.spot.y, 0) / near.length : 0;
+    spots.set(key, free({ x, y, w, h }, [...spots.values()]));
+  }
+  return spots;
+}
+
+function free(/** @type {Spot} */ wanted, /** @type {Spot[]} */ taken) {
+  const step = wanted.h + GAP;
+  for (let round = 0; round < 400; round += 1) {
+    const y = wanted.y + (round % 2 ? 1 : -1) * Math.ceil(round / 2) * step;
+    const spot = { ...wanted, y };
+    if (!taken.some((one) => Math.abs(one.x - spot.x) < (one.w + spot.w) / 2 + 6 && Math.abs(one.y - y) < (one.h + spot.h) / 2 + 6)) return spot;
+  }
+  return wanted;
+}
+
+function sizeOf(/** @type {any} */ item) {
+  return SIZES[/** @type {keyof typeof SIZES} */ (item.kind)];
+}
+
+/** The rectangle that holds all of them. @param {Iterable<Spot>} spots */
+export function extent(spots) {
+  let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
+  for (const { x, y, w, h } of spots) {
+    left = Math.min(left, x - w / 2);
+    right = Math.max(right, x + w / 2);
+    top = Math.min(top, y - h / 2);
+    bottom = Math.max(bottom, y + h / 2);
+  }
+  return left > right ? { x: 0, y: 0, w: 1, h: 1 } : { x: left, y: top, w: right - left, h: bottom - top };
+}

@@ -1,0 +1,190 @@
+/** The drawing: boxes for nodes, topics and services, lines for what flows, red ones for what was refused. */
+
+import { html, useEffect, useRef, useState } from "../html.js";
+import { Icon } from "../parts/icon.js";
+import { rate } from "../numbers.js";
+import { plain } from "../words.js";
+import { extent } from "./arrange.js";
+
+const MARGIN = 24;
+const CLOSEST = 2.5;
+
+/** @typedef {{x: number, y: number, zoom: number}} Look the corner of what is seen, and how large it is drawn */
+
+/** @param {{items: Map<string, any>, lines: Map<string, any>, spots: Map<string, any>, chosen: string | null, choose: (key: string | null) => void, arranged: number}} given */
+export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
+  const box = useRef(/** @type {HTMLElement | null} */ (null));
+  const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
+  const fit = () => {
+    if (box.current) setLook(fitted(extent(spots.values()), box.current));
+  };
+  useEffect(fit, [arranged, spots.size > 0]);
+  const zoom = (/** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) => setLook((now) => zoomed(now, factor, px, py));
+  const middle = (/** @type {number} */ factor) => box.current && zoom(factor, box.current.clientWidth / 2, box.current.clientHeight / 2);
+  usePanning(box, setLook, zoom);
+  const near = chosen ? neighbours(chosen, lines) : null;
+  const key = (/** @type {KeyboardEvent} */ event) => {
+    const step = { ArrowLeft: [-60, 0], ArrowRight: [60, 0], ArrowUp: [0, -60], ArrowDown: [0, 60] }[event.key];
+    if (step) setLook((now) => ({ ...now, x: now.x + step[0] / now.zoom, y: now.y + step[1] / now.zoom }));
+    else if (event.key === "+" || event.key === "=") middle(1.25);
+    else if (event.key === "-") middle(0.8);
+    else if (event.key === "0") fit();
+    else if (event.key === "Escape") choose(null);
+    else return;
+    event.preventDefault();
+  };
+  return html`<div class="drawing" ref=${box} onKeyDown=${key} data-items=${items.size}>
+    <svg role="group" aria-label="Graph of nodes and topics" onClick=${(/** @type {any} */ event) => event.target === event.currentTarget && choose(null)}>
+      <defs><${Tip} id="tip-flow" /><${Tip} id="tip-mediated" /><${Tip} id="tip-denied" /><${Tip} id="tip-would" /></defs>
+      <g transform=${`scale(${look.zoom}) translate(${-look.x} ${-look.y})`}>
+        ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} />`)}
+        ${[...items.values()].map((item) => html`<${Box} key=${item.key} item=${item} spot=${spots.get(item.key)} chosen=${chosen === item.key} faint=${near !== null && !near.has(item.key)} choose=${choose} />`)}
+      </g></svg>
+    <div class="drawing-tools">
+      <button class="button small" onClick=${() => middle(1.25)} aria-label="Closer"><${Icon} name="plus" size=${16} /></button>
+      <button class="button small" onClick=${() => middle(0.8)} aria-label="Farther"><${Icon} name="minus" size=${16} /></button>
+      <button class="button small" onClick=${fit} aria-label="Show all" title="Show all (0)"><${Icon} name="fit" size=${16} /></button>
+    </div></div>`;
+}
+
+function Tip(/** @type {{id: string}} */ { id }) {
+  return html`<marker id=${id} class=${id} viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto"><path d="M0 0.500L8 4L0 7.500z" /></marker>`;
+}
+
+function Box(/** @type {any} */ { item, spot, chosen, faint, choose }) {
+  if (!spot) return null;
+  const { x, y, w, h } = spot;
+  const words = item.kind === "topic" || item.kind === "service" || item.kind === "missing" ? 25 : 22;
+  const name = shortened(item.name, words);
+  const state = [item.kind, item.members ? "many" : "", item.mediated ? "mediated" : "", item.lost ? "lost" : "", chosen ? "chosen" : "", faint ? "faint" : ""].filter(Boolean).join(" ");
+  const said = `${item.members ? "group " : ""}${item.kind} ${plain(item.name, 120)}, ${plain(item.sub, 60)}${item.mediated ? ", mediated" : ""}${item.lost ? ", lost" : ""}`;
+  const pick = (/** @type {any} */ event) => {
+    if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    event.stopPropagation();
+    choose(item.key);
+  };
+  const round = item.kind === "node" || item.kind === "party" || item.kind === "master" ? 8 : h / 2;
+  return html`<g class=${`box ${state}`} transform=${`translate(${x - w / 2} ${y - h / 2})`} tabindex="0" role="button" aria-label=${said} data-key=${item.key} onClick=${pick} onKeyDown=${pick}>
+    ${item.members && html`<rect class="behind" x="4" y="4" width=${w} height=${h} rx=${round} />`}
+    <rect class="shape" width=${w} height=${h} rx=${round} />
+    ${item.mediated && html`<circle class="mark" cx=${14} cy=${h / 2} r="3.500" />`}
+    <text class="box-name" x=${item.mediated ? 25 : 14} y=${h / 2 - 2}>${name}</text>
+    <text class="box-sub" x=${item.mediated ? 25 : 14} y=${h / 2 + 12}>${shortened(item.sub, 28)}</text>
+    <title>${said}</title></g>`;
+}
+
+function Line(/** @type {any} */ { line, spots, chosen, near, choose }) {
+  const from = spots.get(line.from);
+  const to = spots.get(line.to);
+  if (!from || !to) return null;
+  const path = curve(from, to);
+  const own = chosen === line.key;
+  const touched = near === null || own || line.from === chosen || line.to === chosen;
+  const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
+  const shape = html`<path class=${`line ${kind}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
+  if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
+  const said = `refused: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
+  const pick = (/** @type {any} */ event) => {
+    if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    event.stopPropagation();
+    choose(line.key);
+  };
+  return html`<g class="attempt" tabindex="0" role="button" aria-label=${said} data-key=${line.key} onClick=${pick} onKeyDown=${pick}>
+    <path class="reach" d=${path} />${shape}<title>${said}</title></g>`;
+}
+
+/** From the right side of one box to the left of the other; backwards in a wide bow below. */
+function curve(/** @type {any} */ from, /** @type {any} */ to) {
+  const x1 = from.x + from.w / 2;
+  const x2 = to.x - to.w / 2 - 2;
+  if (x2 > x1 - 20) {
+    const bend = Math.max(24, (x2 - x1) / 2);
+    return `M${x1} ${from.y}C${x1 + bend} ${from.y} ${x2 - bend} ${to.y} ${x2} ${to.y}`;
+  }
+  const low = Math.max(from.y + from.h / 2, to.y + to.h / 2) + 26 + Math.abs(x1 - x2) * 0.04;
+  return `M${x1} ${from.y}C${x1 + 56} ${from.y} ${x1 + 48} ${low} ${(x1 + x2) / 2} ${low}S${x2 - 56} ${to.y} ${x2} ${to.y}`;
+}
+
+function shortened(/** @type {string} */ text, /** @type {number} */ most) {
+  const said = plain(text, 400);
+  const points = [...said];
+  if (points.length <= most) return said;
+  return `${points.slice(0, 5).join("")}…${points.slice(-(most - 6)).join("")}`;
+}
+
+function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} */ lines) {
+  const near = new Set([chosen]);
+  for (const line of lines.values()) {
+    if (line.key === chosen || line.from === chosen || line.to === chosen) {
+      near.add(line.from);
+      near.add(line.to);
+    }
+  }
+  return near;
+}
+
+function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {
+  const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
+  // Never so small that nothing can be read: then only a part is seen, and the rest by moving.
+  const readable = Math.max(zoom, box.clientWidth < 700 ? 0.5 : 0.42);
+  const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
+  return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
+}
+
+function zoomed(/** @type {Look} */ now, /** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) {
+  const zoom = Math.min(CLOSEST, Math.max(0.08, now.zoom * factor));
+  return { zoom, x: now.x + px / now.zoom - px / zoom, y: now.y + py / now.zoom - py / zoom };
+}
+
+function usePanning(/** @type {{current: HTMLElement | null}} */ box, /** @type {any} */ setLook, /** @type {(factor: number, x: number, y: number) => void} */ zoom) {
+  useEffect(() => {
+    const element = box.current;
+    if (!element) return undefined;
+    const fingers = new Map();
+    let moved = 0;
+    const down = (/** @type {PointerEvent} */ event) => {
+      if (/** @type {Element} */ (event.target).closest(".drawing-tools")) return;
+      if (!fingers.size) moved = 0;
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    };
+    const move = (/** @type {PointerEvent} */ event) => {
+      const last = fingers.get(event.pointerId);
+      if (!last) return;
+      const [dx, dy] = [event.clientX - last[0], event.clientY - last[1]];
+      moved += Math.abs(dx) + Math.abs(dy);
+      if (moved > 4 && !element.hasPointerCapture(event.pointerId)) element.setPointerCapture(event.pointerId);
+      if (fingers.size === 2) {
+        const other = [...fingers.entries()].find(([id]) => id !== event.pointerId)?.[1];
+        const apart = (/** @type {number[]} */ a, /** @type {number[]} */ b) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+        const place = element.getBoundingClientRect();
+        zoom(apart([event.clientX, event.clientY], other) / Math.max(1, apart(last, other)), (event.clientX + other[0]) / 2 - place.left, (event.clientY + other[1]) / 2 - place.top);
+      } else setLook((/** @type {Look} */ now) => ({ ...now, x: now.x - dx / now.zoom, y: now.y - dy / now.zoom }));
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    };
+    const up = (/** @type {PointerEvent} */ event) => fingers.delete(event.pointerId);
+    const click = (/** @type {MouseEvent} */ event) => {
+      if (moved > 4) event.stopPropagation();
+    };
+    const wheel = (/** @type {WheelEvent} */ event) => {
+      event.preventDefault();
+      const place = element.getBoundingClientRect();
+      zoom(Math.exp(-event.deltaY * 0.0015), event.clientX - place.left, event.clientY - place.top);
+    };
+    element.addEventListener("pointerdown", down);
+    element.addEventListener("pointermove", move);
+    element.addEventListener("pointerup", up);
+    element.addEventListener("pointercancel", up);
+    element.addEventListener("click", click, true);
+    element.addEventListener("wheel", wheel, { passive: false });
+    return () => {
+      element.removeEventListener("pointerdown", down);
+      element.removeEventListener("pointermove", move);
+      element.removeEventListener("pointerup", up);
+      element.removeEventListener("pointercancel", up);
+      element.removeEventListener("click", click, true);
+      element.removeEventListener("wheel", wheel);
+    };
+  }, []);
+}

@@ -1,0 +1,35 @@
+/** The same graph as a table: for reading, for sorting, and for whom a drawing says nothing. */
+
+import { html, useState } from "../html.js";
+import { bytes, counted, rate } from "../numbers.js";
+import { Badge } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Empty } from "../parts/notice.js";
+
+const PAGE = 100;
+
+/** @param {{topics: any[], choose: (key: string) => void, chosen: string | null}} given */
+export function TopicList({ topics, choose, chosen }) {
+  const [page, setPage] = useState(0);
+  const pages = Math.max(1, Math.ceil(topics.length / PAGE));
+  const at = Math.min(page, pages - 1);
+  if (!topics.length) return html`<${Empty} icon="graph" title="No topic">Nothing matches the search, or no node has registered one.</${Empty}>`;
+  return html`<div class="table-wrap"><table class="table"><thead><tr><th>Topic</th><th>Type</th><th>Path</th><th>Publishers</th><th>Subscribers</th><th class="number">Messages/s</th><th class="number">Volume/s</th></tr></thead>
+    <tbody>${topics.slice(at * PAGE, (at + 1) * PAGE).map((one) => html`<tr key=${one.name} class=${chosen === `t${one.name}` ? "chosen" : ""}>
+      <td><button class="link" onClick=${() => choose(`t${one.name}`)}><${Given} value=${one.name} mono most=${80} /></button></td><td><${Given} value=${one.type} most=${60} /></td>
+      <td>${one.mediated ? html`<${Badge} word="mediated" tone="note" />` : html`<${Badge} word="direct" />`}</td>
+      <td><${Names} names=${one.publishers.map((/** @type {any} */ each) => each.node)} /></td><td><${Names} names=${one.subscribers} /></td>
+      <td class="number">${rate(sum(one, "messages_per_second"))}</td><td class="number nowrap">${bytes(sum(one, "bytes_per_second"))}</td></tr>`)}</tbody></table></div>
+    ${pages > 1 && html`<div class="panel-body row"><button class="button small" disabled=${at === 0} onClick=${() => setPage(at - 1)}>Back</button>
+      <span class="muted small">${at * PAGE + 1} to ${Math.min(topics.length, (at + 1) * PAGE)} of ${counted(topics.length, "topic")}</span>
+      <button class="button small" disabled=${at === pages - 1} onClick=${() => setPage(at + 1)}>More</button></div>`}`;
+}
+
+function Names(/** @type {{names: string[]}} */ { names }) {
+  if (!names.length) return html`<span class="muted">none</span>`;
+  return html`${names.slice(0, 3).map((one) => html`<div key=${one}><${Given} value=${one} mono most=${50} /></div>`)}${names.length > 3 && html`<div class="muted small">and ${names.length - 3} more</div>`}`;
+}
+
+function sum(/** @type {any} */ topic, /** @type {string} */ field) {
+  return topic.publishers.reduce((/** @type {number} */ total, /** @type {any} */ one) => total + one[field], 0);
+}

@@ -1,0 +1,96 @@
+/**
+ * What the graph has, out of `/v1/graph` and the refusals of the audit log: items and the lines between them.
+ *
+ * Keys are a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`); a refused party that is not in the graph has
+ * `x` and its name and host. Nothing here knows where things are drawn.
+ */
+
+/**
+ * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
+ *   mediated?: boolean, lost?: boolean, row?: any}} Item
+ * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
+ *   denials?: any[], would?: boolean}} Line
+ * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
+ */
+
+export const MASTER = "m/";
+const QUIET = new Set(["/rosout", "/rosout_agg", "/clock", "/statistics", "/diagnostics"]);
+const ATTEMPTS = 60;
+
+/** @param {any} graph @param {any[]} denials @param {{services: boolean, quiet: boolean, denied: boolean}} wanted @returns {Model} */
+export function modelOf(graph, denials, wanted) {
+  /** @type {Model} */
+  const model = { items: new Map(), lines: new Map() };
+  for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: node.host, lost: node.state === "lost", row: node });
+  for (const topic of graph.topics) if (!(wanted.quiet && QUIET.has(topic.name))) topicOf(model, topic);
+  if (wanted.services) for (const service of graph.services) if (!(wanted.quiet && /\/(get_loggers|set_logger_level)$/.test(service.name))) serviceOf(model, service);
+  if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt);
+  return model;
+}
+
+/** Refusals of the same party for the same thing as one, the newest first. @param {any[]} denials */
+export function attempts(denials) {
+  const found = new Map();
+  for (const record of denials) {
+    if (!record.resource || record.category === "rest" || !(record.caller_id || record.host) || isLateWithdrawal(record)) continue;
+    const command = record.category === "command" || record.category === "parameters";
+    const key = JSON.stringify([record.host, record.caller_id, record.category, command ? "" : record.resource]);
+    const one = found.get(key);
+    if (one) one.records.push(record);
+    else if (found.size < ATTEMPTS) found.set(key, { key, command, records: [record] });
+  }
+  return [...found.values()];
+}
+
+/** A node that was replaced withdraws what it had: refused, but nobody attempted anything. */
+function isLateWithdrawal(/** @type {any} */ record) {
+  return record.rule === null && String(record.detail?.call ?? "").startsWith("unregister");
+}
+
+function topicOf(/** @type {Model} */ model, /** @type {any} */ topic) {
+  const key = `t${topic.name}`;
+  put(model, { key, kind: "topic", name: topic.name, sub: topic.type, mediated: topic.mediated, row: topic });
+  let rate = 0;
+  for (const one of topic.publishers) {
+    rate += one.messages_per_second;
+    flow(model, `n${one.node}`, key, topic.mediated, one.messages_per_second);
+  }
+  for (const name of topic.subscribers) flow(model, key, `n${name}`, topic.mediated, rate);
+}
+
+function serviceOf(/** @type {Model} */ model, /** @type {any} */ service) {
+  const key = `s${service.name}`;
+  put(model, { key, kind: "service", name: service.name, sub: "service", mediated: service.mediated, row: service });
+  flow(model, key, `n${service.node}`, service.mediated, service.messages_per_second);
+  for (const one of service.connections) flow(model, `n${one.to}`, key, service.mediated, service.messages_per_second);
+}
+
+function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt) {
+  const { host, caller_id: caller, category, resource } = attempt.records[0];
+  const known = model.items.get(`n${caller}`);
+  const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
+  const to = attempt.command ? MASTER : `${category === "offer" || category === "call" ? "s" : category === "node" ? "n" : "t"}${resource}`;
+  // What the party does have now was refused only for a moment (a call that came late): it is no attempt.
+  if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
+  if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });
+  if (!model.items.has(to)) {
+    const kind = attempt.command ? "master" : "missing";
+    put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `refused ${category}` });
+  }
+  const backwards = category === "subscribe";
+  const key = `!${attempt.key}`;
+  const line = { key, from: backwards ? to : from, to: backwards ? from : to };
+  const would = attempt.records.every((one) => one.decision === "would deny");
+  model.lines.set(key, { ...line, kind: "denied", mediated: false, rate: 0, denials: attempt.records, would });
+}
+
+function put(/** @type {Model} */ model, /** @type {Item} */ item) {
+  model.items.set(item.key, item);
+}
+
+function flow(/** @type {Model} */ model, /** @type {string} */ from, /** @type {string} */ to, /** @type {boolean} */ mediated, /** @type {number} */ rate) {
+  for (const key of [from, to]) if (!model.items.has(key)) put(model, { key, kind: "node", name: key.slice(1), sub: "not registered" });
+  const key = `${from}>${to}`;
+  const known = model.lines.get(key);
+  model.lines.set(key, { key, from, to, kind: "flow", mediated, rate: rate + (known?.rate ?? 0) });
+}

@@ -1,0 +1,110 @@
+/** Graph: who talks to whom, through the appliance or past it, and who was not let. */
+
+import { html, useMemo, useRef, useState } from "../html.js";
+import { live } from "../live.js";
+import { notable } from "../notable.js";
+import { counted } from "../numbers.js";
+import { Check } from "../parts/field.js";
+import { Empty, Loading } from "../parts/notice.js";
+import { useStore } from "../store.js";
+import { afresh, arrange } from "./arrange.js";
+import { collapse } from "./collapse.js";
+import { Details } from "./details.js";
+import { Drawing } from "./drawing.js";
+import { TopicList } from "./list.js";
+import { modelOf } from "./model.js";
+
+const MOST = 42; // things of a kind that are drawn before they are grouped
+const RECENT_HOURS = 1;
+
+export function GraphView() {
+  const graph = useStore(live, (one) => one.graph);
+  const denials = useStore(notable, (one) => one.denials);
+  const [search, setSearch] = useState("");
+  const [wanted, setWanted] = useState({ services: false, quiet: true, denied: true });
+  const [opened, setOpened] = useState(/** @type {Set<string>} */ (new Set()));
+  const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
+  const [form, setForm] = useState("drawing");
+  const [round, setRound] = useState(0);
+  const recent = useMemo(() => recentOf(denials ?? []), [denials]);
+  const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
+  const shown = useMemo(() => (model ? collapse(model, opened, MOST) : null), [model, opened]);
+  const { spots, arranged } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${opened.size}`);
+  const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(graph.nodes.length, "node")}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
+    <div class="head-actions"><div class="row" role="group" aria-label="Form">
+      ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
+  if (!graph || !shown || !model) return html`${head}<section class="panel"><${Loading} rows=${8} /></section>`;
+  const choose = (/** @type {string | null} */ key) => setChosen(key === null ? null : shownKey(key, shown));
+  const item = chosen ? shown.items.get(chosen) ?? model.items.get(chosen) : null;
+  const line = chosen ? shown.lines.get(chosen) : null;
+  const open = (/** @type {string} */ key) => {
+    setOpened(new Set([...opened, key]));
+    setChosen(null);
+  };
+  const topics = graph.topics.filter((/** @type {any} */ one) => matches(search, [one.name, one.type, ...one.publishers.map((/** @type {any} */ each) => each.node), ...one.subscribers]));
+  return html`${head}
+    <div class=${`graph-grid${item || line ? " with-details" : ""}`}>
+      <section class="panel graph-panel" aria-label="Graph">
+        <div class="panel-head"><input class="input graph-search" type="search" data-search placeholder="Search nodes, topics, types, hosts" aria-label="Search the graph" value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} />
+          <${Check} label="Refused" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
+          <${Check} label="Services" on=${wanted.services} set=${(services) => setWanted({ ...wanted, services })} />
+          <${Check} label="Without logging" on=${wanted.quiet} set=${(quiet) => setWanted({ ...wanted, quiet })} />
+          <span class="end">${opened.size > 0 && html`<button class="button small" onClick=${() => setOpened(new Set())}>Close groups</button>`}
+            ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Place everything anew">Arrange</button>`}</span></div>
+        ${form === "list" ? html`<${TopicList} topics=${topics} choose=${choose} chosen=${chosen} />`
+          : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
+          : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} /><${Legend} />`}
+      </section>
+      ${(item || line) && html`<${Details} key=${chosen} item=${item} line=${line} denials=${recent} choose=${choose} open=${open} />`}
+    </div>`;
+}
+
+function Legend() {
+  return html`<ul class="legend" aria-label="Legend">
+    <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-node" x="1" y="1" width="28" height="14" rx="4" /></svg>node</li>
+    <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-topic" x="1" y="1" width="28" height="14" rx="7" /></svg>topic or service</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line mediated" d="M1 8H33" /></svg>mediated by the relay</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line flow" d="M1 8H33" /></svg>direct</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line denied" d="M1 8H33" /></svg>refused in the last hour</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line would" d="M1 8H33" /></svg>would be refused</li></ul>`;
+}
+
+/** Places that hold while the graph changes; a search, a filter or an opened group arranges afresh. */
+function useSpots(/** @type {any} */ shown, /** @type {number} */ round, /** @type {string} */ cause) {
+  const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0 });
+  return useMemo(() => {
+    if (!shown) return kept.current;
+    const anew = kept.current.cause !== cause || kept.current.round !== round;
+    const before = kept.current.spots;
+    const spots = anew ? afresh(shown.items, shown.lines) : arrange(shown.items, shown.lines, before);
+    const moved = anew || [...before].some(([key, spot]) => spots.has(key) && spots.get(key) !== spot);
+    kept.current = { spots, cause, round, arranged: kept.current.arranged + (moved || !before.size ? 1 : 0) };
+    return kept.current;
+  }, [shown, round, cause]);
+}
+
+function recentOf(/** @type {any[]} */ denials) {
+  const since = Date.now() - RECENT_HOURS * 3_600_000;
+  return denials.filter((one) => Date.parse(one.time) > since);
+}
+
+/** What a search leaves: what matches, and what that is connected to. */
+function narrowed(/** @type {import("./model.js").Model} */ model, /** @type {string} */ search) {
+  if (!search.trim()) return model;
+  const hit = new Set([...model.items.values()].filter((one) => matches(search, [one.name, one.sub])).map((one) => one.key));
+  const near = new Set(hit);
+  const lines = new Map([...model.lines].filter(([, line]) => hit.has(line.from) || hit.has(line.to)));
+  for (const line of lines.values()) near.add(line.from).add(line.to);
+  return { items: new Map([...model.items].filter(([key]) => near.has(key))), lines };
+}
+
+function matches(/** @type {string} */ search, /** @type {string[]} */ words) {
+  const wanted = search.trim().toLowerCase();
+  return !wanted || words.some((one) => String(one).toLowerCase().includes(wanted));
+}
+
+function shownKey(/** @type {string} */ key, /** @type {any} */ shown) {
+  if (shown.items.has(key) || shown.lines.has(key)) return key;
+  for (const item of shown.items.values()) if (item.members?.some((/** @type {any} */ one) => one.key === key)) return item.key;
+  return key;
+}

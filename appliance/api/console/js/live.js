@@ -1,0 +1,65 @@
+/** What the appliance says of itself while the page is open: status, open alarms, samples, the graph when it is wanted. */
+
+import { follow } from "./events.js";
+import { get } from "./rest.js";
+import { createStore } from "./store.js";
+
+const HOUR = 3600;
+
+/**
+ * @typedef {{time: number, allowed: number, denied: number, messages: number, bytes: number, dropped: number,
+ *   nodes: number, monitors: Record<string, number[]>}} Sample
+ * @typedef {{kind: string, severity: "alarm" | "warning" | "notice", text: string, about: string}} Alarm
+ */
+
+export const live = createStore({
+  standing: /** @type {import("./events.js").Standing} */ ({ state: "connecting", reason: null, again: null }),
+  away: /** @type {string | null} */ (null),
+  heard: /** @type {number | null} */ (null),
+  status: /** @type {any} */ (null),
+  alarms: /** @type {Alarm[]} */ ([]),
+  samples: /** @type {Sample[]} */ ([]),
+  graph: /** @type {any} */ (null),
+});
+
+let running = /** @type {ReturnType<typeof follow> | null} */ (null);
+let withGraph = false;
+
+/** Follow from now on; with the graph, or without. */
+export function start({ graph = false } = {}) {
+  if (running && withGraph === graph) return;
+  const first = !running;
+  running?.stop();
+  withGraph = graph;
+  if (first) recall();
+  running = follow(() => `/v1/live${withGraph ? "?graph=1" : ""}`, heard, (standing) => live.update({ standing }));
+}
+
+export function stop() {
+  running?.stop();
+  running = null;
+  live.update({ status: null, alarms: [], samples: [], graph: null, heard: null, away: null });
+}
+
+export function retry() {
+  running?.retry();
+}
+
+async function recall() {
+  try {
+    const { samples } = await get("/v1/history", { points: 600 });
+    const newest = samples.at(-1)?.time ?? 0;
+    live.update({ samples: [...samples, ...live.get().samples.filter((one) => one.time > newest)] });
+  } catch {
+    // the curves begin now; the standing of the stream says what is wrong
+  }
+}
+
+function heard(/** @type {string} */ event, /** @type {any} */ data) {
+  const heard = Date.now();
+  if (event === "now") {
+    const samples = [...live.get().samples, data.sample].filter((one) => one.time > data.sample.time - HOUR);
+    live.update({ status: data.status, alarms: data.alarms, samples, away: null, heard });
+  } else if (event === "graph") live.update({ graph: data, heard });
+  else if (event === "away") live.update({ away: data.reason, heard });
+}

@@ -1,0 +1,13 @@
+/** The page begins: a token kept from before is tried, and what it may see is drawn. */
+
+import { App } from "./app.js";
+import { html, render } from "./html.js";
+import { enter } from "./door.js";
+import { kept, session } from "./session.js";
+
+const token = kept();
+if (token) {
+  session.update({ checking: true });
+  enter(token, true).catch((error) => session.set({ current: null, ended: error.message, checking: false }));
+}
+render(html`<${App} />`, /** @type {Element} */ (document.getElementById("console")));

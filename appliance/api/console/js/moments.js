@@ -1,0 +1,56 @@
+/** Times in the reader's zone; UTC, to the nanosecond where it is known, on hover. */
+
+import { html, useEffect, useState } from "./html.js";
+
+const CLOCK = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
+const DAY = new Intl.DateTimeFormat(undefined, { year: "numeric", month: "short", day: "numeric" });
+const WITHIN = new Intl.DateTimeFormat(undefined, { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
+const MINUTE = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+
+/** @param {string | number} value RFC 3339, or seconds since the epoch */
+export function dateOf(value) {
+  return new Date(typeof value === "number" ? value * 1000 : value);
+}
+
+/** A moment: the clock today, with the day before. */
+export function Moment(/** @type {{at: string | number | null, always?: "day"}} */ { at, always }) {
+  if (at === null || at === undefined) return html`<span class="muted">never</span>`;
+  const date = dateOf(at);
+  if (Number.isNaN(date.getTime())) return html`<span class="muted">unknown</span>`;
+  const utc = typeof at === "string" ? at : date.toISOString();
+  return html`<time datetime=${date.toISOString()} title=${`${utc.replace("T", " ").replace("Z", "")} UTC`}>${shown(date, always)}</time>`;
+}
+
+function shown(/** @type {Date} */ date, /** @type {"day" | undefined} */ always) {
+  if (always === "day") return DAY.format(date);
+  return date.toDateString() === new Date().toDateString() ? CLOCK.format(date) : WITHIN.format(date);
+}
+
+/** Hours and minutes, for the axis of a plot. @param {number} seconds */
+export function minute(seconds) {
+  return MINUTE.format(new Date(seconds * 1000));
+}
+
+/** A length of time in its two largest units. @param {number} seconds */
+export function lasting(seconds) {
+  const units = /** @type {[string, number][]} */ ([["d", 86_400], ["h", 3600], ["min", 60], ["s", 1]]);
+  let left = Math.max(0, Math.round(seconds));
+  const said = [];
+  for (const [name, size] of units) {
+    const count = Math.floor(left / size);
+    left -= count * size;
+    if (count || (said.length && name !== "s")) said.push(`${count} ${name}`);
+    if (said.length === 2) break;
+  }
+  return said.length ? said.join(" ") : "0 s";
+}
+
+/** The time now, in milliseconds, anew every so many of them. @param {number} every */
+export function useNow(every = 1000) {
+  const [now, set] = useState(Date.now());
+  useEffect(() => {
+    const timer = setInterval(() => set(Date.now()), every);
+    return () => clearInterval(timer);
+  }, [every]);
+  return now;
+}

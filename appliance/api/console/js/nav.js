@@ -1,0 +1,39 @@
+/** The way to the views, and who reads. */
+
+import { html } from "./html.js";
+import { live } from "./live.js";
+import { Given } from "./parts/given.js";
+import { Icon, Mark } from "./parts/icon.js";
+import { Link, place, VIEWS } from "./router.js";
+import { end, session } from "./session.js";
+import { Pulse } from "./standing.js";
+import { useStore } from "./store.js";
+import { switchTheme, theme } from "./theme.js";
+
+export const TITLES = { now: "Now", graph: "Graph", audit: "Audit", policy: "Policy", monitors: "Monitors", hosts: "Hosts" };
+
+export function Nav() {
+  const { view } = useStore(place);
+  const alarms = useStore(live, (one) => one.alarms.filter((alarm) => alarm.severity === "alarm").length);
+  const version = useStore(live, (one) => one.status?.version ?? "");
+  const { current } = useStore(session);
+  return html`<header class="side">
+    <div class="brand"><${Mark} /><div><div class="brand-name">ROSRV</div><div class="brand-sub">${version ? `Appliance ${version}` : "Appliance"}</div></div></div>
+    <nav class="nav" aria-label="Views"><ul>${VIEWS.map((name, index) => html`<li key=${name}>
+      <${Link} to=${`/console/${name}`} class="fades" aria-current=${name === view ? "page" : undefined} aria-keyshortcuts=${String(index + 1)}>
+        <${Icon} name=${name} /><span>${TITLES[/** @type {keyof typeof TITLES} */ (name)]}</span>
+        ${name === "now" && alarms > 0 && html`<span class="count" title="open alarms">${alarms}<span class="sr-only"> open alarms</span></span>`}
+        <span class="key" aria-hidden="true">${index + 1}</span>
+      </${Link}></li>`)}</ul></nav>
+    <div class="side-foot"><${Pulse} />
+      <div class="who"><span class="who-name"><${Given} value=${current?.name} most=${40} /></span><span class="muted small" data-role=${current?.role}>${current?.role}</span></div>
+      <div class="side-buttons"><${ThemeSwitch} />
+        <button class="button plain" onClick=${() => end(null)} aria-label="Sign out" title="Sign out"><${Icon} name="out" /></button></div>
+    </div></header>`;
+}
+
+function ThemeSwitch() {
+  const dark = useStore(theme) === "dark";
+  const word = dark ? "Use the light theme" : "Use the dark theme";
+  return html`<button class="button plain" onClick=${switchTheme} aria-label=${word} title=${word}><${Icon} name=${dark ? "sun" : "moon"} /></button>`;
+}

@@ -1,0 +1,63 @@
+/**
+ * The records that a person may want to see as they happen (notices and graver): refusals, what monitors did, changes.
+ * One stream for all views; the last ones are kept, the newest first.
+ */
+
+import { follow } from "./events.js";
+import { get } from "./rest.js";
+import { createStore } from "./store.js";
+
+const KEPT = 400;
+const NEAR = "1d";
+
+/** @typedef {Record<string, any>} AuditRecord as docs/audit.md describes it */
+
+export const notable = createStore({
+  denials: /** @type {AuditRecord[] | null} */ (null),
+  doings: /** @type {AuditRecord[] | null} */ (null), // of monitors
+  incidents: /** @type {AuditRecord[] | null} */ (null), // of severity alarm
+});
+
+let running = /** @type {ReturnType<typeof follow> | null} */ (null);
+let generation = 0;
+
+export async function startNotable() {
+  if (running) return;
+  const mine = (generation += 1);
+  running = { stop: () => {}, retry: () => {} };
+  const past = (/** @type {Record<string, any>} */ query) =>
+    get("/v1/audit", { since: NEAR, limit: 100, ...query }).then(({ records }) => records, () => []);
+  const [denials, doings, incidents] = await Promise.all([
+    past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }), past({ severity: "alarm" }),
+  ]);
+  if (mine !== generation) return;
+  notable.set({ denials, doings, incidents });
+  const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
+  running = follow(() => "/v1/audit/stream?severity=notice", heard, () => {}, last ? String(last) : null);
+}
+
+export function stopNotable() {
+  generation += 1;
+  running?.stop();
+  running = null;
+  notable.set({ denials: null, doings: null, incidents: null });
+}
+
+function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
+  if (event !== "record") return;
+  const change = /** @type {any} */ ({});
+  if (isDenial(record)) change.denials = added(notable.get().denials, record);
+  if (record.category === "monitor") change.doings = added(notable.get().doings, record);
+  if (record.severity === "alarm") change.incidents = added(notable.get().incidents, record);
+  if (Object.keys(change).length) notable.update(change);
+}
+
+/** Whether a record is a refusal, or would have been one. @param {AuditRecord} record */
+export function isDenial(record) {
+  return record.decision === "deny" || record.decision === "would deny";
+}
+
+function added(/** @type {AuditRecord[] | null} */ list, /** @type {AuditRecord} */ record) {
+  if (list?.some((one) => one.sequence === record.sequence)) return list;
+  return [record, ...(list ?? [])].slice(0, KEPT);
+}

@@ -1,0 +1,45 @@
+/** The last refusals, and the last things that monitors did, as they happen. */
+
+import { html } from "../html.js";
+import { Moment } from "../moments.js";
+import { notable } from "../notable.js";
+import { Badge } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Empty, Loading } from "../parts/notice.js";
+import { Link } from "../router.js";
+import { useStore } from "../store.js";
+
+const SHOWN = 8;
+
+export function Refusals() {
+  const denials = useStore(notable, (one) => one.denials);
+  return html`<section class="panel" aria-labelledby="refusals"><div class="panel-head"><h2 id="refusals">Refused lately</h2>
+      <span class="end"><${Link} to="/console/audit?decision=deny&since=1d" class="small">All in the audit log</${Link}></span></div>
+    ${denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was refused in the last day">Who tries what the policy does not allow appears here at once.</${Empty}>`
+      : html`<${List} records=${denials} what=${denied} />`}</section>`;
+}
+
+export function Doings() {
+  const doings = useStore(notable, (one) => one.doings);
+  return html`<section class="panel" aria-labelledby="doings"><div class="panel-head"><h2 id="doings">Done by monitors lately</h2>
+      <span class="end"><${Link} to="/console/audit?category=monitor&since=1d" class="small">All in the audit log</${Link}></span></div>
+    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor had to act in the last day">Verdicts, dropped and changed messages appear here.</${Empty}>`
+      : html`<${List} records=${doings} what=${done} />`}</section>`;
+}
+
+function List(/** @type {{records: any[], what: (record: any) => any}} */ { records, what }) {
+  return html`<ul class="event-list">${records.slice(0, SHOWN).map((one) => html`<li key=${one.id} class="event">
+    <span class="event-time"><${Moment} at=${one.time} /></span>${what(one)}</li>`)}</ul>`;
+}
+
+function denied(/** @type {any} */ one) {
+  return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
+    <div><${Given} value=${one.caller_id} most=${60} mono none="nobody" /> <span class="muted">of</span> <${Given} value=${one.host} mono /> <span class="muted"><${Given} value=${one.category} none="" /></span> <${Given} value=${one.resource} most=${80} mono /></div>
+    <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.event} most=${220} /></${Link}></div></div>`;
+}
+
+function done(/** @type {any} */ one) {
+  return html`<span class="event-badge"><${Badge} word=${one.event.replace(/^(monitor|message) /, "")} tone=${one.severity === "alarm" ? "deny" : one.severity === "warning" ? "warn" : "note"} /></span><div class="event-body">
+    <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono /></div>
+    <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.detail.category || one.event} most=${200} /></${Link}></div></div>`;
+}

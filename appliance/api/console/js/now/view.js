@@ -1,0 +1,67 @@
+/** Now: is all well, what flows, what was refused, what is open. */
+
+import { html } from "../html.js";
+import { live } from "../live.js";
+import { lasting, Moment, useNow } from "../moments.js";
+import { notable } from "../notable.js";
+import { count, counted, growth } from "../numbers.js";
+import { Badge } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Loading } from "../parts/notice.js";
+import { Plot } from "../parts/plot.js";
+import { Link } from "../router.js";
+import { useStore } from "../store.js";
+import { Alarms } from "./alarms.js";
+import { Doings, Refusals } from "./lists.js";
+
+const SPAN = 900;
+
+export function Now() {
+  const status = useStore(live, (one) => one.status);
+  const alarms = useStore(live, (one) => one.alarms);
+  const incidents = useStore(notable, (one) => one.incidents);
+  const now = useNow(5000);
+  if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
+  return html`<div class="head"><h1>Now</h1><span class="head-sub">in service for ${lasting(now / 1000 - status.since)}</span></div>
+    <${Health} status=${status} alarms=${alarms} />
+    <div class="now-grid">
+      <div class="stack"><${Curves} /><${Refusals} /><${Doings} /></div>
+      <div class="stack"><${Alarms} alarms=${alarms} incidents=${incidents} /><${Processes} status=${status} /></div>
+    </div>`;
+}
+
+function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) {
+  const grave = alarms.filter((one) => one.severity === "alarm").length;
+  const warnings = alarms.filter((one) => one.severity === "warning").length;
+  const state = grave ? ["deny", "Needs attention"] : warnings ? ["warn", "In service, with warnings"] : ["allow", "In service"];
+  const { policy, monitors, ipsec, audit } = status;
+  return html`<section class="cards" aria-label="Health">
+    <${Card} name="Appliance" to="/console/now" tone=${state[0]} figure=${state[1]} words>${status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`}</${Card}>
+    <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "goes back unless confirmed" : html`by <${Given} value=${policy.who} most=${30} />${policy.differs_from_file ? ", not what the file says" : ""}`}</${Card}>
+    <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
+    <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
+    <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>
+    <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : "Complete"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
+  </section>`;
+}
+
+function Card(/** @type {any} */ { name, to, figure, tone = "", words = false, children }) {
+  return html`<${Link} to=${to} class=${`card ${tone}`}><span class="card-name">${name}</span><span class=${words ? "card-words" : "card-figure"}>${figure}</span><span class="card-more">${children}</span></${Link}>`;
+}
+
+function Curves() {
+  const samples = useStore(live, (one) => one.samples);
+  const series = (/** @type {string} */ name, /** @type {any} */ colour, /** @type {(one: any) => number} */ read) => ({ name, colour, points: growth(samples, read) });
+  return html`<section class="panel" aria-labelledby="curves"><div class="panel-head"><h2 id="curves">Rates, last 15 minutes</h2></div>
+    <div class="panel-body plots">
+      <${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("refused", "c2", (one) => one.denied)]} />
+      <${Plot} label="Messages" span=${SPAN} series=${[series("messages relayed", "c3", (one) => one.messages), series("not taken by slow subscribers", "c4", (one) => one.dropped)]} />
+    </div></section>`;
+}
+
+function Processes(/** @type {{status: any}} */ { status }) {
+  return html`<section class="panel" aria-labelledby="processes"><div class="panel-head"><h2 id="processes">Processes</h2></div>
+    <div class="table-wrap"><table class="table"><thead><tr><th>Role</th><th class="number">Process</th><th>Since</th><th class="number">Restarts</th></tr></thead>
+    <tbody>${status.processes.map((/** @type {any} */ one) => html`<tr key=${one.role}><td><${Given} value=${one.role} /></td><td class="number">${one.pid}</td><td class="nowrap"><${Moment} at=${one.since} /></td>
+      <td class="number">${one.restarts ? html`<${Badge} word=${String(one.restarts)} tone="warn" />` : "0"}</td></tr>`)}</tbody></table></div></section>`;
+}

@@ -1,0 +1,55 @@
+/** Numbers as people read them. */
+
+const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+const SHORT = new Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 });
+
+/** @param {number | null | undefined} value */
+export function count(value) {
+  if (value === null || value === undefined) return "–";
+  return Math.abs(value) < 100_000 ? WHOLE.format(value) : SHORT.format(value);
+}
+
+/** Per second; three figures. @param {number | null | undefined} value */
+export function rate(value) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  if (value === 0) return "0";
+  if (value < 0.1) return "<0.1";
+  if (value < 100) return value.toFixed(1);
+  return count(Math.round(value));
+}
+
+/** @param {number | null | undefined} value */
+export function bytes(value) {
+  if (value === null || value === undefined) return "–";
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let size = value;
+  let unit = 0;
+  while (size >= 1000 && unit < units.length - 1) {
+    size /= 1000;
+    unit += 1;
+  }
+  return `${size >= 100 || unit === 0 ? Math.round(size) : size.toFixed(1)} ${units[unit]}`;
+}
+
+/** `1 host`, `2 hosts`. @param {number} value @param {string} one @param {string} [many] */
+export function counted(value, one, many = `${one}s`) {
+  return `${count(value)} ${value === 1 ? one : many}`;
+}
+
+/**
+ * How fast counters grew between samples; null where they began anew or nothing was known for long.
+ * @template {{time: number}} S
+ * @param {S[]} samples @param {(sample: S) => number} read
+ * @returns {{time: number, value: number | null}[]}
+ */
+export function growth(samples, read) {
+  const found = [];
+  for (let index = 1; index < samples.length; index += 1) {
+    const before = samples[index - 1];
+    const after = samples[index];
+    const seconds = after.time - before.time;
+    const more = read(after) - read(before);
+    found.push({ time: after.time, value: more < 0 || seconds <= 0 ? null : more / seconds });
+  }
+  return found;
+}

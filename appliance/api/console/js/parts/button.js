@@ -1,0 +1,38 @@
+/** Buttons that say when they cannot be used, and why: a role that is missing is named, not hidden. */
+
+import { html, useState } from "../html.js";
+import { may, session } from "../session.js";
+import { useStore } from "../store.js";
+
+/**
+ * @param {{role?: "viewer" | "operator" | "admin", tone?: string, small?: boolean, disabled?: boolean, why?: string,
+ *   onClick: () => any, children?: any, [more: string]: any}} given
+ * `why`: the reason it is disabled. While a click's promise is open it cannot be clicked again.
+ */
+export function Button({ role = "viewer", tone = "", small = false, disabled = false, why, onClick, children, ...more }) {
+  useStore(session);
+  const [busy, setBusy] = useState(false);
+  const allowed = may(role);
+  const reason = allowed ? (disabled ? why : undefined) : `For the role ${role}${role === "admin" ? "" : " or admin"}; yours is ${session.get().current?.role ?? "none"}`;
+  const off = !allowed || disabled || busy;
+  const click = async () => {
+    if (off) return;
+    setBusy(true);
+    try {
+      await onClick();
+    } finally {
+      setBusy(false);
+    }
+  };
+  return html`<button type="button" class=${`button ${tone}${small ? " small" : ""}`} aria-disabled=${off ? "true" : undefined}
+    aria-busy=${busy ? "true" : undefined} title=${reason} onClick=${click} ...${more}>${children}${!allowed && html`<span class="sr-only"> (${reason})</span>`}</button>`;
+}
+
+/** On or off. @param {{on: boolean, label: string, change: () => any, role?: "viewer" | "operator" | "admin"}} given */
+export function Switch({ on, label, change, role = "viewer" }) {
+  useStore(session);
+  const allowed = may(role);
+  const reason = allowed ? undefined : `For the role ${role}; yours is ${session.get().current?.role ?? "none"}`;
+  return html`<button type="button" class="switch" role="switch" aria-checked=${String(on)} aria-label=${label}
+    disabled=${!allowed} title=${reason} onClick=${(/** @type {Event} */ event) => (event.stopPropagation(), change())}></button>`;
+}

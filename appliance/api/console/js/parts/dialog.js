@@ -1,0 +1,29 @@
+/** A question that has to be answered first. Escape and the cross close it; the focus goes back to where it was. */
+
+import { html, useEffect, useId, useRef } from "../html.js";
+import { Icon } from "./icon.js";
+
+/** @param {{title: string, close: () => void, foot?: any, wide?: boolean, children?: any}} given */
+export function Dialog({ title, close, foot, wide = false, children }) {
+  const ref = useRef(/** @type {HTMLDialogElement | null} */ (null));
+  const id = useId();
+  useEffect(() => {
+    const dialog = ref.current;
+    const before = /** @type {HTMLElement | null} */ (document.activeElement);
+    dialog?.showModal();
+    return () => {
+      dialog?.close();
+      before?.focus?.();
+    };
+  }, []);
+  const cancel = (/** @type {Event} */ event) => {
+    event.preventDefault();
+    close();
+  };
+  return html`<dialog ref=${ref} class=${`dialog${wide ? " wide" : ""}`} aria-labelledby=${id} onCancel=${cancel}>
+    <div class="dialog-head"><h2 id=${id}>${title}</h2>
+      <button class="button plain" onClick=${close} aria-label="Close"><${Icon} name="close" /></button></div>
+    <div class="dialog-body">${children}</div>
+    ${foot && html`<div class="dialog-foot">${foot}</div>`}
+  </dialog>`;
+}

@@ -1,0 +1,130 @@
+/**
+ * A text with line numbers, colours and errors at their place (CodeMirror).
+ *
+ * It lives in a shadow root: there its style sheets are constructed objects, which the page's content security policy
+ * allows, and not style elements, which it forbids. It is fetched when it is first needed.
+ */
+
+import { html, useEffect, useRef, useState } from "../html.js";
+import { plain } from "../words.js";
+import { policyLanguage, rvLanguage } from "./languages.js";
+
+const SOURCE = "/console/static/vendor/codemirror.js";
+
+/**
+ * @param {{label: string, value: string, change?: (text: string) => void, language: "policy" | "rv", findings?: any[],
+ *   line?: {number: number, column?: number, count: number} | null, dry?: () => void, height?: string}} given
+ * Without `change` it can only be read. A new `line.count` moves to that line.
+ */
+export function Editor({ label, value, change, language, findings = [], line = null, dry, height = "60vh" }) {
+  const host = useRef(/** @type {HTMLElement | null} */ (null));
+  const held = useRef(/** @type {any} */ (null));
+  const newest = useRef({ change, dry });
+  newest.current = { change, dry };
+  const [ready, setReady] = useState(false);
+
+  useEffect(() => {
+    let gone = false;
+    import(SOURCE).then((mirror) => {
+      if (gone || !host.current) return;
+      const root = host.current.shadowRoot ?? host.current.attachShadow({ mode: "open" });
+      held.current = { mirror, view: build(mirror, root, { label, value, language, height, writable: Boolean(change), newest }) };
+      setReady(true);
+    });
+    return () => {
+      gone = true;
+      held.current?.view.destroy();
+      held.current = null;
+    };
+  }, [language, Boolean(change)]);
+
+  useEffect(() => {
+    const view = held.current?.view;
+    if (!view || view.state.doc.toString() === value) return;
+    view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: value } });
+  }, [value, ready]);
+
+  useEffect(() => {
+    if (!held.current) return;
+    const { mirror, view } = held.current;
+    view.dispatch(mirror.setDiagnostics(view.state, findings.map((one) => diagnostic(view.state, one))));
+  }, [findings, ready, value]);
+
+  useEffect(() => {
+    if (!held.current || !line) return;
+    const { mirror, view } = held.current;
+    const row = view.state.doc.line(Math.min(Math.max(1, line.number), view.state.doc.lines));
+    const at = Math.min(row.to, row.from + Math.max(0, (line.column ?? 1) - 1));
+    view.dispatch({ selection: { anchor: at }, effects: mirror.EditorView.scrollIntoView(at, { y: "center" }) });
+    if (line.count > 0) view.focus();
+  }, [line?.number, line?.count, ready]);
+
+  return html`<div class="editor" ref=${host} data-editor=${language} data-ready=${String(ready)}></div>`;
+}
+
+function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @type {any} */ { label, value, language, height, writable, newest }) {
+  const { EditorView, EditorState, keymap } = mirror;
+  const dry = () => (newest.current.dry?.(), true);
+  return new EditorView({
+    parent: root, root,
+    state: EditorState.create({
+      doc: value,
+      extensions: [
+        mirror.lineNumbers(), mirror.lintGutter(), mirror.highlightActiveLine(), mirror.highlightActiveLineGutter(),
+        mirror.history(), mirror.highlightSpecialChars(), mirror.search({ top: true }), mirror.highlightSelectionMatches(),
+        keymap.of([{ key: "Mod-s", run: dry, preventDefault: true }, ...mirror.searchKeymap, ...mirror.historyKeymap, ...mirror.defaultKeymap]),
+        mirror.StreamLanguage.define(language === "policy" ? policyLanguage : rvLanguage),
+        mirror.syntaxHighlighting(colours(mirror)), look(EditorView, height),
+        EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable) }),
+        EditorView.updateListener.of((/** @type {any} */ update) => update.docChanged && newest.current.change?.(update.state.doc.toString())),
+      ],
+    }),
+  });
+}
+
+function diagnostic(/** @type {any} */ state, /** @type {any} */ finding) {
+  const row = state.doc.line(Math.min(Math.max(1, finding.line), state.doc.lines));
+  const from = Math.min(row.to, row.from + Math.max(0, finding.column - 1));
+  const word = /^[^\s=,]+/.exec(state.sliceDoc(from, row.to));
+  return { from, to: Math.max(from, from + (word?.[0].length ?? 0)), severity: finding.severity === "error" ? "error" : "warning", message: plain(finding.text, 600) };
+}
+
+function colours(/** @type {any} */ { HighlightStyle, tags }) {
+  return HighlightStyle.define([
+    { tag: tags.comment, color: "var(--code-comment)" },
+    { tag: tags.heading, color: "var(--code-section)", fontWeight: "600" },
+    { tag: tags.propertyName, color: "var(--code-key)" },
+    { tag: tags.keyword, color: "var(--code-section)" },
+    { tag: tags.string, color: "var(--code-string)" },
+    { tag: tags.number, color: "var(--code-number)" },
+    { tag: tags.typeName, color: "var(--code-string)" },
+  ]);
+}
+
+function look(/** @type {any} */ EditorView, /** @type {string} */ height) {
+  return EditorView.theme({
+    "&": { height, fontSize: "12.5px", color: "var(--text)", backgroundColor: "var(--surface)" },
+    "&.cm-focused": { outline: "none" },
+    ".cm-scroller": { fontFamily: "var(--mono)", lineHeight: "1.6", overflow: "auto" },
+    ".cm-content": { caretColor: "var(--text)", padding: "8px 0" },
+    ".cm-gutters": { backgroundColor: "var(--sunken)", color: "var(--muted)", border: "none", borderRight: "1px solid var(--line)" },
+    ".cm-activeLine": { backgroundColor: "color-mix(in srgb, var(--chosen) 55%, transparent)" },
+    ".cm-activeLineGutter": { backgroundColor: "var(--chosen)", color: "var(--text)" },
+    ".cm-selectionBackground, &.cm-focused .cm-selectionBackground, ::selection": { backgroundColor: "var(--chosen) !important" },
+    ".cm-cursor": { borderLeftColor: "var(--text)" },
+    ".cm-tooltip": { backgroundColor: "var(--surface)", border: "1px solid var(--line-strong)", borderRadius: "5px", color: "var(--text)", maxWidth: "560px" },
+    ".cm-diagnostic": { fontFamily: "var(--sans)", fontSize: "13px", padding: "6px 10px", whiteSpace: "pre-wrap" },
+    ".cm-diagnostic-error": { borderLeft: "3px solid var(--deny)" },
+    ".cm-diagnostic-warning": { borderLeft: "3px solid var(--warn)" },
+    ".cm-lintRange-error": { backgroundImage: "none", textDecoration: "underline wavy var(--deny)", textUnderlineOffset: "3px" },
+    ".cm-lintRange-warning": { backgroundImage: "none", textDecoration: "underline wavy var(--warn)", textUnderlineOffset: "3px" },
+    ".cm-lint-marker": { width: "10px", height: "10px", content: "none", borderRadius: "50%", margin: "5px 0 0 2px" },
+    ".cm-lint-marker-error": { backgroundColor: "var(--deny)" },
+    ".cm-lint-marker-warning": { backgroundColor: "var(--warn)" },
+    ".cm-panels": { backgroundColor: "var(--sunken)", color: "var(--text)", borderBottom: "1px solid var(--line)" },
+    ".cm-textfield": { backgroundColor: "var(--surface)", border: "1px solid var(--line-strong)", color: "var(--text)" },
+    ".cm-button": { backgroundImage: "none", backgroundColor: "var(--surface)", border: "1px solid var(--line-strong)", color: "var(--text)" },
+    ".cm-searchMatch": { backgroundColor: "var(--warn-soft)" },
+    ".cm-specialChar": { color: "var(--deny)" },
+  });
+}

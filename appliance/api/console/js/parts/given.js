@@ -1,0 +1,13 @@
+/** Texts that strangers chose, as text: never markup, never invisible, never reordering their surroundings. */
+
+import { html } from "../html.js";
+import { pieces, plain } from "../words.js";
+
+/** @param {{value: unknown, most?: number, mono?: boolean, none?: string}} given */
+export function Given({ value, most = 160, mono = false, none = "–" }) {
+  if (value === null || value === undefined || value === "") return html`<span class="muted">${none}</span>`;
+  const shown = pieces(value, most);
+  const cut = String(value).length > most;
+  return html`<bdi class=${`given${mono ? " given-mono" : ""}`} title=${cut ? plain(value, 1000) : undefined}>
+    ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : one.text))}</bdi>`;
+}

@@ -1,0 +1,35 @@
+/** What is wrong with the text, what its tests say, and what it would change. */
+
+import { html } from "../html.js";
+import { counted } from "../numbers.js";
+import { Badge } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Empty, Failure, Findings, Notice } from "../parts/notice.js";
+import { useStore } from "../store.js";
+import { draft } from "./draft.js";
+
+/** @param {{pick: (finding: any) => void}} given */
+export function Check({ pick }) {
+  const { error, findings, report, text, base } = useStore(draft);
+  const errors = findings.filter((one) => one.severity === "error");
+  const ours = findings.filter((one) => one.file === "policy" || !one.file.includes(".tests."));
+  const ofTests = findings.filter((one) => !ours.includes(one));
+  if (!error && !report && !findings.length) {
+    return html`<${Empty} icon="policy" title=${text === base ? "This is the policy in force" : "No error in this text"}>${text === base ? "Change the text; errors appear at their place while you write." : "A dry run shows what is registered now and would be decided differently."}</${Empty}>`;
+  }
+  return html`<div class="panel-body stack">
+    ${error && !errors.length ? html`<${Failure} error=${error} />` : null}
+    ${errors.length > 0 && html`<${Notice} tone="deny" role="alert" title=${`Refused: ${counted(errors.length, "error")}`}>Nothing was changed. Choose an error to go to its place.</${Notice}>`}
+    ${ours.length > 0 && html`<${Findings} findings=${ours} pick=${pick} />`}
+    ${ofTests.length > 0 && html`<div><h3>Tests that fail</h3><${Findings} findings=${ofTests} /></div>`}
+    ${report && html`<${Report} report=${report} />`}</div>`;
+}
+
+function Report(/** @type {{report: any}} */ { report }) {
+  const title = report.loaded ? `Revision ${report.revision} is in force` : "It can be loaded";
+  const taken = report.revoked === null ? "" : ` ${counted(report.revoked, "registration or connection", "registrations and connections")} taken back.`;
+  return html`<${Notice} tone="allow" role="status" title=${title}>${report.changes.length ? `${counted(report.changes.length, "live registration")} ${report.loaded ? "are" : "would be"} decided differently.` : "Nothing that is registered now is decided differently."}${taken}</${Notice}>
+    ${report.changes.length > 0 && html`<div class="table-wrap"><table class="table"><thead><tr><th>Now</th><th>Then</th><th>Node</th><th>Wants</th></tr></thead><tbody>
+      ${report.changes.slice(0, 200).map((/** @type {any} */ one, /** @type {number} */ index) => html`<tr key=${index}><td><${Badge} word=${one.now} /></td><td><${Badge} word=${one.then} /></td><td><${Given} value=${one.caller_id} mono /><div class="muted small"><${Given} value=${one.host} mono /></div></td>
+        <td>${one.category} <${Given} value=${one.resource} mono /><div class="muted small"><${Given} value=${one.reason} most=${300} /></div></td></tr>`)}</tbody></table></div>`}`;
+}

@@ -1,0 +1,104 @@
+/** The policy in force and the text that is being written; it is not lost by looking at another view. */
+
+import { ask, get } from "../rest.js";
+import { session } from "../session.js";
+import { createStore } from "../store.js";
+
+export const draft = createStore({
+  live: /** @type {any} */ (null), // as GET /v1/policy has it
+  etag: /** @type {string | null} */ (null), // of what the text was begun from
+  base: "", // the text it was begun from
+  text: "",
+  error: /** @type {unknown} */ (null),
+  findings: /** @type {any[]} */ ([]),
+  report: /** @type {any} */ (null), // of the last dry run, or load
+  tested: /** @type {any} */ (null),
+});
+
+session.subscribe(() => {
+  if (!session.get().current) draft.set({ live: null, etag: null, base: "", text: "", error: null, findings: [], report: null, tested: null });
+});
+
+/** Ask for the policy in force. A text that was changed here stays, and keeps what it was begun from. */
+export async function look() {
+  try {
+    const { body, etag } = await ask("GET", "/v1/policy");
+    const { text, base, live } = draft.get();
+    if (live === null || text === base) draft.update({ live: body, etag, base: body.text, text: body.text, error: null });
+    else draft.update({ live: body, error: null });
+  } catch (error) {
+    draft.update({ error });
+  }
+}
+
+export function write(/** @type {string} */ text) {
+  if (text !== draft.get().text) draft.update({ text, report: null });
+}
+
+/** Begin anew from what is in force. */
+export function discard() {
+  const { live } = draft.get();
+  draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, findings: [], report: null, tested: null });
+}
+
+/** Keep the text, and take it as one that knows the revision now in force. */
+export function rebase() {
+  const { live } = draft.get();
+  draft.update({ base: live.text, etag: `"${live.revision}"`, report: null });
+}
+
+/** Errors, warnings and tests of the text, for whoever writes. Changes nothing. */
+export async function check(/** @type {AbortSignal} */ signal) {
+  const { text } = draft.get();
+  try {
+    const { body } = await ask("POST", "/v1/policy/test", { json: { text }, signal });
+    if (draft.get().text === text) draft.update({ tested: body, findings: [], error: null });
+  } catch (error) {
+    if (!signal.aborted && draft.get().text === text) refused(error);
+  }
+}
+
+/** What the text would do. */
+export async function dryRun() {
+  const { text } = draft.get();
+  try {
+    const { body } = await ask("POST", "/v1/policy", { query: { dry_run: 1 }, json: { text } });
+    draft.update({ report: body, findings: body.warnings, error: null });
+  } catch (error) {
+    refused(error);
+    throw error;
+  }
+}
+
+/** Bring the text into force. @param {string} note @param {number | null} within seconds to confirm */
+export async function load(note, within) {
+  const { text, etag } = draft.get();
+  try {
+    const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note }, match: etag ?? "" });
+    draft.update({ report: body, findings: body.warnings, base: text, etag: next, error: null });
+    await look();
+    return body;
+  } catch (error) {
+    refused(error);
+    throw error;
+  }
+}
+
+/** The report of a change that is not a text: rollback, reload, confirm. @param {string} what @param {any} [json] */
+export async function change(what, json) {
+  const { live } = draft.get();
+  const { body } = await ask("POST", `/v1/policy/${what}`, { json, match: `"${live.revision}"` });
+  const clean = draft.get().text === draft.get().base;
+  if (clean) draft.update({ base: "", text: "" , live: null, report: null });
+  await look();
+  return body;
+}
+
+export async function revisions(/** @type {AbortSignal} */ signal) {
+  return (await get("/v1/policy/revisions", {}, signal)).revisions;
+}
+
+function refused(/** @type {any} */ error) {
+  const findings = Array.isArray(error?.findings) ? error.findings : [];
+  draft.update({ error, findings, report: null, tested: null });
+}

@@ -1,0 +1,68 @@
+/** Requests to the appliance's REST interface, and only there: paths, never addresses. */
+
+import { Problem } from "./problem.js";
+import { end, session } from "./session.js";
+
+/**
+ * @typedef {{query?: Record<string, any>, json?: any, text?: string, match?: string, token?: string,
+ *   headers?: Record<string, string>, signal?: AbortSignal}} Options
+ */
+
+/**
+ * The answer, once its headers are there. Throws `Problem`.
+ * @param {string} method @param {string} path @param {Options} [options]
+ */
+export async function send(method, path, { query, json, text, match, token, headers = {}, signal } = {}) {
+  const holder = token ?? session.get().current?.token;
+  if (holder) headers = { ...headers, Authorization: `Bearer ${holder}` };
+  if (match !== undefined) headers["If-Match"] = match;
+  if (json !== undefined) headers["Content-Type"] = "application/json";
+  else if (text !== undefined) headers["Content-Type"] = "text/plain; charset=utf-8";
+  let response;
+  try {
+    response = await fetch(path + queryText(query), {
+      method, headers, signal, body: json !== undefined ? JSON.stringify(json) : text,
+      cache: "no-store", credentials: "omit", redirect: "error", referrerPolicy: "no-referrer",
+    });
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw new Problem(0, { detail: "There was no answer: is the appliance running, and can this machine reach it?" });
+  }
+  if (response.ok) return response;
+  const problem = await problemOf(response);
+  if (problem.status === 401 && !token && holder === session.get().current?.token) end(problem.message);
+  throw problem;
+}
+
+/** The body as JSON, and its ETag. @param {string} method @param {string} path @param {Options} [options] */
+export async function ask(method, path, options) {
+  const response = await send(method, path, options);
+  const body = response.status === 204 ? null : await response.json();
+  return { body, etag: response.headers.get("etag") };
+}
+
+/** @param {string} path @param {Record<string, any>} [query] @param {AbortSignal} [signal] */
+export async function get(path, query, signal) {
+  return (await ask("GET", path, { query, signal })).body;
+}
+
+/** @param {Record<string, any>} [query] What is null, undefined or empty is left out; an array is repeated. */
+export function queryText(query) {
+  const words = new URLSearchParams();
+  for (const [name, value] of Object.entries(query ?? {})) {
+    for (const one of Array.isArray(value) ? value : [value]) {
+      if (one !== null && one !== undefined && one !== "" && one !== false) words.append(name, String(one));
+    }
+  }
+  const text = words.toString();
+  return text ? `?${text}` : "";
+}
+
+async function problemOf(/** @type {Response} */ response) {
+  const after = Number(response.headers.get("retry-after")) || null;
+  try {
+    return new Problem(response.status, await response.json(), after);
+  } catch {
+    return new Problem(response.status, { detail: `The answer was ${response.status}, and no reason with it.` }, after);
+  }
+}

@@ -1,0 +1,33 @@
+/** Whether what is shown is what is: a word beside the navigation, and a banner as soon as it is not. */
+
+import { html } from "./html.js";
+import { live, retry } from "./live.js";
+import { useNow } from "./moments.js";
+import { Given } from "./parts/given.js";
+import { Icon } from "./parts/icon.js";
+import { useStore } from "./store.js";
+
+export function Pulse() {
+  const standing = useStore(live, (one) => one.standing);
+  const away = useStore(live, (one) => one.away);
+  const heard = useStore(live, (one) => one.heard !== null);
+  const [kind, word] =
+    standing.state === "live" && away ? ["wait", "RVMaster away"]
+    : standing.state === "live" && heard ? ["live", "Live"]
+    : standing.state === "lost" ? ["lost", "Not live"]
+    : ["wait", "Connecting"];
+  return html`<div class="pulse" role="status" aria-label=${`Connection: ${word}`} data-standing=${kind}><span class=${`dot ${kind}`}></span><span class="pulse-text">${word}</span></div>`;
+}
+
+export function NotLive() {
+  const { standing, away, heard } = useStore(live);
+  const now = useNow();
+  const since = heard ? `, as of ${Math.max(0, Math.round((now - heard) / 1000))} s ago` : "";
+  if (standing.state === "live" && away)
+    return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>RVMaster does not answer${since}.</strong> <${Given} value=${away} most=${300} /></span></div>`;
+  if (standing.state === "live" || !standing.reason) return null;
+  const wait = standing.again ? Math.max(0, Math.ceil((standing.again - now) / 1000)) : 0;
+  return html`<div class="banner" role="status"><${Icon} name="warn" />
+    <span><strong>Not live${since}.</strong> <${Given} value=${standing.reason} most=${300} /> ${wait ? `Next try in ${wait} s.` : "Trying now."}</span>
+    <button class="button small" onClick=${retry}>Try now</button></div>`;
+}

@@ -1,0 +1,34 @@
+/** Dark or light: as the reader's system has it until the switch is used, and then as that says. */
+
+import { createStore } from "./store.js";
+
+const KEY = "rosrv.theme";
+const system = matchMedia("(prefers-color-scheme: dark)");
+
+export const theme = createStore(/** @type {"dark" | "light"} */ (document.documentElement.dataset.theme ?? "light"));
+
+theme.subscribe(() => {
+  document.documentElement.dataset.theme = theme.get();
+});
+
+system.addEventListener("change", () => {
+  if (!remembered()) theme.set(system.matches ? "dark" : "light");
+});
+
+export function switchTheme() {
+  const next = theme.get() === "dark" ? "light" : "dark";
+  try {
+    localStorage.setItem(KEY, next);
+  } catch {
+    // not kept: it holds until the page is closed
+  }
+  theme.set(next);
+}
+
+function remembered() {
+  try {
+    return localStorage.getItem(KEY);
+  } catch {
+    return null;
+  }
+}
