@@ -279,6 +279,10 @@ class Settings(_Section):
     publish_as: Annotated[str, AfterValidator(_checked_name)] = Field(
         default="/rosrv", description="the node name under which monitors publish"
     )
+    monitors_on_rosout: bool = Field(
+        default=False,
+        description="put output, verdicts and faults of monitors on /rosout, too (the audit log always has them)",
+    )
     hide_publisher: bool = Field(
         default=False, description="leave out what monitors publish in getSystemState"
     )

@@ -15,6 +15,7 @@ import structlog
 
 from appliance.channel import messages
 from appliance.config import Settings
+from appliance.master import rosout
 from appliance.master.addresses import Addresses
 from appliance.master.core import Master
 from appliance.master.delivery import Delivery
@@ -47,6 +48,7 @@ from appliance.master.reminders import Reminders
 from appliance.master.revocation import Revocation
 from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.ros.standard import standard_definitions
 from appliance.store.state import StateStore
 
 RVMASTER, INNER = "rvmaster", "inner"
@@ -281,13 +283,14 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
     relay.statement, relay.heard, relay.lost = (
         base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
     )  # fmt: skip
-    publisher = OwnPublisher(
-        master,
-        base.settings.publish_as,
-        base.port(INNER),
-        lambda: base.monitors.checked.publications,
-    )
+    publisher = OwnPublisher(master, base.settings.publish_as, base.port(INNER), lambda: _published(base))
     base.monitors.published = publisher.wake
+    if base.settings.monitors_on_rosout:
+        relay.own_header = rosout.header(standard_definitions())
+        said = rosout.Rosout(
+            base.settings.publish_as, relay.publish, lambda name: base.monitors.checked.monitors.get(name, "")
+        )
+        base.monitors.records.told = said.reported
     reconciler = wires.reconciler()
     revocation = Revocation(master, put_back=reconciler.put_back)
     base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
@@ -316,3 +319,9 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
         ),
         inner=InnerFace(reach.registry, reach.delivery, value_limits(base.settings)),
     )
+
+
+def _published(base: Foundation) -> dict[str, str]:
+    """The topics that the appliance's own publisher has, and their types."""
+    own = {rosout.TOPIC: rosout.TYPE} if base.settings.monitors_on_rosout else {}
+    return own | base.monitors.checked.publications

@@ -25,6 +25,7 @@ class MonitorRecords:
     """Makes records of reports; `fields(topic, data)` reads a message.
 
     `counts` has how often each kind happened, by monitor; `at` how often messages of a topic were dropped or changed.
+    `told(event)` hears of every event.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class MonitorRecords:
         self._fields = fields
         self.counts: Counter[tuple[str, str]] = Counter()
         self.at: Counter[tuple[str, str]] = Counter()
+        self.told: Callable[[MonitorEvent], None] = lambda event: None  # noqa: ARG005 - set when wired
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
         """A batch of the relay."""
@@ -44,6 +46,7 @@ class MonitorRecords:
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
+            self.told(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"
             self._recorder.happened("records lost", text, severity=Severity.ALARM, lost=lost)

@@ -57,6 +57,7 @@ class RelayControl:
         self.statement: Callable[[int], messages.Message | None] = lambda relay: None  # noqa: ARG005 - set when wired
         self.heard: Callable[[messages.Message, int], None] = lambda message, relay: None  # noqa: ARG005 - the same
         self.lost: Callable[[int], None] = lambda relay: None  # noqa: ARG005 - the same
+        self.own_header: messages.OwnHeaderStated | None = None  # of what control publishes itself
         self.carried = Carried(recorder, self._known_name, allocation.relays)
 
     @property
@@ -98,6 +99,8 @@ class RelayControl:
         specifications = self.statement(index)  # before anything is placed: nothing goes past the monitors
         if specifications is not None:
             post.send(specifications)
+        if self.own_header is not None:
+            post.send(self.own_header)
         with post.restating():
             for incarnation in self._registry.live():
                 self._place(post, incarnation)
@@ -109,6 +112,10 @@ class RelayControl:
     def send(self, message: messages.Message, relay: int) -> bool:
         """Tell a relay; False when it is not there."""
         return self._posts[relay].send(message)
+
+    def publish(self, message: messages.OwnPublished) -> None:
+        """Publish as the appliance's own publisher, to whoever subscribes now."""
+        self._post(TOPIC, message.topic).send(message)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
         """Whether a topic or service is carried by this relay."""

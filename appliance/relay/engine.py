@@ -20,6 +20,8 @@ from appliance.channel.messages import (
     MonitorSwitched,
     NodePlaced,
     NodeWithdrawn,
+    OwnHeaderStated,
+    OwnPublished,
     PublicationPlaced,
     PublicationWithdrawn,
     ServiceWithdrawn,
@@ -47,7 +49,6 @@ from appliance.relay.subscriber import Subscriber
 from appliance.relay.topic import RelayedTopic
 from appliance.relay.upstream import Publisher
 from appliance.relay.visitor import Farewell, Visitor
-from appliance.rosmop.runtime.context import Published
 
 
 class Engine:
@@ -59,7 +60,7 @@ class Engine:
         self._reporter = Reporter(limits)
         scratch = memoryview(bytearray(SCRATCH))
         self._middle = Middle(loop, self._reporter)
-        self._middle.publish = self._publish
+        self._middle.publish = lambda published: self._publish(published.topic, published.data)
         self._middle.changed = self._monitors_changed
         self._context = RelayContext(
             loop, limits, self._reporter, MemoryBudget(limits.memory_bytes), scratch, self._middle
@@ -68,6 +69,7 @@ class Engine:
         self._ports = Ports(loop, limits, self._arrived, self._turned_away)
         self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
         self._own: dict[str, OwnPublisher] = {}
+        self._own_headers: dict[str, dict[str, str]] = {}
         self._clients: set[ServiceClient] = set()
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self._visitors: set[Visitor] = set()
@@ -100,6 +102,10 @@ class Engine:
             self._middle.switch(message.name, message.enabled)
         elif isinstance(message, MonitorResumed):
             self._middle.resume(message.name)
+        elif isinstance(message, OwnHeaderStated):
+            self._state_header(message)
+        elif isinstance(message, OwnPublished):
+            self._publish(message.topic, message.data)
         else:
             self._table.withdraw(message)
             self._withdrawn(message)
@@ -185,7 +191,7 @@ class Engine:
         )
         publisher: Publisher | OwnPublisher
         if node is not None and node.monitors:
-            publisher = self._own[topic] = OwnPublisher(relayed, lambda: self._middle.header_of(topic))
+            publisher = self._own[topic] = OwnPublisher(relayed, lambda: self._header_of(topic))
             relayed.upstream = publisher
         else:
             publisher = Publisher(
@@ -209,11 +215,23 @@ class Engine:
         for client in list(self._clients):
             client.judge_again()
 
-    def _publish(self, published: Published) -> None:
+    def _state_header(self, message: OwnHeaderStated) -> None:
+        self._own_headers[message.topic] = {
+            "type": message.type,
+            "md5sum": message.md5sum,
+            "message_definition": message.definition,
+            "latching": "0",
+        }
+
+    def _header_of(self, topic: str) -> dict[str, str] | None:
+        """The connection header of what the appliance publishes: of the monitors' definitions, or as control says."""
+        return self._middle.header_of(topic) or self._own_headers.get(topic)
+
+    def _publish(self, topic: str, data: bytes) -> None:
         """Between two messages, or in the middle of a batch of another topic: never of this one."""
-        publisher = self._own.get(published.topic)
+        publisher = self._own.get(topic)
         if publisher is not None:
-            publisher.publish(published.data)
+            publisher.publish(data)
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
         if (key, topic) not in self._topics:

@@ -231,6 +231,22 @@ class SpecificationsRefused(Message):
     findings: list[str]
 
 
+class OwnHeaderStated(Message):
+    """The connection header, without names, of a topic on which control itself publishes (`OwnPublished`)."""
+
+    topic: str
+    type: str
+    md5sum: str
+    definition: str
+
+
+class OwnPublished(Message):
+    """Control publishes a message as the appliance's own publisher; `data` is without its length."""
+
+    topic: str
+    data: bytes
+
+
 class PublicationRefused(Message):
     """A publisher (or service) is not carried: its definition is another than the specifications'."""
 
@@ -293,5 +309,6 @@ RelayLink = (
     | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | ConnectionOpened | ConnectionClosed
     | ConnectionRefused | TrafficReported | SpecificationsStated | MonitorSwitched | MonitorResumed
-    | SpecificationsTaken | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted
+    | OwnHeaderStated | OwnPublished | SpecificationsTaken | SpecificationsRefused | PublicationRefused
+    | MonitorsReported | MonitorsCounted
 )  # fmt: skip

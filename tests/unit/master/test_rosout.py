@@ -1,0 +1,79 @@
+"""What monitors say on /rosout: the right bytes, the right level, and no flood."""
+
+import msgspec
+import pytest
+
+from appliance.channel.messages import MonitorEvent, OwnPublished
+from appliance.master.rosout import Rosout, header
+from appliance.ros.reading import read_fields
+from appliance.ros.standard import standard_definitions
+
+DEFINITIONS = standard_definitions()
+LINE = MonitorEvent("log", "gate", "key", "/chatter", 1_700_000_000_250_000_000, "ünsafe", {"level": "WARN"})
+
+
+class Desk:
+    """A Rosout whose clock stands still unless it is set."""
+
+    def __init__(self) -> None:
+        self.now = 10.0
+        self.sent: list[OwnPublished] = []
+        self.rosout = Rosout("/rosrv", self.sent.append, lambda monitor: f"{monitor}.rv", lambda: self.now)
+
+    def said(self) -> list[dict[str, object]]:
+        """The messages, read as a subscriber would."""
+        fields = [read_fields(DEFINITIONS, "rosgraph_msgs/Log", one.data) for one in self.sent]
+        return [one for one in fields if one is not None]
+
+
+def test_a_line_is_a_log_message() -> None:
+    """With the appliance as node, the monitor as function, its file, its level and when it was said."""
+    desk = Desk()
+    desk.rosout.reported(LINE)
+    (said,) = desk.said()
+    assert desk.sent[0].topic == "/rosout"
+    assert {name: said[name] for name in ("level", "name", "msg", "file", "function", "topics")} == {
+        "level": 4, "name": "/rosrv", "msg": "ünsafe", "file": "gate.rv", "function": "gate", "topics": [],
+    }  # fmt: skip
+    assert said["header"]["stamp"] == 1_700_000_000.25  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("kind", "detail", "level"),
+    [
+        ("log", {"level": "DEBUG"}, None),
+        ("log", {"level": "FATAL"}, 16),
+        ("verdict", {"category": "violation"}, 4),
+        ("verdict", {"category": "match"}, 2),
+        ("fault", {}, 8),
+        ("drop", {}, None),
+        ("change", {}, None),
+        ("publish", {}, None),
+    ],
+)
+def test_what_is_said_and_how_loud(kind: str, detail: dict[str, str], level: int | None) -> None:
+    """Output, verdicts and faults; what a monitor did to messages is for the audit log."""
+    desk = Desk()
+    desk.rosout.reported(msgspec.structs.replace(LINE, kind=kind, detail=detail))
+    assert [one["level"] for one in desk.said()] == ([] if level is None else [level])
+
+
+def test_a_flood_is_cut_and_said() -> None:
+    """Fifty in a second; how many more there were comes with the next."""
+    desk = Desk()
+    for _ in range(60):
+        desk.rosout.reported(LINE)
+    desk.rosout.reported(msgspec.structs.replace(LINE, text="WARN ünsafe", count=5, detail={}))
+    assert len(desk.sent) == 50
+    desk.now += 1
+    desk.rosout.reported(msgspec.structs.replace(LINE, text="WARN ünsafe", count=3, detail={}))
+    assert [one["msg"] for one in desk.said()[50:]] == [
+        "15 more lines of monitors; the audit log has them",
+        "3 more in the same second: ünsafe",
+    ]
+    assert [one["level"] for one in desk.said()[50:]] == [4, 4]
+
+
+def test_the_header_is_that_of_ros() -> None:
+    """As `rosmsg md5 rosgraph_msgs/Log` says."""
+    assert header(DEFINITIONS).md5sum == "acffd30cd6b6de30f120938c17c593fb"
