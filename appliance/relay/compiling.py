@@ -89,7 +89,9 @@ class Compiler:
             if self._standard is None:
                 self._standard = standard_definitions()
             definitions = self._standard.extended(Definitions.from_files(message.definitions))
-            return MonitorSet.load(dict(message.files), definitions, message.on_fault)
+            monitors = MonitorSet.load(dict(message.files), definitions, message.on_fault)
+            monitors.write_loops()
+            return monitors
         except SpecificationError as error:
             return [str(one) for one in error.findings]
         except DefinitionError as error:

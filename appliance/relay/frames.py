@@ -22,6 +22,8 @@ LARGE = 128 << 10
 SCRATCH = 512 << 10
 _KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one costs four times the rest
 
+_MANY = 4  # frames
+
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
 
@@ -42,15 +44,19 @@ class MemoryBudget:
 class Batch:
     """Whole frames, one after the other, in a buffer that is used again unless they are kept.
 
-    `last` is where the last of the `messages` frames begins.
+    `last` is where the last of the `messages` frames begins, None if that has to be looked for; `stride` the bytes of
+    each of the frames if they are known to be equally long, else 0.
     """
 
-    __slots__ = ("_kept", "_owned", "last", "messages", "view")
+    __slots__ = ("_kept", "_owned", "last", "messages", "stride", "view")
 
-    def __init__(self, view: memoryview, messages: int, last: int, *, owned: bool = False) -> None:
+    def __init__(
+        self, view: memoryview, messages: int, last: int | None, *, owned: bool = False, stride: int = 0
+    ) -> None:
         self.view = view
         self.messages = messages
         self.last = last
+        self.stride = stride
         self._owned = owned
         self._kept: memoryview | None = None
 
@@ -70,6 +76,8 @@ class Batch:
         if self._owned and self.messages == 1:
             self.keep()
             return self
+        if self.last is None:
+            self.last = last_frame(self.view)
         last = memoryview(bytes(self.view[self.last :]))
         return Batch(last, 1, 0, owned=True)
 
@@ -118,7 +126,10 @@ class FrameReceiver:
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
         """All whole frames in `buffer[:end]`; the torn one after them is set aside."""
         limit = self._limit
-        position = messages = last = need = 0
+        need = 0
+        stride, messages = equal_frames(buffer, end)
+        position = stride * messages
+        last = position - stride
         while position + 4 <= end:
             need = _unpack_length(buffer, position)[0] + 4
             if position + need > end:
@@ -126,6 +137,7 @@ class FrameReceiver:
             last = position
             position += need
             messages += 1
+            stride = 0
         self._torn = b""
         if position < end:
             if position + 4 <= end and need > LARGE:
@@ -134,7 +146,9 @@ class FrameReceiver:
                 self._begin_area(need, buffer[position:end])
             else:
                 self._torn = bytes(buffer[position:end])
-        return Batch(buffer[:position], messages, last, owned=owned) if messages else None
+        if not messages:
+            return None
+        return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
         """Go on with a frame of `need` bytes, of which `start` has come, in an area of its own."""
@@ -168,6 +182,33 @@ class FrameReceiver:
         self._filled, self._target = 0, need
         self._delivered = Batch(area[:need], 1, 0, owned=True)
         return self._delivered
+
+
+def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
+    """How long the frames at the start of `buffer[:end]` are, and how many, if they are many and all equally long.
+
+    (0, 0) if not. To see it in one look at the lengths is cheaper than to walk from frame to frame.
+    """
+    if end < 4:
+        return 0, 0
+    stride = _unpack_length(buffer, 0)[0] + 4
+    count = end // stride
+    if count < _MANY or _unpack_length(buffer, stride)[0] + 4 != stride:
+        return 0, 0
+    whole = count * stride
+    for place in range(4):
+        if buffer[place:whole:stride].tobytes() != buffer[place : place + 1].tobytes() * count:
+            return 0, 0
+    return stride, count
+
+
+def last_frame(view: memoryview) -> int:
+    """Where the last of the whole frames in `view` begins."""
+    position = last = 0
+    while position < len(view):
+        last = position
+        position += _unpack_length(view, position)[0] + 4
+    return last
 
 
 def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:

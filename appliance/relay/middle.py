@@ -1,7 +1,8 @@
 """Monitors in the middle: the specifications in force, and what they do to messages, requests and replies.
 
-A topic without an enabled event never comes here (`stands` is asked when something changes, not per message). For
-the others a batch is walked frame by frame; what nobody changed or dropped leaves in the buffer it came in.
+A topic without an enabled event never comes here (`stands` is asked when something changes, not per message). The
+messages of a batch are taken many at a time where they need nothing but the common (`_walk`), one by one where there
+is something to tell; what nobody changed or dropped leaves in the buffer it came in.
 
 Invariants:
 - Whatever goes wrong with a monitor, a defect of this program included, ends the way of that message and of nothing
@@ -28,8 +29,10 @@ from appliance.relay.compiling import Compiler, Result
 from appliance.relay.frames import Batch
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.observations import SHOWN, Observations
+from appliance.relay.passage import Passage
 from appliance.relay.report import Reporter
 from appliance.relay.telling import Place, Telling, refusal
+from appliance.rosmop.batch import Walker
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import Published
@@ -178,23 +181,60 @@ class Middle:
 
     # --- messages ---
 
-    def through(  # noqa: PLR0912, PLR0915 - one loop: a call for each message would cost a fifth of its time
-        self, key: str, topic: str, batch: Batch
-    ) -> Batch | None:
+    def through(self, key: str, topic: str, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does."""
         monitors = self._set
         if self._blocked or monitors is None:
             return self._block(batch, (key, topic))
-        view, place, telling, now = batch.view, (key, topic), self._telling, self._now()
+        passage = Passage(batch, (key, topic), self._now())
+        walker = monitors.walker(topic)
+        while passage.position < passage.end:
+            if walker is None:
+                self._one_by_one(monitors, passage, batch.messages)
+            elif self._spent > _LONGEST or not self._walk(monitors, walker, passage):
+                self._one_by_one(monitors, passage, passage.turns())
+        if self._due is not None or monitors.next_due is not None:
+            self._schedule()
+        return passage.result()
+
+    def _walk(self, monitors: MonitorSet, walker: Walker, passage: Passage) -> bool:
+        """Take the messages that need nothing but the common; False if the next one needs more."""
+        if not monitors.walks(walker, passage.time):
+            return False
+        telling, place, before = self._telling, passage.place, passage.position
+        began = time.thread_time() if passage.messages > _LOOK_EVERY else None  # else too little to count
+        try:
+            walked = walker.walk(
+                passage.view,
+                before,
+                passage.run,
+                passage.pieces,
+                stride=passage.stride,
+                time_ns=passage.time,
+                loud=walker.changes and telling.shows(place),
+                told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
+            )
+        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
+            telling.defect(error, place, passage.time)
+            return False
+        if began is not None:
+            self._spent += time.thread_time() - began
+        telling.walked(walker, walked, place, passage.time)
+        passage.walked(walked.position, walked.run, sum(walked.dropped) if walker.drops else 0)
+        return passage.position == passage.end
+
+    def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:
+        """Give so many messages to the engine."""
+        topic, place, now, telling = passage.place[1], passage.place, passage.time, self._telling
+        view, position, end = passage.view, passage.position, passage.end
         process = monitors.process
         shows = telling.shows(place)
-        pieces: list[memoryview | bytes | bytearray] = []
-        position = run = messages = last = length = looked = 0
+        looked = 0
         spent = self._spent - time.thread_time()
-        while position < len(view):
+        while position < end and looked < count:
             first = position + 4
-            end = first + _unpack_length(view, position)[0]
-            body = view[first:end]
+            following = first + _unpack_length(view, position)[0]
+            body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             try:
                 outcome = (
@@ -207,39 +247,21 @@ class Middle:
             result = outcome.result
             if result == "dropped":
                 telling.dropped(outcome, place, body)
-                if position > run:
-                    pieces.append(view[run:position])
-                    length += position - run
-                run = end
-            else:
-                messages += 1
-                last = length + position - run
-                if result == "changed":
-                    if shows:
-                        telling.changed(outcome, place, before, end - first)
-                        shows = telling.shows(place)
-                    else:
-                        telling.changed_again(outcome, place)
-                    if outcome.buffer is not body:
-                        if position > run:
-                            pieces.append(view[run:position])
-                        pieces += (_LENGTH.pack(len(outcome.buffer)), outcome.buffer)
-                        length = last + 4 + len(outcome.buffer)
-                        run = end
-            position = end
+                passage.cut(position, following)
+            elif result == "changed":
+                if shows:
+                    telling.changed(outcome, place, before, len(body))
+                    shows = telling.shows(place)
+                else:
+                    telling.changed_again(outcome, place)
+                if outcome.buffer is not body:
+                    passage.replace(position, following, outcome.buffer)
+            position = following
             looked += 1
             if not looked % _LOOK_EVERY or outcome.faults:
                 self._spent = spent + time.thread_time()
+        passage.position = position
         self._spent = spent + time.thread_time()
-        if self._due is not None or monitors.next_due is not None:
-            self._schedule()
-        if not run:
-            return batch
-        if not messages:
-            return None
-        if position > run:
-            pieces.append(view[run:position])
-        return Batch(memoryview(b"".join(pieces)), messages, last, owned=True)
 
     def request(self, key: str, service: str, body: bytes) -> Judged:
         """What becomes of a request."""

@@ -79,6 +79,10 @@ class Observations:
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = time
 
+    def told(self, kind: str, monitor: str, place: tuple[str, str]) -> bool:
+        """Whether this has been told in this second, so that the next is only counted."""
+        return (kind, monitor, *place, "") in self._told
+
     def tick(self) -> None:
         """A second is over: tell the counts, and the state of the monitors if it changed."""
         for key, count in self._told.items():

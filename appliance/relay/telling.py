@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorRow
 from appliance.relay.observations import SHOWN, Observations
+from appliance.rosmop.batch import Walked, Walker
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import Published
@@ -41,6 +42,28 @@ class Telling:
     def shows(self, place: Place) -> bool:
         """Whether the next change at a place is told with the bytes before it."""
         return place not in self._shown
+
+    def hides_drop(self, monitor: str, place: Place) -> bool:
+        """Whether the next drop of a monitor at a place is only counted."""
+        return self._observations.told("drop", monitor, place)
+
+    def walked(self, walker: Walker, walked: Walked, place: Place, time: int) -> None:
+        """Messages that needed nothing to be told: their events, and drops and changes beyond the first."""
+        for number, count in enumerate(walked.happened):
+            if count:
+                events = walker.events[number]
+                self._happened[events] = self._happened.get(events, 0) + count
+        if walker.changes:
+            for number, count in enumerate(walked.changed):
+                if count:
+                    key = (walker.events[number], place)
+                    self._again[key] = self._again.get(key, 0) + count
+        if walker.drops:
+            for number, count in enumerate(walked.dropped):
+                if count:
+                    monitor = walker.monitors[number]
+                    self._counter(monitor).drops += count
+                    self._observations.add("drop", monitor, place, time, count)
 
     def told(self, outcome: Outcome, place: Place) -> None:
         """Tell what an outcome has besides its result, and publish what it publishes."""

@@ -11,7 +11,9 @@ Theory of operation:
 3. Time is what the caller says: nanoseconds, with every message. Ticks (`every`) up to and including the time of
    a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
    the caller calls `advance` when `next_due` has come.
-4. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
+4. `walker` offers, for most topics, loops that do what `process` does to many messages at once (`batch.py`), as far
+   as these need nothing that is recorded or explained. Whoever uses them must not see a difference but in time.
+5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
 """
 
@@ -20,6 +22,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from appliance.ros.definitions import Definitions
+from appliance.rosmop.batch import Walker, walkers
 from appliance.rosmop.compile.specification import Compiled, compile_files
 from appliance.rosmop.faults import explain, line_of
 from appliance.rosmop.logics.interface import Categories, RunFaultError
@@ -53,6 +56,8 @@ class MonitorSet:
         self._due: int | None = None
         self.began: tuple[str, ...] = ()
         self._timed = False
+        self._walkers: Mapping[str, Walker] = {}
+        self._broken = False
         self._index()
 
     @classmethod
@@ -116,6 +121,18 @@ class MonitorSet:
         """Whether an enabled monitor has an event on this topic."""
         return topic in self._steps
 
+    def write_loops(self) -> None:
+        """Write the loops that `walker` offers; takes about as long as compiling the specifications."""
+        self._walkers = walkers(self._compiled, self._monitors)
+
+    def walker(self, topic: str) -> Walker | None:
+        """The loops for messages on this topic; None if there are none."""
+        return self._walkers.get(topic) if topic in self._steps else None
+
+    def walks(self, walker: Walker, time_ns: int) -> bool:
+        """Whether loops may be used now: nothing is due, no monitor waits for its first message or could not begin."""
+        return (self._due is None or self._due > time_ns) and not self._broken and walker.ready()
+
     def monitor(self, name: str) -> Monitor:
         """A running specification by name; raises KeyError."""
         for monitor in self._monitors:
@@ -148,6 +165,7 @@ class MonitorSet:
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
             for timer in monitor.timers:
                 timer.due = None if awaited else time_ns + timer.period
+        self._broken = any(monitor.broken for monitor in self._monitors)
         self._collect(outcome)
         self._schedule()
         return outcome

@@ -35,7 +35,8 @@ class Module:
         self._lines: list[str] = []
         self._line_sites: list[int] = []
         self._names = 0
-        self._structs: dict[str, str] = {}
+        self._structs: dict[tuple[str, str], str] = {}
+        self._functions: dict[str, tuple[int, int]] = {}
 
     def fresh(self, prefix: str) -> str:
         """A name that nothing else has."""
@@ -55,16 +56,29 @@ class Module:
 
     def struct(self, code: str, method: str) -> str:
         """A name for `Struct(code).method`."""
-        key = f"{method} {code}"
+        key = (code, method)
         if key not in self._structs:
             self._structs[key] = self.use(getattr(struct.Struct(code), method), "s")
         return self._structs[key]
 
+    @property
+    def structs(self) -> dict[str, tuple[str, str]]:
+        """The names that `struct` has given: the `struct` code and the method of each."""
+        return {name: key for key, name in self._structs.items()}
+
     def add(self, lines: list[tuple[str, int]]) -> None:
-        """Append lines with their sites (-1: none)."""
+        """Append lines with their sites (-1: none): those of one function."""
+        head = lines[0][0] if lines else ""
+        if head.startswith("def "):
+            self._functions[head[4 : head.index("(")]] = (len(self._lines), len(lines))
         for line, site in lines:
             self._lines.append(line)
             self._line_sites.append(site)
+
+    def function(self, name: str) -> str | None:
+        """The source of a function; None if there is none of this name."""
+        first, count = self._functions.get(name, (0, 0))
+        return "\n".join(self._lines[first : first + count]) if count else None
 
     @property
     def next_line(self) -> int:

@@ -1,0 +1,198 @@
+"""Random specifications and messages, for comparing two ways of running the same thing."""
+
+import struct
+from dataclasses import dataclass
+from random import Random
+
+from appliance.ros.definitions import Definitions
+from appliance.ros.standard import standard_definitions
+
+OWN = Definitions.from_files(
+    {
+        "own/Plain.msg": "uint8 kind\nint32 count\nfloat64 x\nfloat32 y\nbool on\ntime when\nint64[3] three\n"
+        "uint8[] rest\n",
+        "own/Stamped.msg": "string frame\ntime when\nfloat64 x\nint16 count\nfloat64[] values\nuint8 kind\n"
+        "string[] names\n",
+    }
+)
+TOPICS = {"/plain": "own/Plain", "/stamped": "own/Stamped"}
+_PLAIN = {"kind": "int", "count": "int", "x": "double", "y": "float", "on": "bool", "when": "ros::Time",
+          "three[1]": "long", "x ": "int"}  # fmt: skip
+_STAMPED = {"frame": "std::string", "x": "double", "count": "int", "values[1]": "double", "kind": "int",
+            "when.sec": "unsigned int"}  # fmt: skip
+_LOGICS = (
+    "fsm: here [ e0 -> there, default here ] there [ e0 -> here, default there ]{here}{there}{fail}",
+    "fsm: one [ e0 -> two, default one ] two [ e0 -> three ] three [ default three ]{three}{fail}",
+    "ere: e0* (e1 | epsilon)\n{match}{fail}",
+    "ltl: [](e0 => o (e0 or e1)){violation}{validation}",
+    "ptltl: e0 -> (*) (e0 or e1){violation}{validation}",
+    "cfg: S -> e0 S e1 | epsilon{match}{fail}",
+    "mtl: once[0,1ms] e0{violation}",
+)
+_HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; }}", "@{} {{ __RESET; }}",
+             "@{} {{ total = total + 1; }}")  # fmt: skip
+
+
+def definitions() -> Definitions:
+    """ROS's definitions and the two of these tests."""
+    return standard_definitions().extended(OWN)
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Messages of one topic as frames one after the other, and how many."""
+
+    topic: str
+    frames: bytes
+    messages: int
+
+
+class Specifications:
+    """Random texts of specifications."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = Random(seed)  # noqa: S311  draws examples, not keys
+
+    def texts(self) -> list[str]:
+        """One to three specifications."""
+        return [self._specification(number) for number in range(self._random.choice((1, 1, 1, 2, 3)))]
+
+    def _specification(self, number: int) -> str:
+        random = self._random
+        events = [self._event(index) for index in range(2)]
+        properties = [self._property() for _ in range(random.choice((0, 0, 0, 1, 1, 2)))]
+        helper = "bool high(double v) { if (v > 3) { return true; } return total > 5; }"
+        tick = random.choice(("", "", "", "event tick() every 2ms { total = 0; }"))
+        return (
+            f"s{number}() {{ int total = 0; double level = 1.5; bool seen = false; std::string last;\n"
+            f"std::vector<int> all; {helper}\n" + "\n".join([*events, tick, *properties]) + "\n}"
+        )
+
+    def _event(self, index: int) -> str:
+        random = self._random
+        topic = random.choice(("/plain", "/plain", "/stamped"))
+        fields = _PLAIN if topic == "/plain" else _STAMPED
+        chosen = random.sample(sorted(fields), random.randint(0, 3))
+        names = {}
+        for place, field in enumerate(dict.fromkeys(one.strip() for one in chosen)):
+            kind = next(fields[one] for one in chosen if one.strip() == field)
+            names[f"p{place}"] = (field, kind)
+        parameters = ", ".join(f"{kind} {name}" for name, (_, kind) in names.items())
+        pattern = [f"{field}:{name}" for name, (field, _) in names.items()]
+        if random.random() < 0.3 and not any(field == "kind" for field, _ in names.values()):
+            pattern.append("kind:1")
+        numbers = [name for name, (_, kind) in names.items() if kind not in ("std::string", "ros::Time")]
+        readable = [*numbers, "total", "level", "seen"]
+        when = f"when ({self._condition(readable)})" if random.random() < 0.3 else ""
+        body = " ".join(self._statement(names, readable, 2) for _ in range(random.randint(0, 4)))
+        kind = TOPICS[topic]
+        return f"event e{index}({parameters}) {topic} {kind} '{{{', '.join(pattern)}}}' {when} {{ {body} }}"
+
+    def _property(self) -> str:
+        logic = self._random.choice(_LOGICS)
+        found: dict[str, str] = {}
+        for category in ("here", "there", "three", "match", "fail", "violation", "validation"):
+            handler = self._random.choice(_HANDLERS)
+            found[category] = "\n" + handler.format(category, category)
+        text = logic.format(**found)
+        if "@" not in text:
+            text = logic.format(
+                **dict.fromkeys(found, "")
+                | {first: f"\n@{first} {{ }}" for first in [logic[logic.rindex("{") + 1 : -1]]}
+            )
+        return text
+
+    def _expression(self, names: list[str], depth: int) -> str:
+        random = self._random
+        if not depth or random.random() < 0.3:
+            return random.choice([*names, "0", "1", "2", "-3", "0.5", "2.5", "100"])
+        one, other = (self._expression(names, depth - 1) for _ in range(2))
+        return random.choice(
+            (
+                f"({one} + {other})", f"({one} - {other})", f"({one} * {other})", f"({one} / {other})",
+                f"((int) {one} % (int) {other})", f"std::max((double) {one}, (double) {other})",
+                f"(high({one}) ? {one} : {other})", f"std::abs({one})", f"-({one})",
+            )
+        )  # fmt: skip
+
+    def _condition(self, names: list[str]) -> str:
+        random = self._random
+        one, other = (self._expression(names, 1) for _ in range(2))
+        sign = random.choice(("<", ">", "==", "!=", "<=", ">="))
+        return random.choice(
+            (f"{one} {sign} {other}", f"!({one} {sign} {other})", f"{one} > 1 && {other} < 2")
+        )
+
+    def _statement(self, names: dict[str, tuple[str, str]], readable: list[str], depth: int) -> str:
+        random = self._random
+        value = self._expression(readable, 2)
+        assigned = [name for name in names if name in readable] * 3
+        texts = [name for name, (_, kind) in names.items() if kind == "std::string"]
+        choices = [
+            f"total = {value};", f"level = {value};", "total++;", "seen = !seen;", f"total += {value};",
+            *(f"{name} = {value};" for name in assigned),
+            *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
+        ]  # fmt: skip
+        if depth:
+            inner = self._statement(names, readable, depth - 1)
+            other = self._statement(names, readable, depth - 1)
+            choices += [f"if ({self._condition(readable)}) {{ {inner} }} else {{ {other} }}"] * 3
+            choices.append(f"if ({self._condition(readable)}) {{ {inner} }}")
+        if depth < 2:
+            choices += ["return;", "DROP;"] * 2
+        if depth < 2 and random.random() < 0.3:
+            choices += ['ROS_WARN("said %d", total);', "all.push_back(total);",
+                        "for (int i = 0; i < 3; i++) { total += i; }"]  # fmt: skip
+            choices += [f'{name} = "other";' for name in texts]
+        return random.choice(choices)
+
+
+class Messages:
+    """Random messages of the two topics."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = Random(seed)  # noqa: S311
+
+    def traffic(self) -> Traffic:
+        """Some messages of one topic; mostly equally long, now and then not even of their type."""
+        random = self._random
+        topic = random.choice(("/plain", "/plain", "/stamped"))
+        make = self._plain if topic == "/plain" else self._stamped
+        alike = random.random() < 0.7
+        count = random.choice((1, 1, 2, 5, 12, 30))
+        shape = random.randrange(1 << 30)
+        frames = b"".join(make(shape if alike else random.randrange(1 << 30)) for _ in range(count))
+        return Traffic(topic, frames, count)
+
+    def _number(self) -> float:
+        return self._random.choice(
+            (*(0.0, -0.0, 1.0, 2.5, 2.5, -3.0, 100.0) * 4, float("nan"), float("inf"), 1e-40)
+        )
+
+    def _plain(self, shape: int) -> bytes:
+        random = self._random
+        rest = b"\x05" * (shape % 9)
+        body = struct.pack("<Bi", random.choice((0, 1, 1, 2)), random.choice((0, 1, 5, -7, 2**31 - 1)))
+        body += struct.pack("<dfB", self._number(), self._number(), random.choice((0, 1, 1, 2)))
+        body += struct.pack("<II3q", 5, random.choice((0, 7, 3_000_000_000)), 1, random.choice((0, 2, -1)), 3)
+        body += struct.pack("<I", len(rest)) + rest
+        return _frame(body[: random.choice((*[None] * 60, 3))])  # type: ignore[misc]  # None: all of it
+
+    def _stamped(self, shape: int) -> bytes:
+        random = self._random
+        frame = (b"abc", b"abd", b"", b"longer")[shape % 4] if random.random() < 0.95 else b"xyz"
+        values = [self._number() for _ in range(shape % 3)]
+        names = [b"n" * (shape % 5)] * (shape % 2)
+        if frame and names and random.random() < 0.1:  # as long as the others, with other lengths inside
+            frame, names = frame[:-1], [names[0] + b"n"]
+        body = struct.pack("<I", len(frame)) + frame
+        body += struct.pack("<IIdh", 9, 8, self._number(), random.choice((0, 1, -5)))
+        body += struct.pack(f"<I{len(values)}d", len(values), *values) + struct.pack(
+            "<B", random.choice((0, 1))
+        )
+        body += struct.pack("<I", len(names)) + b"".join(struct.pack("<I", len(one)) + one for one in names)
+        return _frame(body)
+
+
+def _frame(body: bytes) -> bytes:
+    return struct.pack("<I", len(body)) + body
