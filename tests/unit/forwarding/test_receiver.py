@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from appliance.forwarding.receiver import DatagramReceiver, StreamReceiver, tls_context
+from tests.support.certificates import Certificates, make_certificates
 from tests.support.syslog import DatagramCollector, StreamCollector
-from tests.unit.forwarding.conftest import Certificates, make_certificates
 
 HOST = "127.0.0.1"
 

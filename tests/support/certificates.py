@@ -1,0 +1,56 @@
+"""Certificates for tests: an authority of the test's own, and one certificate of it."""
+
+import datetime
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
+
+
+@dataclass(frozen=True)
+class Certificates:
+    """Files in PEM: an authority, and a certificate of it with its key, for an address and logs.example."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+def make_certificates(folder: Path, address: str = "127.0.0.1") -> Certificates:
+    """An authority, and a certificate for a server or client with this address."""
+    folder.mkdir(parents=True)
+    now = datetime.datetime.now(datetime.UTC)
+    keys = {name: ec.generate_private_key(ec.SECP256R1()) for name in ("ca", "peer")}
+    issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test authority")])
+
+    def made(name: str, subject: x509.Name, extensions: list[Any]) -> Path:
+        builder = x509.CertificateBuilder(
+            issuer,
+            subject,
+            keys[name].public_key(),
+            x509.random_serial_number(),
+            now - datetime.timedelta(hours=1),
+            now + datetime.timedelta(days=1),
+        )
+        for extension, critical in extensions:
+            builder = builder.add_extension(extension, critical)
+        file = folder / f"{name}.pem"
+        file.write_bytes(builder.sign(keys["ca"], hashes.SHA256()).public_bytes(Encoding.PEM))
+        return file
+
+    usage = x509.KeyUsage(*[True] * 1, *[False] * 4, *[True] * 2, *[False] * 2)
+    ca = made("ca", issuer, [(x509.BasicConstraints(True, None), True), (usage, True)])
+    names = x509.SubjectAlternativeName(
+        [x509.IPAddress(ipaddress.ip_address(address)), x509.DNSName("logs.example")]
+    )
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "peer")])
+    certificate = made("peer", subject, [(names, False)])
+    key = folder / "peer.key"
+    key.write_bytes(keys["peer"].private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    return Certificates(ca, certificate, key)
