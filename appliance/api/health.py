@@ -3,7 +3,7 @@
 from typing import Any, Literal
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Viewer, ask
@@ -57,6 +57,7 @@ class Status(_Model):
 
     version: str
     since: float
+    master: str = Field(description="where nodes find their master")
     processes: list[Process]
     isolation: str
     firewall: dict[str, Any]

@@ -120,7 +120,8 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         sys.stdout.write(lines + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
-        log.warning("nobody reads standard output", lines=None if said.token else lines)
+        kept = None if said.token is None else str(_keep_token(settings.state, said.token))
+        log.warning("nobody reads standard output", first_token=kept, lines=None if said.token else lines)
 
 
 def _rest_url(settings: Settings) -> str | None:

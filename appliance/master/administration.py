@@ -224,6 +224,7 @@ class Administration:
         return {
             "version": appliance.__version__,
             "since": self._started,
+            "master": self._surroundings.master,
             "processes": msgspec.to_builtins(self._surroundings.processes),
             "isolation": self._surroundings.firewall.isolation,
             "firewall": self._surroundings.firewall.report,

@@ -22,6 +22,8 @@ class ControlLifeline:
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
+        self.announced = False  # whether whoever started the appliance knows what `Ready` said
+        self.was_announced: Callable[[], None] = lambda: None
         self.links: dict[str, Callable[[int, int], None]] = {}
         self.stopped: Callable[[], None] = lambda: None
         self.processes_changed: Callable[[], None] = lambda: None
@@ -78,7 +80,8 @@ class ControlLifeline:
                 self.stopped()
             case messages.SocketRestored(name):
                 self.sockets[name] = socket.socket(fileno=descriptors[0])
-            case messages.SocketsRestored():
+            case messages.SocketsRestored(_count, announced):
+                self.announced = announced
                 self.restored.set()
             case messages.LinkOpened(role, index):
                 self._open_link(role, index, descriptors[0])
@@ -95,6 +98,9 @@ class ControlLifeline:
                 self.processes_changed()
             case messages.PolicyReloadRequested():
                 self.reload_requested()
+            case messages.Announced():
+                self.announced = True
+                self.was_announced()
             case messages.FirewallReported():
                 self.surroundings.firewall = message
             case messages.ProbeFailed(reason):

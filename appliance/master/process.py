@@ -184,6 +184,9 @@ class _Control:
         await doors.open(sockets[_OWN], parts.pipeline.handler(MASTER_CALLS, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
         self._tokens = Tokens(base.store, base.recorder)
+        if self._lifeline.announced:
+            self._tokens.told()
+        self._lifeline.was_announced = self._tokens.told
         self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
         administration = Administration(
             parts.master,
@@ -239,6 +242,7 @@ class _Control:
         host, base = self._settings.listen_address[0], self._base
         told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
         uri = node_uri(told, base.port(RVMASTER))
+        self._lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
             base.recorder.happened(
                 "appliance started", f"nodes may connect at {uri}", severity=Severity.NOTICE

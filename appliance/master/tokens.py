@@ -14,6 +14,7 @@ from appliance.store.state import StateStore
 from appliance.store.tokens import BadTokenNameError, TokenRow, make_token
 
 FIRST_NAME = "first"
+_UNTOLD = "first token untold"  # the setting that says that nobody may know it yet
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
@@ -30,6 +31,7 @@ class Tokens:
         self._store = store
         self._recorder = recorder
         self._rows = {row.id: row for row in store.tokens()}
+        self._untold = bool(store.settings().get(_UNTOLD))
         self.changed: Callable[[], None] = lambda: None
 
     def rows(self) -> list[TokenRow]:
@@ -46,11 +48,21 @@ class Tokens:
         ]
 
     async def first(self) -> str | None:
-        """The text of the first token, if there never was one."""
-        if self._rows:
+        """The text of the first token, if there never was one; of another, if nobody was told that one (`told`)."""
+        if self._rows and not self._untold:
             return None
+        self._untold = True
+        self._store.save_setting(_UNTOLD, "yes")
+        if self._named(FIRST_NAME, time.time()) is not None:
+            await self.revoke(FIRST_NAME)
         _row, text = await self.add(FIRST_NAME, "admin", DEFAULT_SECONDS)
         return text
+
+    def told(self) -> None:
+        """Whoever started the appliance has the first token."""
+        if self._untold:
+            self._untold = False
+            self._store.save_setting(_UNTOLD, "")
 
     async def add(self, name: str, role: str, seconds: float) -> tuple[TokenRow, str]:
         """Make a token that ends after `seconds`; its text is given here and never again.

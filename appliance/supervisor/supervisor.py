@@ -25,6 +25,7 @@ import msgspec
 import structlog
 
 from appliance.channel.messages import (
+    Announced,
     ApplianceStopRequested,
     Failed,
     Message,
@@ -241,7 +242,7 @@ class Supervisor:
     def _equip_control(self, life: Life) -> None:
         for name, descriptor in self._kept:
             life.send(SocketRestored(name), (descriptor,))
-        life.send(SocketsRestored(len(self._kept)))
+        life.send(SocketsRestored(len(self._kept), self._is_ready))
         for message in self._guard.news():
             life.send(message)
 
@@ -324,6 +325,7 @@ class Supervisor:
         if not self._is_ready:
             self._is_ready = True
             self._ready(said)
+            life.send(Announced())
 
     async def _route(self, life: Life, host: str) -> None:
         life.send(RouteFound(host, await self._guard.route_to(host)))

@@ -18,6 +18,7 @@ from appliance.channel.messages.api import (
 )
 from appliance.channel.messages.forwarding import ForwardingLink, ForwardingReported
 from appliance.channel.messages.lifeline import (
+    Announced,
     ApplianceStopRequested,
     Failed,
     FirewallReported,
@@ -110,6 +111,7 @@ from appliance.channel.messages.tunnels import (
 
 __all__ = [
     "APPLIANCE_NAME",
+    "Announced",
     "ApiLink",
     "ApplianceStopRequested",
     "AuthorityStated",

@@ -71,9 +71,17 @@ class SocketRestored(Message):
 
 
 class SocketsRestored(Message):
-    """All kept sockets have been given back; sent at every start of control, also when there are none."""
+    """All kept sockets have been given back; sent at every start of control, also when there are none.
+
+    `announced`: whoever started the appliance has been told what an earlier control said with `Ready`.
+    """
 
     count: int
+    announced: bool = False
+
+
+class Announced(Message):
+    """Whoever started the appliance has been told what control said with `Ready`, the first token included."""
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):
@@ -133,8 +141,8 @@ class ApplianceStopRequested(Message):
 
 Lifeline = (
     Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
-    | SocketsRestored | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed | PolicyReloadRequested
-    | RouteWanted
+    | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
+    | PolicyReloadRequested | RouteWanted
     | TunnelsWanted | TunnelsEnclosed
     | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip
