@@ -19,6 +19,7 @@ EVENTS: dict[str, str] = {
     "host renewed": "A host got a new certificate, and the one before was revoked.",
     "host revoked": "A host may no longer come: certificate revoked, tunnel closed, registrations taken back.",
     "tunnel up": "The tunnel of an enrolled host is up; `host` is its virtual address, `detail` has the real one.",
+    "tunnel moved": "A standing tunnel comes from another real address now; `detail` has both.",
     "tunnel down": "The tunnel of an enrolled host is down; nothing of it is accepted until it is back.",
     "tunnel refused": "Somebody asked for a tunnel and was refused; `host` is the real address, `reason` says why.",
     "specifications loaded": "Specifications of monitors came into force; `detail` has who, and which files changed.",

@@ -5,7 +5,8 @@ Invariants:
 1. `open` first has the supervisor take the pool's addresses through IPsec only; before that, `enclosed` is False
    and no address of a host counts.
 2. What charon is to have is stated whole each time, in the order in which it came about.
-3. Every tunnel that comes up, goes down or is refused is recorded.
+3. Every tunnel that comes up, moves, goes down or is refused is recorded.
+4. A certificate's end is the end of its tunnel.
 """
 
 import asyncio
@@ -42,6 +43,7 @@ _OPEN_SECONDS = 20.0
 _TAKEN_SECONDS = 10.0
 _RESTATE_SECONDS = 3600.0
 _AGAIN_SECONDS = 5.0
+_JUST_AFTER_SECONDS = 0.1
 
 
 class Tunnels:
@@ -137,10 +139,10 @@ class Tunnels:
         self._dirty.set()
 
     async def run(self) -> None:
-        """State what charon is to have whenever it changes, and every hour (expired hosts, the list's age)."""
+        """State what charon is to have: when it changes, when a certificate ends, every hour (the list's age)."""
         while True:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._dirty.wait(), _RESTATE_SECONDS)
+                await asyncio.wait_for(self._dirty.wait(), self._until_it_changes())
             self.each_hour()
             self._dirty.clear()
             try:
@@ -148,6 +150,12 @@ class Tunnels:
             except AuthorityError as error:
                 _log.warning("charon is told later", reason=str(error))
                 asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
+
+    def _until_it_changes(self) -> float:
+        """Seconds until something changes by itself: charon would keep a tunnel whose certificate has ended."""
+        now = time.time()
+        ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
+        return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
         """Wait until charon has what is stated after now; False when it does not come in time."""
@@ -251,9 +259,24 @@ class Tunnels:
             self._went_down(name, "gone")
         for name, row in standing.items():
             self._changed(name, True, row.remote)
+            self._look_where(row)
             if row.bytes_in > self.seen[name].bytes_in:
                 self.last[name] = now
             self.seen[name] = row
+
+    def _look_where(self, row: TunnelSeen) -> None:
+        """A host that moves keeps its tunnel; a copy of its kit elsewhere would look like this, too."""
+        before = self.seen[row.name].remote
+        if row.remote != before:
+            self._recorder.happened(
+                "tunnel moved",
+                f"{row.name} comes from {row.remote} now, before from {before}",
+                severity=Severity.NOTICE,
+                host=self._table.rows[row.name].address,
+                name=row.name,
+                remote=row.remote,
+                before=before,
+            )
 
     def _went_down(self, name: str, reason: str) -> None:
         seen = self.seen.pop(name, None)
