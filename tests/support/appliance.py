@@ -83,7 +83,7 @@ class Appliance:
         command += self.options  # last, for of a flag given twice the second counts
         self.process = Process(self.host, command, env=_environment(), label="rosrv up")
         if self.json:
-            self.ready = self.process.wait_for(event="ready", timeout=60)
+            self.ready = self.process.wait_for(event="ready", timeout=2 * LIMIT)
         else:
             self.process.wait_for_text("Nodes may connect", timeout=60)
         return self

@@ -14,13 +14,13 @@ from typing import Any, Self
 from appliance.network.lab import Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
-from tests.support.processes import Event, Process, ThisMachine
+from tests.support.processes import LIMIT, Event, Process, ThisMachine
 from tests.support.tunnels import JoinedHost
 
 MIDDLE, ROBOT, OCU, ATTACKER = "10.88.0.2", "10.88.0.10", "10.88.0.20", "10.88.0.66"
 MASTER = f"http://{MIDDLE}:11311"
 OWN = "10.113.11.1"  # the appliance's address in the tunnels
-LONG = 60.0  # seconds
+LONG = 2 * LIMIT  # seconds
 POLICY = f"""\
 [Groups]
 trusted = host:ocu-1, {ROBOT}

@@ -166,3 +166,21 @@ def _checksum(header: bytes) -> bytes:
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
     return (~total & 0xFFFF).to_bytes(2)
+
+
+def connect(host: Host, source: str, target: str, port: int = 11311) -> str:
+    """What comes of a TCP connection from this source address: `connected`, `refused` or `nothing`."""
+
+    def work() -> str:
+        with socket.socket() as client:
+            client.settimeout(4)
+            client.bind((source, 0))
+            try:
+                client.connect((target, port))
+            except TimeoutError:
+                return "nothing"
+            except ConnectionRefusedError:
+                return "refused"
+            return "connected"
+
+    return host.run(work)

@@ -1,0 +1,135 @@
+"""Tunnels in everyday trouble: hosts that move, ends that restart in either order, new keys under traffic."""
+
+import contextlib
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.network.lab import INTERFACE, Lab
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import need_root
+from tests.support.tunnel_site import LONG, TunnelSite, numbers
+from tests.support.tunnels import JoinedHost, need_strongswan
+
+SHORT_LIVES = """
+connections {
+  rosrv {
+    rekey_time = 11s
+    rand_time = 0
+    children {
+      ros {
+        rekey_time = 4s
+        rand_time = 0
+      }
+    }
+  }
+}
+"""
+
+
+@pytest.fixture
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
+    """An appliance."""
+    need_root()
+    need_strongswan()
+    with Lab("rosrv-endure") as lab, TunnelSite(lab, tmp_path_factory.mktemp("endure")) as one:
+        yield one
+
+
+def up_again(joined: JoinedHost, since: int) -> None:
+    """The tunnel stands again, as the host sees it."""
+    assert joined.charon is not None
+    joined.charon.wait_for(
+        lambda event: "CHILD_SA ros" in str(event.get("text")) and "established" in str(event.get("text")),
+        since=since,
+        timeout=LONG,
+    )
+
+
+def test_a_host_moves(site: TunnelSite) -> None:
+    """A host whose address changes keeps its tunnel and its connections, and the log says where it is now."""
+    roamer = site.lab.host("roamer", "10.88.0.40/24")
+    roamer.namespace.sysctl("net.ipv4.conf.all.promote_secondaries", "1")
+    with site.joined(site.kit(), roamer) as joined, site.talking(joined) as (_, listener):
+        mark = site.mark
+        for command in (["add", "10.88.0.41/24"], ["del", "10.88.0.40/24"]):
+            assert roamer.popen(["ip", "addr", *command, "dev", INTERFACE]).wait(LIMIT) == 0
+        moved = site.recorded(mark, event="tunnel moved")
+        assert (moved["host"], moved["detail"]["remote"]) == (joined.address, "10.88.0.41")
+        listener.wait_for_count(len(listener.seen(event="received")) + 20, event="received")
+        assert [one["remote"] for one in site.hosts()] == ["10.88.0.41"]
+        assert site.trail.seen(event="tunnel down") == []
+        heard = numbers(listener)
+        assert heard == list(range(heard[0], heard[0] + len(heard))), "no message was lost on the way"
+
+
+def test_new_keys_under_traffic(site: TunnelSite) -> None:
+    """While keys are changed every few seconds, of ESP and of IKE, not one message is lost."""
+    with (
+        site.joined(site.kit(), settings=SHORT_LIVES) as joined,
+        site.talking(joined, rate=100) as (talker, listener),
+    ):
+        charon = joined.charon
+        assert charon is not None
+        _told(charon, "inbound CHILD_SA ros{", 4)
+        _told(charon, "rekeyed between", 1)
+        sent = int(talker.seen(event="sent")[-1]["number"])
+        listener.wait_for(data=f"hello {sent}", timeout=LONG)
+        heard = numbers(listener)
+        assert heard == list(range(heard[0], heard[0] + len(heard)))
+        assert site.trail.seen(event="tunnel down") == []
+
+
+def _told(charon: Process, text: str, count: int) -> None:
+    """Wait until charon has said this so many times."""
+    position = 0
+    for _ in range(count):
+        found = charon.wait_for(lambda event: text in str(event.get("text")), since=position, timeout=LONG)
+        position = next(i for i in range(position, len(charon.events)) if charon.events[i] is found) + 1
+
+
+@contextlib.contextmanager
+def restarted(site: TunnelSite, how: int) -> Iterator[None]:
+    """The appliance ends by this signal, something happens, and it is there again."""
+    site.trail.stop()
+    assert site.appliance.process is not None
+    site.appliance.process.stop(with_signal=how)
+    yield
+    site.appliance.start()
+    site.watch()
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_both_ends_restart(site: TunnelSite, how: int) -> None:
+    """Whatever order the two ends restart in, orderly or not, the tunnel and what flows in it are back."""
+    kit = site.kit()
+    host = site.join(kit)
+    with host:
+        host.wait_until_up()
+        # The appliance alone, while its host stays.
+        assert host.charon is not None
+        mark = host.charon.mark()
+        with restarted(site, how):
+            pass
+        up_again(host, mark)
+        with site.talking(host):
+            pass
+        # The host alone, without a word to the appliance.
+        host.charon.kill()
+        host.stop()
+        host.start()
+        host.wait_until_up()
+        # Both: the host comes back first and asks nobody; then the other way round.
+        with restarted(site, how):
+            host.stop()
+            host.start()
+        host.wait_until_up()
+        with restarted(site, how):
+            host.charon.kill()
+        host.stop()
+        host.start()
+        host.wait_until_up()
+        with site.talking(host):
+            pass
+        assert site.state() == "up"

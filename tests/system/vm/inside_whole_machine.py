@@ -1,0 +1,137 @@
+"""Runs in the virtual machine: the appliance, and the machine of a trusted host, as they are on real machines.
+
+What happens here changes the network of the machine itself, so it is never run anywhere else.
+"""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network import links
+from appliance.network.lab import INTERFACE, Host, Lab
+from appliance.network.namespaces import Namespace, namespaces
+from tests.support.appliance import ROSRV, Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT
+from tests.support.root_host import root_host
+from tests.support.tunnel_site import ATTACKER, LONG, MIDDLE, OCU, OWN, POLICY, ROBOT, TunnelSite
+from tests.support.tunnels import JoinedHost
+from tests.support.wire import connect
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """An Ethernet."""
+    with Lab("rosrv-machine") as lab:
+        yield lab
+
+
+def told(*command: str) -> str:
+    """What a program says on the machine itself."""
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT, check=False
+    )
+    return done.stdout
+
+
+def state_of_the_machine() -> dict[str, object]:
+    """What an appliance changes on a machine, and must put back."""
+    return {
+        "rules": told("nft", "list", "ruleset"),
+        "iptables": "ROSRV" in told("iptables-legacy-save") + told("ip6tables-legacy-save"),
+        "states": told("ip", "xfrm", "state"),
+        "policies": told("ip", "xfrm", "policy"),
+        "interfaces": sorted(links.links(Namespace.own())),
+        "addresses": sorted(one for one in links.addresses(Namespace.own()) if not one.startswith("fe80")),
+        "namespaces": [one.name for one in namespaces() if not one.name.startswith("rosrv-machine")],
+        "forwarding": Path("/proc/sys/net/ipv4/ip_forward").read_text(),
+    }
+
+
+@pytest.mark.parametrize(
+    ("isolation", "backend"), [("netns", "nft"), ("container", "iptables")], ids=["netns", "container"]
+)
+def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, backend: str) -> None:
+    """On the machine itself the ROSMaster is hidden, nodes in clear text and behind a kernel tunnel hear each other, a
+    forged address gets nowhere, and an orderly end leaves the machine as it was."""
+    robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
+    attacker = lab.host("attacker", f"{ATTACKER}/24")
+    config, kit = tmp_path / "appliance.yaml", tmp_path / "kit.tar.gz"
+    config.write_text(f"firewall: {{backend: {backend}}}\n")
+    options = ("--listen", "0.0.0.0:11311", "--api", "off", "--config", str(config))
+    with root_host(lab, f"{MIDDLE}/24") as machine:
+        before = state_of_the_machine()
+        with Appliance(machine, policy=POLICY, isolation=isolation, options=options) as one:
+            one.rosrv("host", "add", "ocu-1", "--appliance", MIDDLE, "--out", str(kit))
+            with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
+                joined.wait_until_up()
+                with (
+                    RosSession(joined.master, tmp_path, joined) as there,
+                    RosSession(f"http://{MIDDLE}:11311", tmp_path, robot) as here,
+                ):
+                    there.talker("rospy", "/orders", name="boss")
+                    here.listener("rospy", "/orders", name="arm").wait_for(event="received", timeout=LONG)
+                links.add_address(attacker.namespace, INTERFACE, f"{joined.address}/32")
+                assert connect(attacker, joined.address, MIDDLE) == "nothing"
+                assert connect(attacker, ATTACKER, MIDDLE) == "connected"
+                assert connect(ocu, joined.address, OWN) == "connected"
+                status = one.status()
+            assert status["ipsec"]["esp"] == "kernel"
+            assert (status["isolation"], status["firewall"]["backend"]) == (isolation, backend)
+            assert status["probe"] == "passed"
+            assert one.stop() == 0
+        assert state_of_the_machine() == before
+
+
+def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
+    """join.sh on a Debian with systemd: the tunnel is up, ROS works through it, its own ports are closed to others;
+    leave.sh takes all of it away."""
+    with (
+        TunnelSite(lab, tmp_path, options=("--api", "off")) as site,
+        root_host(lab, "10.88.0.50/24") as machine,
+    ):
+        kit = site.kit()
+        before = state_of_the_machine()
+        subprocess.run(["tar", "-xzf", str(kit), "-C", str(tmp_path)], check=True)
+        folder = tmp_path / "rosrv-ocu-1"
+        joining = subprocess.run(
+            [str(folder / "join.sh")], capture_output=True, text=True, timeout=LONG * 2, check=False
+        )
+        assert joining.returncode == 0, (
+            joining.stdout + joining.stderr + told("journalctl", "-u", "strongswan")
+        )
+        assert "ESP runs in the kernel" in joining.stdout
+        setting = next(line for line in joining.stdout.splitlines() if "ROS_MASTER_URI=" in line)
+        master = setting.split("ROS_MASTER_URI=")[1].split()[0]
+        address = setting.split("ROS_IP=")[1].split()[0]
+        node = _Joined(address, machine)
+        with (
+            RosSession(master, tmp_path, node) as there,
+            RosSession(f"http://{MIDDLE}:11311", tmp_path, site.robot) as here,
+        ):
+            there.talker("rospy", "/orders", name="boss")
+            here.listener("rospy", "/orders", name="arm").wait_for(event="received", timeout=LONG)
+            seen = site.attacker.popen(
+                [ROSRV, "protect", "--check", "10.88.0.50"],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            assert "closed" in seen.communicate(timeout=LONG)[0]
+        assert site.state() == "up"
+        leaving = subprocess.run(
+            [str(folder / "leave.sh")], capture_output=True, text=True, timeout=LONG, check=False
+        )
+        assert leaving.returncode == 0, leaving.stderr
+        told("systemctl", "stop", "strongswan")
+        assert state_of_the_machine() == before
+
+
+class _Joined:
+    """The machine as nodes on it are told of it: by its virtual address."""
+
+    def __init__(self, address: str, machine: Host) -> None:
+        self.address = address
+        self.popen = machine.popen

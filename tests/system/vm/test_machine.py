@@ -1,0 +1,66 @@
+"""The appliance in a virtual machine with Debian's own kernel: what no namespace of the test machine can show.
+
+Each test here runs some tests *in* the machine: those of `inside_*.py`, which are written for it, and those of other
+folders whose promise depends on the kernel. What they said is in the report when one fails.
+"""
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.machine import Machine
+from tests.support.machine_disk import ROOT
+
+HERE = "tests/system/vm"
+PLUGINS = ("env", "PYTEST_DISABLE_PLUGIN_AUTOLOAD=1")
+SECONDS = 600.0
+
+pytestmark = pytest.mark.timeout(900)  # the first one makes the machine's disk
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """The machine, booted once for all tests here."""
+    with Machine(tmp_path_factory.mktemp("machine")) as one:
+        yield one
+        assert one.stop(), f"it was not switched off in order\n{one.story()}"
+
+
+def passes(machine: Machine, *what: str) -> None:
+    """These tests pass in the machine, all of them: none is skipped."""
+    done = machine.run(
+        *(*PLUGINS, f"{ROOT}/.venv/bin/pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--quiet"),
+        *("--durations=5", *what),
+        seconds=SECONDS,
+        check=False,
+    )
+    assert done.status == 0, f"in the machine ({done.seconds:.0f} s):\n{done.output}"
+    summary = done.output.strip().splitlines()[-1]
+    assert "passed" in summary, summary
+    assert "skipped" not in summary, done.output
+
+
+def test_the_kernels_esp(machine: Machine) -> None:
+    """Tunnels in the kernel: nodes talk, forged addresses do not, by both back ends, and nothing is left behind."""
+    passes(machine, f"{HERE}/inside_kernel_esp.py")
+
+
+def test_the_appliance_on_a_machine(machine: Machine) -> None:
+    """isolation netns and container on the machine itself, from its start to a machine that is as it was before."""
+    passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "appliance")
+
+
+def test_the_kit_on_a_machine(machine: Machine) -> None:
+    """join.sh and leave.sh of a kit, on a Debian with systemd."""
+    passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "joins")
+
+
+def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
+    """Both back ends hide the ROSMaster and keep tunnelled addresses from being forged, in this kernel too."""
+    passes(machine, "tests/system/network/test_firewall.py", "-k", "tunnelled_host or only_control")
+
+
+def test_the_machine_is_alone(machine: Machine) -> None:
+    """It runs Debian's cloud kernel and has no network card: what happens in it stays in it."""
+    assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
+    assert machine.run("ip", "-br", "link").output.split()[0::3] == ["lo"]
