@@ -193,6 +193,7 @@ class Engine:
         if node is not None and node.monitors:
             publisher = self._own[topic] = OwnPublisher(relayed, lambda: self._header_of(topic))
             relayed.upstream = publisher
+            relayed.monitor(None, wanted=True)
         else:
             publisher = Publisher(
                 self._context, relayed, lambda header: self._middle.objection(topic, header)

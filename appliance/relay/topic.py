@@ -14,7 +14,7 @@ the withdrawal.
 
 A topic that monitors want has its upstream without any subscriber, too. What they leave of a batch (`middle`) is
 what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
-(`published`).
+(`published`). What comes while nobody is served is kept for a moment (`recent`).
 
 When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
 most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
@@ -27,6 +27,7 @@ from typing import Protocol
 
 from appliance.channel.messages import TopicTraffic
 from appliance.relay.frames import Batch, MemoryBudget
+from appliance.relay.recent import Recent
 
 
 class Member(Protocol):
@@ -103,6 +104,7 @@ class RelayedTopic:
         self._served: tuple[Member, ...] = ()
         self._latched: Batch | None = None
         self._latching = False
+        self._recent: Recent | None = None
         self._paused = False
         self._connected = False
         self._through: Through | None = None
@@ -131,6 +133,9 @@ class RelayedTopic:
         self._announce()
         self._reported = False
         self._forget_header()
+        if not self.members:
+            self._drop_recent()
+            self._settle_recent()
         self.relieve()
         if not self.members and not self._wanted and self.upstream is not None:
             self.upstream.spare()
@@ -141,6 +146,7 @@ class RelayedTopic:
         if wanted == self._wanted:
             return
         self._wanted = wanted
+        self._settle_recent()
         if self.upstream is None:
             return
         if wanted:
@@ -154,6 +160,7 @@ class RelayedTopic:
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
         self._connected = True
+        self._settle_recent()
         if before is not None and _identity(before) != _identity(header):
             for member in self._served:
                 member.cut("the publisher has come back with another type")
@@ -169,6 +176,7 @@ class RelayedTopic:
         self._latch(None)
         self._paused = False
         self._connected = False
+        self._settle_recent()
         self._forget_header()
 
     def received(self, batch: Batch) -> None:
@@ -193,6 +201,8 @@ class RelayedTopic:
     def _pass_on(self, batch: Batch) -> None:
         if self._latching:
             self._latch(batch.keep_last())
+        if self._recent is not None:
+            self._remember(self._recent, batch)
         congested = False
         for member in self._served:
             member.deliver(batch)
@@ -231,7 +241,30 @@ class RelayedTopic:
         self._reported = False
         if self._latched is not None:
             member.deliver(self._latched)
+        elif self._recent is not None:
+            for batch in self._recent.give(member.caller_id, self._clock()):
+                member.deliver(batch)
         self.relieve()
+
+    def _settle_recent(self) -> None:
+        """Begin to keep what comes, or stop: there is a publisher that has nobody but a monitor."""
+        if self._recent is None:
+            if self._connected and self._wanted and not self._latching and not self.members:
+                self._recent = Recent(self._budget)
+        elif not self._connected or (not self._wanted and not self._served):
+            self._drop_recent()
+
+    def _remember(self, recent: Recent, batch: Batch) -> None:
+        now = self._clock()
+        if recent.over(now):
+            self._drop_recent()
+        else:
+            recent.add(batch, now)
+
+    def _drop_recent(self) -> None:
+        if self._recent is not None:
+            self._recent.clear()
+            self._recent = None
 
     def _forget_header(self) -> None:
         """Without a connection the header is only good for those who have been given it."""

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.relay_driver import wait_until
 from tests.support.requirements import needs
 
+CLIENTS: list[Client] = ["rospy", "roscpp"]
 SPECIFICATION = """
 NAME() {
     int heard = 0;
@@ -168,3 +169,20 @@ def test_services_are_carried_by_the_relay_of_their_monitor(
         client.send("true")
         client.wait_for_count(2, event="answered")
     wait_until(lambda: int(str(rows(appliance)["gate"]["events"])) == 2, "the monitor has seen both requests")
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
+    appliance: Appliance, ros: RosSession, client: Client
+) -> None:
+    """Which is connected, and counts as the subscriber the publisher waits for, before the real one is."""
+    listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]
+    for number in range(3):
+        talker = ros.node("rospy", "patient_talker", "/left", name=f"voice{number}")
+        talker.wait_for(event="sent")
+        for listener in listeners:
+            heard = listener.wait_for(event="received", publisher=f"/voice{number}")
+            assert heard["data"].endswith("hello 1")
+        talker.stop()
+    for listener in listeners:
+        assert len(listener.seen(event="received")) == 3

@@ -93,9 +93,9 @@ class Story:
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream
 
-    def join(self) -> RecordedMember:
+    def join(self, caller_id: str = "/listener") -> RecordedMember:
         """One more subscriber."""
-        member = RecordedMember()
+        member = RecordedMember(caller_id=caller_id)
         self.topic.join(member)
         return member
 
@@ -150,6 +150,68 @@ def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
     story.topic.upstream_opened(HEADER)
     story.topic.received(batch(b"1"))
     assert story.join().received == b""
+
+
+def monitored(*, latching: str = "0") -> Story:
+    """A topic that a monitor wants, with its publisher connected and nobody else."""
+    story = Story()
+    story.topic.monitor(lambda batch: batch, wanted=True)
+    story.topic.upstream_opened(HEADER | {"latching": latching})
+    return story
+
+
+def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -> None:
+    """A second's messages, without a gap to what follows; who comes soon after the first gets them as well."""
+    story = monitored()
+    for number in range(4):
+        story.topic.received(batch(b"%d" % number))
+        story.now += 0.4
+    first = story.join()
+    story.topic.received(batch(b"4"))
+    assert first.received == bytes(batch(b"2", b"3", b"4").view)
+    second = story.join("/second")
+    assert second.received == bytes(batch(b"2", b"3", b"4").view)
+    story.topic.leave(second)
+    assert story.join("/second").received == b""
+    story.now += 1.1
+    story.topic.received(batch(b"5"))
+    assert story.join("/third").received == b""
+    assert first.received.endswith(bytes(batch(b"5").view))
+    assert story.budget.used == 0
+
+
+def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
+    """The last message of a latched one; the next message of one whose subscriber triggered the connection."""
+    story = monitored(latching="1")
+    story.topic.received(batch(b"1"))
+    story.topic.received(batch(b"2"))
+    assert story.join().received == bytes(batch(b"2").view)
+    story = Story()
+    story.topic.monitor(lambda batch: batch, wanted=True)
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"1"))
+    assert story.join().received == b""
+
+
+def test_who_comes_back_gets_what_it_missed_and_nothing_twice() -> None:
+    """What comes while nobody is there is kept again; without monitor or publisher nothing is."""
+    story = monitored()
+    first = story.join()
+    story.topic.received(batch(b"1"))
+    story.topic.leave(first)
+    story.now += 2
+    story.topic.received(batch(b"3"))
+    second = story.join()
+    assert second.received == bytes(batch(b"3").view)
+    story.topic.leave(second)
+    story.topic.received(batch(b"4"))
+    story.topic.upstream_closed()
+    assert story.budget.used == 0
+    story.topic.upstream_opened(HEADER)
+    story.topic.received(batch(b"5"))
+    story.topic.monitor(None, wanted=False)
+    assert story.budget.used == 0
 
 
 def test_a_latched_message_is_forgotten_with_the_connection() -> None:

@@ -1,0 +1,27 @@
+"""A rospy publisher that waits for its first subscriber, says one thing and stays: patient_talker.py TOPIC."""
+
+import argparse
+
+import rospy
+from report import report
+from std_msgs.msg import String
+
+
+def main():
+    """Wait, publish once, stay."""
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("topic")
+    options = arguments.parse_args(rospy.myargv()[1:])
+    rospy.init_node("patient_talker")
+    publisher = rospy.Publisher(options.topic, String, queue_size=10)
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    while not publisher.get_num_connections() and not rospy.is_shutdown():
+        rospy.sleep(0.001)
+    publisher.publish("hello 1")
+    report("sent", number=1)
+    rospy.spin()
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()
