@@ -16,10 +16,12 @@ SHORT_LIVES = """
 connections {
   rosrv {
     rekey_time = 11s
+    over_time = 60s
     rand_time = 0
     children {
       ros {
         rekey_time = 4s
+        life_time = 60s
         rand_time = 0
       }
     }
