@@ -4,10 +4,12 @@ Under load this saves most of the system calls between the two processes; a call
 answers are taken apart again, so that nobody notices: a fault of one part is that part's fault.
 
 Only calls whose parameters and answers are a few names travel together. What may be large, slow or impossible to write
-(a parameter's value) travels alone: it could fail, and would take the calls of others with it.
+(a parameter's value) travels alone: it could fail, and would take the calls of others with it. One caller's own run of
+calls, whose order counts, travels together by `in_order`.
 """
 
 import asyncio
+from collections.abc import Sequence
 
 from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.ros.errors import EncodingError
@@ -19,6 +21,7 @@ _TOGETHER = frozenset({
     "registerService", "unregisterService", "lookupNode", "lookupService", "hasParam", "searchParam",
     "unsubscribeParam",
 })  # fmt: skip
+Wanted = tuple[str, tuple[Value, ...]]
 _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
@@ -41,6 +44,17 @@ class BatchingClient:
             loop.call_soon(self._send)
         return await answer
 
+    async def in_order(self, calls: Sequence[Wanted]) -> "list[Value | CallFailedError]":
+        """Make these calls as one, one after the other; the outcome of each.
+
+        Raises `CallFailedError` when there is no usable answer for any, `EncodingError` when nothing was sent.
+        """
+        parts: list[Value] = [{"methodName": method, "params": list(params)} for method, params in calls]
+        values = await self._client.call("system.multicall", parts)
+        if not isinstance(values, list) or len(values) != len(calls):
+            raise CallFailedError("the ROS Master answered a multicall with another number of answers")
+        return [_outcome(method, value) for (method, _params), value in zip(calls, values, strict=True)]
+
     def _send(self) -> None:
         waiting, self._waiting = self._waiting, []
         for begin in range(0, len(waiting), _LARGEST):
@@ -61,25 +75,24 @@ class BatchingClient:
             _settle(answer, value)
 
     async def _many(self, waiting: list[_Waiting]) -> None:
-        calls: list[Value] = [
-            {"methodName": method, "params": list(params)} for method, params, _answer in waiting
-        ]
         try:
-            values = await self._client.call("system.multicall", calls)
-            if not isinstance(values, list) or len(values) != len(waiting):
-                raise CallFailedError("the ROS Master answered a multicall with another number of answers")
+            outcomes = await self.in_order([(method, params) for method, params, _answer in waiting])
         except (CallFailedError, EncodingError) as error:
             for _method, _params, answer in waiting:
                 _settle(answer, error)
             return
-        for (method, _params, answer), value in zip(waiting, values, strict=True):
-            match value:
-                case [one]:
-                    _settle(answer, one)
-                case {"faultString": str(text)}:
-                    _settle(answer, CallFailedError(f"the ROS Master answered {method} with a fault: {text}"))
-                case _:
-                    _settle(answer, CallFailedError(f"the ROS Master answered {method} with nonsense"))
+        for (_method, _params, answer), outcome in zip(waiting, outcomes, strict=True):
+            _settle(answer, outcome)
+
+
+def _outcome(method: str, value: Value) -> "Value | CallFailedError":
+    match value:
+        case [one]:
+            return one
+        case {"faultString": str(text)}:
+            return CallFailedError(f"the ROS Master answered {method} with a fault: {text}")
+        case _:
+            return CallFailedError(f"the ROS Master answered {method} with nonsense")
 
 
 def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError | EncodingError") -> None:

@@ -3,21 +3,26 @@
 The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
+from appliance.master.batch import Wanted
 from appliance.master.call import Answer, Caller, LimitReachedError
+from appliance.master.client import CallFailedError
 from appliance.master.registration import incarnation_of
 from appliance.master.registry import Kind
 from appliance.policy.model import Category, Request
-from appliance.ros.errors import ProtocolError
+from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
 
 Tree = dict[str, Value]
+# Calls that go to ROSMaster together when they follow each other in a multicall, and how much of them.
+IN_ORDER = frozenset({"setParam", "deleteParam", "hasParam"})
+_TOGETHER_BYTES = 256 << 10
 _NAME_WEIGHT = 40
 
 
@@ -60,6 +65,10 @@ class ParameterMirror:
             raise LimitReachedError(
                 f"all parameters together would have {self.weight + weight} bytes; the limit is {self._bytes_limit}"
             )
+
+    def has_room(self, weight: int) -> bool:
+        """Whether so much can come in addition to what is there."""
+        return self.weight + weight <= self._bytes_limit
 
     def replace(self, tree: Tree) -> None:
         """Take the tree that ROSMaster has."""
@@ -151,6 +160,61 @@ async def set_param(master: "Master", caller: Caller, arguments: tuple[object, .
     if answer[0] == 1:
         master.parameters.set(key, value)
     return answer
+
+
+async def in_order(
+    master: "Master", wanted: Sequence[tuple[Caller, str, tuple[object, ...]]]
+) -> list[Answer | Exception]:
+    """Carry out several calls of `IN_ORDER` one after the other, in few requests: the outcome of each.
+
+    A value is checked as if it came alone after those before it; one that fails holds up no other.
+    """
+    outcomes: list[Answer | Exception] = []
+    waiting: list[Wanted] = []
+    weight = 0
+    for caller, method, arguments in wanted:
+        key, value = str(arguments[0]), cast(tuple[Value, ...], arguments[1:])
+        try:
+            more = sum(_NAME_WEIGHT + len(key) + measure(one)[0] for one in value)
+            if weight + more > _TOGETHER_BYTES or not master.parameters.has_room(weight + more):
+                outcomes += await _send(master, waiting)
+                waiting, weight = [], 0
+            for one in value:
+                master.parameters.check(key, one)
+        except (ProtocolError, LimitReachedError) as error:
+            outcomes += [*await _send(master, waiting), error]
+            waiting, weight = [], 0
+            continue
+        waiting.append((method, (caller.caller_id, key, *value)))
+        weight += more
+    return outcomes + await _send(master, waiting)
+
+
+async def _send(master: "Master", calls: list[Wanted]) -> list[Answer | Exception]:
+    """Make them, as one call if they are several; the mirror follows what ROSMaster took."""
+    outcomes: list[Answer | Exception] = []
+    if not calls:
+        return outcomes
+    try:
+        if len(calls) == 1:
+            method, params = calls[0]
+            outcomes.append(await master.rosmaster.call(method, *params))
+        else:
+            outcomes += await master.rosmaster.call_in_order(calls)
+    except EncodingError as error:
+        if len(calls) == 1:
+            return [error]
+        return [outcome for one in calls for outcome in await _send(master, [one])]  # nothing was sent yet
+    except CallFailedError as error:
+        return [error] * len(calls)
+    for (method, (_caller_id, key, *value)), outcome in zip(calls, outcomes, strict=True):
+        if isinstance(outcome, Exception) or outcome[0] != 1:
+            continue
+        if method == "setParam":
+            master.parameters.set(str(key), value[0])
+        elif method == "deleteParam":
+            master.parameters.delete(str(key))
+    return outcomes
 
 
 async def delete_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:

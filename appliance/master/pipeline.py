@@ -8,7 +8,7 @@ import asyncio
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import structlog
 
@@ -19,7 +19,9 @@ from appliance.master.claims import Claims
 from appliance.master.client import CallFailedError
 from appliance.master.gate import Contest, contested
 from appliance.master.http import Handler, HttpRequest
+from appliance.master.parameters import IN_ORDER, in_order
 from appliance.master.places import NoPortError
+from appliance.master.recorder import NOT_RECORDED
 from appliance.master.registry import Incarnation
 from appliance.policy.model import Category, Decision
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
@@ -31,13 +33,12 @@ if TYPE_CHECKING:
 
 _log = structlog.get_logger()
 _MULTICALL = "system.multicall"
-# Parts of a multicall that are sent before the one before them is answered: only what reaches ROSMaster in one request
-# (`batch`), because roslaunch clears and sets parameters in one multicall, and the order is what counts.
-_TOGETHER = frozenset({"hasParam"})
-_LONGEST_RUN = 64
+FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFailedError)
+_LONGEST_RUN = 64  # parts of a multicall that reach ROSMaster in one request
 _LONGEST_STRETCH = 0.005  # seconds of a multicall without a look at anybody else
 _RECORDED = (KEY, SEARCH_KEY, NODE, SUBGRAPH)  # resolved names: short, and what a reviewer asks for
 _CLAIM_SHOWN = 1024  # characters of a caller_id that is no name
+_FORM = "a part of a multicall has methodName and params, nothing else"
 _PARSE_FAULT, _LIMIT_FAULT, _INTERNAL_FAULT = -32700, -32600, -32603
 
 
@@ -109,21 +110,46 @@ class Pipeline:
         results: list[Value] = []
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
         for run in _runs(call.params[0]):
-            # A run of parameter calls goes to ROSMaster together: each is decided and sent, in order, before the
-            # first is answered. Everything else waits for the part before it.
-            results += await asyncio.gather(*(self._answer_part(calls, caller, part) for part in run))
+            # Roslaunch clears and sets parameters in one multicall, and the order is what counts: a run of parameter
+            # calls goes to ROSMaster as one, in its order. Everything else waits for the part before it.
+            if len(run) > 1:
+                results += await self._answer_run(calls, caller, run)
+            else:
+                results.append(await self._answer_part(calls, caller, run[0]))
             if time.monotonic() - since > _LONGEST_STRETCH:
                 await asyncio.sleep(0)
                 since = time.monotonic()
         return results
 
+    async def _answer_run(self, calls: Mapping[str, Call], caller: Caller, run: list[Value]) -> list[Value]:
+        """Each part is decided and recorded by itself; those that may be carried out are carried out in order."""
+        answers: list[Value] = []
+        ready: list[tuple[int, Caller, Call, tuple[object, ...]]] = []
+        for place, part in enumerate(run):
+            call = _part_of(part)
+            outcome = self._part_refused(caller, _FORM) if call is None else self._judge(calls, caller, *call)
+            if isinstance(outcome, _Allowed):
+                ready.append((place, *outcome))
+                answers.append(None)
+            else:
+                answers.append(outcome if isinstance(outcome, dict) else [outcome])
+        obstacle = await self._obstacle()
+        if obstacle is not None:
+            for place, _caller, call_row, _arguments in ready:
+                answers[place] = [[0, obstacle, call_row.denial]]
+            return answers
+        outcomes = await in_order(self._master, [(who, row.name, given) for _place, who, row, given in ready])
+        for (place, who, row, _given), done in zip(ready, outcomes, strict=True):
+            answers[place] = [self._failed(row, who, done) if isinstance(done, Exception) else done]
+        return answers
+
     async def _answer_part(self, calls: Mapping[str, Call], caller: Caller, part: Value) -> Value:
-        match part:
-            case {"methodName": "system.multicall", **_rest}:
-                return self._part_refused(caller, "a multicall inside a multicall is not served")
-            case {"methodName": str(method), "params": list(params), **rest} if not rest:
-                return [await self._answer(calls, caller, method, tuple(params))]
-        return self._part_refused(caller, "a part of a multicall has methodName and params, nothing else")
+        if isinstance(part, dict) and part.get("methodName") == _MULTICALL:
+            return self._part_refused(caller, "a multicall inside a multicall is not served")
+        call = _part_of(part)
+        if call is None:
+            return self._part_refused(caller, _FORM)
+        return [await self._answer(calls, caller, *call)]
 
     def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:
         record = self._master.recorder.happened(
@@ -140,33 +166,63 @@ class Pipeline:
     async def _answer(
         self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
     ) -> Value:
-        call = calls.get(method)
-        if call is None:
-            return self._unknown(caller, method, params)
-        try:
-            caller, arguments = _canonical(call, caller, params)
-        except PeerError as error:
-            return self._malformed(call, caller, params, error)
+        understood = self._understand(calls, caller, method, params)
+        if not isinstance(understood, _Allowed):
+            return understood
+        caller, call, arguments = understood
         if call.identity is not Identity.NODE or caller.target is not None:
             return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
         gone = await self._gone(caller, call, arguments)
         async with self._claims.alone(caller.caller_id):
             return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments, gone))
 
+    def _understand(
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+    ) -> "_Allowed | Answer":
+        """The call with its canonical arguments, nothing decided yet; the answer when there is none."""
+        call = calls.get(method)
+        if call is None:
+            return self._unknown(caller, method, params)
+        try:
+            return _Allowed(*_canonical(call, caller, params))
+        except PeerError as error:
+            return self._malformed(call, caller, params, error)
+
+    def _judge(
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+    ) -> "_Allowed | Answer":
+        """Understood, decided and recorded: what may be carried out, or the answer."""
+        understood = self._understand(calls, caller, method, params)
+        if not isinstance(understood, _Allowed):
+            return understood
+        decision = self._decide(*understood)
+        record = self._record(*understood, decision)
+        return understood if decision.allowed else [0, denial_text(decision, record), understood.call.denial]
+
     async def _carry_out(
         self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision
     ) -> Value:
-        category, resource = self._master.gate.asked(call, arguments)
-        recorder = self._master.recorder
-        asked_of = _asked_of(call, arguments)
-        record = recorder.decided(caller, call.name, category.value, resource, decision, **asked_of)
-        if recorder.strict:
-            obstacle = await recorder.durable()
-            if obstacle is not None:
-                return [0, f"denied: the audit log cannot be written: {obstacle}", call.denial]
+        record = self._record(caller, call, arguments, decision)
+        obstacle = await self._obstacle()
+        if obstacle is not None:
+            return [0, obstacle, call.denial]
         if not decision.allowed:
             return [0, denial_text(decision, record), call.denial]
         return await self._perform(call, caller, arguments)
+
+    def _record(self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision) -> str:
+        category, resource = self._master.gate.asked(call, arguments)
+        asked_of = _asked_of(call, arguments)
+        return self._master.recorder.decided(
+            caller, call.name, category.value, resource, decision, **asked_of
+        )
+
+    async def _obstacle(self) -> str | None:
+        """What a caller is told when its record must be on disk before the answer, and cannot be."""
+        recorder = self._master.recorder
+        if not recorder.strict or await recorder.durable() is None:
+            return None
+        return f"denied: {NOT_RECORDED}"
 
     async def _gone(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Incarnation | None:
         """The incarnation that holds the name the caller wants, if its node is gone."""
@@ -187,21 +243,31 @@ class Pipeline:
     async def _perform(self, call: Call, caller: Caller, arguments: tuple[object, ...]) -> Value:
         try:
             return await call.perform(self._master, caller, arguments)
-        except (NoPortError, LimitReachedError) as error:
-            record = self._master.recorder.happened(
-                "limit exceeded", str(error), severity=Severity.ALARM, decision="deny", host=caller.peer.text
-            )
-            return [0, f"{error} [{record}]", call.denial]
-        except PeerError as error:
-            return self._malformed(call, caller, (caller.caller_id,), error)
-        except EncodingError as error:
-            return self._malformed(
-                call, caller, (caller.caller_id,), ProtocolError(f"cannot be passed on: {error}")
-            )
-        except CallFailedError as error:
-            # The text names the hidden ROSMaster's address: it is for our log, not for a node.
-            _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
-            return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
+        except FAILURES as error:
+            return self._failed(call, caller, error)
+
+    def _failed(self, call: Call, caller: Caller, error: Exception) -> Answer:
+        """The answer to a call that was allowed and could not be carried out."""
+        claimed = (caller.caller_id,)
+        match error:
+            case NoPortError() | LimitReachedError():
+                record = self._master.recorder.happened(
+                    "limit exceeded",
+                    str(error),
+                    severity=Severity.ALARM,
+                    decision="deny",
+                    host=caller.peer.text,
+                )
+                return [0, f"{error} [{record}]", call.denial]
+            case PeerError():
+                return self._malformed(call, caller, claimed, error)
+            case EncodingError():
+                return self._malformed(call, caller, claimed, ProtocolError(f"cannot be passed on: {error}"))
+            case CallFailedError():
+                # The text names the hidden ROSMaster's address: it is for our log, not for a node.
+                _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
+                return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
+        raise error
 
     def _unknown(self, caller: Caller, method: str, params: tuple[Value, ...]) -> Answer:
         claimed = _claimed(params)
@@ -226,11 +292,27 @@ class Pipeline:
         return [-1, str(error), call.denial]
 
 
+class _Allowed(NamedTuple):
+    """A call that is understood (of `_judge`: and may be carried out), with its canonical arguments."""
+
+    caller: Caller
+    call: Call
+    arguments: tuple[object, ...]
+
+
+def _part_of(part: Value) -> tuple[str, tuple[Value, ...]] | None:
+    """Method and parameters of a part of a multicall; None when it does not have its form."""
+    match part:
+        case {"methodName": str(method), "params": list(params), **rest} if not rest:
+            return method, tuple(params)
+    return None
+
+
 def _runs(parts: list[Value]) -> Iterator[list[Value]]:
     """The parts of a multicall in their order: runs of parameter calls, and each other part by itself."""
     run: list[Value] = []
     for part in parts:
-        together = isinstance(part, dict) and part.get("methodName") in _TOGETHER
+        together = isinstance(part, dict) and part.get("methodName") in IN_ORDER
         if run and (not together or len(run) >= _LONGEST_RUN):
             yield run
             run = []
@@ -247,10 +329,12 @@ def denial_text(decision: Decision, record: str) -> str:
     return f"{decision.reason} [{record}]"
 
 
-def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[Caller, tuple[object, ...]]:
+def _canonical(
+    call: Call, caller: Caller, params: tuple[Value, ...]
+) -> tuple[Caller, Call, tuple[object, ...]]:
     required = len(call.parameters) - call.optional
     if call.identity is Identity.NOBODY:
-        return caller, canonicalise(call.parameters, required, "", params)
+        return caller, call, canonicalise(call.parameters, required, "", params)
     if not params:
         raise ProtocolError("missing required caller_id parameter")
     check_arity(call.parameters, required, params[1:])
@@ -262,7 +346,7 @@ def _canonical(call: Call, caller: Caller, params: tuple[Value, ...]) -> tuple[C
     elif caller_id or not call.reads:
         check_tool_id(caller_id)
     caller = replace(caller, caller_id=caller_id)
-    return caller, canonicalise(call.parameters, required, caller_id, params[1:])
+    return caller, call, canonicalise(call.parameters, required, caller_id, params[1:])
 
 
 def _asked_of(call: Call, arguments: tuple[object, ...]) -> dict[str, str]:

@@ -10,6 +10,10 @@ from appliance.master.call import Caller
 from appliance.metrics import Meter
 from appliance.policy.model import Decision, Rule
 
+# What a caller is told. Where the log is and what is wrong with it is for those who operate the appliance: it is in its
+# output, in `rosrv status`, and in the log itself when that can be written again.
+NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can"
+
 
 class Recorder:
     """Records decisions and events under the running policy revision.
@@ -28,9 +32,9 @@ class Recorder:
 
     @property
     def obstacle(self) -> str | None:
-        """Why nothing can be granted now (the log cannot be written), or None."""
+        """Why nothing can be granted now (the log cannot be written), or None; in words that a stranger may read."""
         if self._deny_when_failed and self._log.failed is not None:
-            return f"the audit log cannot be written: {self._log.failed}"
+            return NOT_RECORDED
         return None
 
     async def durable(self) -> str | None:

@@ -7,14 +7,17 @@ that registers in that moment notices nothing but a delay. The reconcile loop sh
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
-from appliance.master.batch import BatchingClient
+from appliance.master.batch import BatchingClient, Wanted
 from appliance.master.call import Answer
 from appliance.master.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import Limits, Value
+
+_T = TypeVar("_T")
 
 
 def limits_of_answers(limits: Limits, parameters: int) -> Limits:
@@ -64,24 +67,38 @@ class RosMaster:
 
     async def call(self, method: str, *params: Value) -> Answer:
         """Call for a node; waits while the door is shut. Raises `CallFailedError` when it stays shut."""
+        return await self._call(lambda: self.call_now(method, *params))
+
+    async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
+        """The same for several calls, carried out one after the other: the outcome of each, for itself."""
+        return await self._call(lambda: self._in_order(calls))
+
+    async def _in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
+        outcomes = await self._calls.in_order(calls)
+        return [
+            one if isinstance(one, CallFailedError) else _answer_to(method, one)
+            for (method, _params), one in zip(calls, outcomes, strict=True)
+        ]
+
+    async def _call(self, make: Callable[[], Awaitable[_T]]) -> _T:
         if self._open.is_set():
             with contextlib.suppress(RefusedError, BrokenOffError):
-                return await self._pass(method, *params)
+                return await self._pass(make)
         try:
             async with asyncio.timeout(self._hold):
                 while True:
                     while not self._open.is_set():  # it may be shut again before we are woken
                         await self._open.wait()
                     with contextlib.suppress(RefusedError, BrokenOffError):
-                        return await self._pass(method, *params)
+                        return await self._pass(make)
         except TimeoutError:
             raise CallFailedError(f"the ROS Master did not come back within {self._hold:g} s") from None
 
-    async def _pass(self, method: str, *params: Value) -> Answer:
+    async def _pass(self, make: Callable[[], Awaitable[_T]]) -> _T:
         """Call through the open door; shuts it when nobody is behind it."""
         self._enter()
         try:
-            return await self.call_now(method, *params)
+            return await make()
         except (RefusedError, BrokenOffError):
             self._open.clear()
             self._lost()
@@ -91,12 +108,10 @@ class RosMaster:
 
     async def call_now(self, method: str, *params: Value) -> Answer:
         """Call whether or not the door is open: for the reconcile loop."""
-        answer = await self._calls.call(method, *params)
-        if isinstance(answer, list) and len(answer) == 3 and isinstance(answer[0], int):
-            return answer
-        raise CallFailedError(
-            f"the ROS Master answered {method} with something that is not [code, message, value]"
-        )
+        answer = _answer_to(method, await self._calls.call(method, *params))
+        if isinstance(answer, CallFailedError):
+            raise answer
+        return answer
 
     def shut(self) -> None:
         """Let calls wait from now on: ROSMaster is away."""
@@ -123,3 +138,11 @@ class RosMaster:
         self._inside -= 1
         if not self._inside:
             self._empty.set()
+
+
+def _answer_to(method: str, value: Value) -> Answer | CallFailedError:
+    if isinstance(value, list) and len(value) == 3 and isinstance(value[0], int):
+        return value
+    return CallFailedError(
+        f"the ROS Master answered {method} with something that is not [code, message, value]"
+    )

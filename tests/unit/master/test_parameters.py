@@ -1,5 +1,8 @@
 """The mirror of the parameters is ROSMaster's tree, step by step: compared with rosmaster's own code."""
 
+import asyncio
+import copy
+import ipaddress
 import json
 import subprocess
 from typing import Any
@@ -8,9 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.call import LimitReachedError
-from appliance.master.parameters import ParameterMirror, measure
-from appliance.ros.errors import ProtocolError
+from appliance.master.call import Caller, LimitReachedError
+from appliance.master.client import CallFailedError
+from appliance.master.http import Peer
+from appliance.master.parameters import ParameterMirror, in_order, measure
+from appliance.ros.errors import EncodingError, ProtocolError
 from tests.support.nodes import PYTHON
 
 ORACLE = """
@@ -81,3 +86,110 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
         mirror.check("/a/b/c", {"d": [[1]]})
     with pytest.raises(ProtocolError, match="nil"):
         mirror.check("/a", {"b": [None]})
+
+
+class OrderedServer:
+    """ROSMaster's parameters, and how the calls reached it."""
+
+    def __init__(self, mirror: ParameterMirror) -> None:
+        self.tree = ParameterMirror({}, lambda: None)
+        self.requests: list[list[str]] = []
+        self.parameters = mirror
+        self.rosmaster = self
+        self.broken: Exception | None = None
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """One call by itself."""
+        return (await self.call_in_order([(method, params)]))[0]
+
+    async def call_in_order(self, calls: Any) -> list[Any]:
+        """Several as one."""
+        if any(value == "unwritable" for _method, params in calls for value in params[2:]):
+            raise EncodingError("cannot be written")
+        self.requests.append([f"{method} {params[1]}" for method, params in calls])
+        if self.broken is not None:
+            raise self.broken
+        answers: list[Any] = []
+        for method, (_caller, key, *value) in calls:
+            if method == "setParam":
+                self.tree.set(key, copy.deepcopy(value[0]))
+            elif method == "deleteParam":
+                self.tree.delete(key)
+            elif key == "/fault":
+                answers.append(CallFailedError("a fault"))
+                continue
+            answers.append([1, method, key])
+        return answers
+
+
+def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
+    """Carry them out in order."""
+    peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
+    caller = Caller(peer, "/me", 0)
+    wanted = [(caller, method, tuple(arguments)) for method, *arguments in calls]
+    return asyncio.run(in_order(server, wanted))  # type: ignore[arg-type]  # stands for the master
+
+
+def test_a_run_is_one_request_in_its_order() -> None:
+    """Calls of one run travel as one, in their order, and the mirror has what ROSMaster has."""
+    server = OrderedServer(ParameterMirror({}, lambda: None))
+    answers = ordered(
+        server,
+        ("setParam", "/a", {"b": 1}),
+        ("deleteParam", "/a/b"),
+        ("hasParam", "/a/b"),
+        ("setParam", "/c", 2),
+    )
+    assert server.requests == [["setParam /a", "deleteParam /a/b", "hasParam /a/b", "setParam /c"]]
+    assert [one[1] for one in answers] == ["setParam", "deleteParam", "hasParam", "setParam"]
+    assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(STEP, max_size=12))
+def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]]) -> None:
+    """Whatever the calls, together they leave the tree that they leave one by one."""
+    calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
+    together, single = (OrderedServer(ParameterMirror({}, lambda: None)) for _ in range(2))
+    ordered(together, *copy.deepcopy(calls))
+    for call in copy.deepcopy(calls):
+        ordered(single, call)
+    assert together.parameters.tree == single.parameters.tree == together.tree.tree
+    assert together.parameters.weight == single.parameters.weight
+
+
+def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
+    """The one that no request can carry fails by itself; those before and after it are carried out in order."""
+    server = OrderedServer(ParameterMirror({}, lambda: None))
+    answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
+    assert isinstance(answers[1], EncodingError)
+    assert server.parameters.tree == {"a": 1, "c": 3}
+    assert server.requests == [["setParam /a"], ["setParam /c"]]
+
+
+def test_a_value_that_is_too_much() -> None:
+    """The limit holds for the sum of a run; what takes the place of something else is no addition."""
+    server = OrderedServer(ParameterMirror({}, lambda: None, bytes_limit=1100))
+    big = "x" * 400
+    answers = ordered(
+        server,
+        ("setParam", "/a", big),
+        ("setParam", "/b", big),
+        ("setParam", "/c", big),
+        ("setParam", "/d", 1),
+    )
+    assert [type(one) for one in answers] == [list, list, LimitReachedError, list]
+    assert set(server.parameters.tree) == {"a", "b", "d"}
+    assert server.parameters.weight <= 1100
+
+
+def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
+    """A fault of one part is that part's; without an answer each part has the failure, and the mirror stays."""
+    server = OrderedServer(ParameterMirror({}, lambda: None))
+    answers = ordered(server, ("hasParam", "/fault"), ("setParam", "/a", 1))
+    assert isinstance(answers[0], CallFailedError)
+    assert answers[1][0] == 1
+    server.broken = CallFailedError("gone")
+    answers = ordered(server, ("setParam", "/b", 1), ("deleteParam", "/a"))
+    assert [type(one) for one in answers] == [CallFailedError, CallFailedError]
+    assert server.parameters.tree == {"a": 1}
