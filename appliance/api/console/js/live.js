@@ -58,7 +58,8 @@ async function recall() {
 function heard(/** @type {string} */ event, /** @type {any} */ data) {
   const heard = Date.now();
   if (event === "now") {
-    const samples = [...live.get().samples, data.sample].filter((one) => one.time > data.sample.time - HOUR);
+    const { time } = data.sample;
+    const samples = [...live.get().samples.filter((one) => one.time > time - HOUR && one.time < time), data.sample];
     live.update({ status: data.status, alarms: data.alarms, samples, away: null, heard });
   } else if (event === "graph") live.update({ graph: data, heard });
   else if (event === "away") live.update({ away: data.reason, heard });

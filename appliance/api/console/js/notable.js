@@ -28,7 +28,7 @@ export async function startNotable() {
   const past = (/** @type {Record<string, any>} */ query) =>
     get("/v1/audit", { since: NEAR, limit: 100, ...query }).then(({ records }) => records, () => []);
   const [denials, doings, incidents] = await Promise.all([
-    past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }), past({ severity: "alarm" }),
+    past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
   ]);
   if (mine !== generation) return;
   notable.set({ denials, doings, incidents });
@@ -47,7 +47,7 @@ function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
   if (event !== "record") return;
   const change = /** @type {any} */ ({});
   if (isDenial(record)) change.denials = added(notable.get().denials, record);
-  if (record.category === "monitor") change.doings = added(notable.get().doings, record);
+  if (isDoing(record)) change.doings = added(notable.get().doings, record);
   if (record.severity === "alarm") change.incidents = added(notable.get().incidents, record);
   if (Object.keys(change).length) notable.update(change);
 }
@@ -55,6 +55,11 @@ function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
 /** Whether a record is a refusal, or would have been one. @param {AuditRecord} record */
 export function isDenial(record) {
   return record.decision === "deny" || record.decision === "would deny";
+}
+
+/** Whether a monitor did something, and not somebody something to it. @param {AuditRecord} record */
+function isDoing(record) {
+  return record.category === "monitor" && record.detail?.monitor !== undefined && record.event !== "monitor log";
 }
 
 function added(/** @type {AuditRecord[] | null} */ list, /** @type {AuditRecord} */ record) {

@@ -8,10 +8,10 @@ import { Graph, layout } from "/console/static/vendor/dagre.js";
 /** @typedef {{x: number, y: number, w: number, h: number}} Spot the middle and the size */
 
 export const SIZES = {
-  node: [180, 42], topic: [216, 38], service: [216, 38], party: [180, 42], missing: [216, 38], master: [120, 42],
+  node: [158, 42], topic: [206, 38], service: [206, 38], party: [158, 42], missing: [206, 38], master: [120, 42],
 };
 const GAP = 16;
-const COLUMN = 58;
+const COLUMN = 52;
 const LITTLE = 0.25; // of what is shown may be new before all is arranged afresh
 
 /**
@@ -36,7 +36,7 @@ export function afresh(items, lines) {
   }
   for (const key of [...lines.keys()].sort()) {
     const line = lines.get(key);
-    if (line.from !== line.to) graph.setEdge(line.from, line.to, { weight: line.kind === "denied" ? 1 : 2 });
+    if (line.from !== line.to) graph.setEdge(line.from, line.to, { weight: line.kind === "denied" ? 1 : 3 });
   }
   layout(graph);
   /** @type {Map<string, Spot>} */

@@ -15,17 +15,34 @@ const CLOSEST = 2.5;
 export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
+  const own = useRef(false); // whether the reader chose what is seen; until then all is
   const fit = () => {
+    own.current = false;
     if (box.current) setLook(fitted(extent(spots.values()), box.current));
   };
-  useEffect(fit, [arranged, spots.size > 0]);
-  const zoom = (/** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) => setLook((now) => zoomed(now, factor, px, py));
+  const newest = useRef(fit);
+  newest.current = fit;
+  useEffect(() => fit(), [arranged, spots.size > 0]);
+  useEffect(() => {
+    if (!box.current) return undefined;
+    const observer = new ResizeObserver(() => own.current || newest.current());
+    observer.observe(box.current);
+    return () => observer.disconnect();
+  }, []);
+  const zoom = (/** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) => {
+    own.current = true;
+    setLook((now) => zoomed(now, factor, px, py));
+  };
+  const move = (/** @type {number} */ dx, /** @type {number} */ dy) => {
+    own.current = true;
+    setLook((now) => ({ ...now, x: now.x - dx / now.zoom, y: now.y - dy / now.zoom }));
+  };
   const middle = (/** @type {number} */ factor) => box.current && zoom(factor, box.current.clientWidth / 2, box.current.clientHeight / 2);
-  usePanning(box, setLook, zoom);
+  usePanning(box, move, zoom);
   const near = chosen ? neighbours(chosen, lines) : null;
   const key = (/** @type {KeyboardEvent} */ event) => {
     const step = { ArrowLeft: [-60, 0], ArrowRight: [60, 0], ArrowUp: [0, -60], ArrowDown: [0, 60] }[event.key];
-    if (step) setLook((now) => ({ ...now, x: now.x + step[0] / now.zoom, y: now.y + step[1] / now.zoom }));
+    if (step) move(-step[0], -step[1]);
     else if (event.key === "+" || event.key === "=") middle(1.25);
     else if (event.key === "-") middle(0.8);
     else if (event.key === "0") fit();
@@ -54,7 +71,7 @@ function Tip(/** @type {{id: string}} */ { id }) {
 function Box(/** @type {any} */ { item, spot, chosen, faint, choose }) {
   if (!spot) return null;
   const { x, y, w, h } = spot;
-  const words = item.kind === "topic" || item.kind === "service" || item.kind === "missing" ? 25 : 22;
+  const words = item.kind === "topic" || item.kind === "service" || item.kind === "missing" ? 25 : 19;
   const name = shortened(item.name, words);
   const state = [item.kind, item.members ? "many" : "", item.mediated ? "mediated" : "", item.lost ? "lost" : "", chosen ? "chosen" : "", faint ? "faint" : ""].filter(Boolean).join(" ");
   const said = `${item.members ? "group " : ""}${item.kind} ${plain(item.name, 120)}, ${plain(item.sub, 60)}${item.mediated ? ", mediated" : ""}${item.lost ? ", lost" : ""}`;
@@ -138,7 +155,7 @@ function zoomed(/** @type {Look} */ now, /** @type {number} */ factor, /** @type
   return { zoom, x: now.x + px / now.zoom - px / zoom, y: now.y + py / now.zoom - py / zoom };
 }
 
-function usePanning(/** @type {{current: HTMLElement | null}} */ box, /** @type {any} */ setLook, /** @type {(factor: number, x: number, y: number) => void} */ zoom) {
+function usePanning(/** @type {{current: HTMLElement | null}} */ box, /** @type {(dx: number, dy: number) => void} */ pan, /** @type {(factor: number, x: number, y: number) => void} */ zoom) {
   useEffect(() => {
     const element = box.current;
     if (!element) return undefined;
@@ -160,7 +177,7 @@ function usePanning(/** @type {{current: HTMLElement | null}} */ box, /** @type 
         const apart = (/** @type {number[]} */ a, /** @type {number[]} */ b) => Math.hypot(a[0] - b[0], a[1] - b[1]);
         const place = element.getBoundingClientRect();
         zoom(apart([event.clientX, event.clientY], other) / Math.max(1, apart(last, other)), (event.clientX + other[0]) / 2 - place.left, (event.clientY + other[1]) / 2 - place.top);
-      } else setLook((/** @type {Look} */ now) => ({ ...now, x: now.x - dx / now.zoom, y: now.y - dy / now.zoom }));
+      } else pan(dx, dy);
       fingers.set(event.pointerId, [event.clientX, event.clientY]);
     };
     const up = (/** @type {PointerEvent} */ event) => fingers.delete(event.pointerId);

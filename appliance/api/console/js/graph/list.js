@@ -14,12 +14,12 @@ export function TopicList({ topics, choose, chosen }) {
   const pages = Math.max(1, Math.ceil(topics.length / PAGE));
   const at = Math.min(page, pages - 1);
   if (!topics.length) return html`<${Empty} icon="graph" title="No topic">Nothing matches the search, or no node has registered one.</${Empty}>`;
-  return html`<div class="table-wrap"><table class="table"><thead><tr><th>Topic</th><th>Type</th><th>Path</th><th>Publishers</th><th>Subscribers</th><th class="number">Messages/s</th><th class="number">Volume/s</th></tr></thead>
+  return html`<div class="table-wrap"><table class="table stacked topics"><thead><tr><th>Topic</th><th>Type</th><th>Path</th><th>Publishers</th><th>Subscribers</th><th class="number">Messages/s</th><th class="number">Volume/s</th></tr></thead>
     <tbody>${topics.slice(at * PAGE, (at + 1) * PAGE).map((one) => html`<tr key=${one.name} class=${chosen === `t${one.name}` ? "chosen" : ""}>
-      <td><button class="link" onClick=${() => choose(`t${one.name}`)}><${Given} value=${one.name} mono most=${80} /></button></td><td><${Given} value=${one.type} most=${60} /></td>
-      <td>${one.mediated ? html`<${Badge} word="mediated" tone="note" />` : html`<${Badge} word="direct" />`}</td>
-      <td><${Names} names=${one.publishers.map((/** @type {any} */ each) => each.node)} /></td><td><${Names} names=${one.subscribers} /></td>
-      <td class="number">${rate(sum(one, "messages_per_second"))}</td><td class="number nowrap">${bytes(sum(one, "bytes_per_second"))}</td></tr>`)}</tbody></table></div>
+      <td class="first"><button class="link" onClick=${() => choose(`t${one.name}`)}><${Given} value=${one.name} mono most=${80} /></button></td><td data-label="Type"><${Given} value=${one.type} most=${60} /></td>
+      <td data-label="Path">${one.mediated ? html`<${Badge} word="mediated" tone="note" />` : html`<${Badge} word="direct" />`}</td>
+      <td data-label="Publishers"><div><${Names} names=${one.publishers.map((/** @type {any} */ each) => each.node)} /></div></td><td data-label="Subscribers"><div><${Names} names=${one.subscribers} /></div></td>
+      <td class="number" data-label="Messages/s">${rate(sum(one, "messages_per_second"))}</td><td class="number nowrap" data-label="Volume/s">${bytes(sum(one, "bytes_per_second"))}</td></tr>`)}</tbody></table></div>
     ${pages > 1 && html`<div class="panel-body row"><button class="button small" disabled=${at === 0} onClick=${() => setPage(at - 1)}>Back</button>
       <span class="muted small">${at * PAGE + 1} to ${Math.min(topics.length, (at + 1) * PAGE)} of ${counted(topics.length, "topic")}</span>
       <button class="button small" disabled=${at === pages - 1} onClick=${() => setPage(at + 1)}>More</button></div>`}`;

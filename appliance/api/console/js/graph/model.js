@@ -77,9 +77,8 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
     const kind = attempt.command ? "master" : "missing";
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `refused ${category}` });
   }
-  const backwards = category === "subscribe";
   const key = `!${attempt.key}`;
-  const line = { key, from: backwards ? to : from, to: backwards ? from : to };
+  const line = { key, from, to }; // to what was wanted, whichever way messages would have gone
   const would = attempt.records.every((one) => one.decision === "would deny");
   model.lines.set(key, { ...line, kind: "denied", mediated: false, rate: 0, denials: attempt.records, would });
 }

@@ -3,11 +3,13 @@
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
 import { notable } from "../notable.js";
+import { counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
 import { Empty, Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 import { useStore } from "../store.js";
+import { plain } from "../words.js";
 
 const SHOWN = 8;
 
@@ -27,19 +29,41 @@ export function Doings() {
       : html`<${List} records=${doings} what=${done} />`}</section>`;
 }
 
-function List(/** @type {{records: any[], what: (record: any) => any}} */ { records, what }) {
-  return html`<ul class="event-list">${records.slice(0, SHOWN).map((one) => html`<li key=${one.id} class="event">
-    <span class="event-time"><${Moment} at=${one.time} /></span>${what(one)}</li>`)}</ul>`;
+function List(/** @type {{records: any[], what: (record: any, more: any[]) => any}} */ { records, what }) {
+  return html`<ul class="event-list">${alike(records).slice(0, SHOWN).map(({ first, more }) => html`<li key=${first.id} class="event">
+    <span class="event-time"><${Moment} at=${first.time} /></span>${what(first, more)}</li>`)}</ul>`;
 }
 
-function denied(/** @type {any} */ one) {
+/** Neighbours that differ in what was wanted alone, as one. */
+function alike(/** @type {any[]} */ records) {
+  /** @type {{first: any, more: any[]}[]} */
+  const found = [];
+  for (const one of records) {
+    const last = found.at(-1);
+    if (last && ["host", "caller_id", "event", "category", "decision"].every((name) => last.first[name] === one[name]) && last.first.detail.monitor === one.detail.monitor && near(last.first, one)) last.more.push(one);
+    else found.push({ first: one, more: [] });
+  }
+  return found;
+}
+
+function near(/** @type {any} */ a, /** @type {any} */ b) {
+  return Math.abs(Date.parse(a.time) - Date.parse(b.time)) < 10_000;
+}
+
+function denied(/** @type {any} */ one, /** @type {any[]} */ more) {
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
-    <div><${Given} value=${one.caller_id} most=${60} mono none="nobody" /> <span class="muted">of</span> <${Given} value=${one.host} mono /> <span class="muted"><${Given} value=${one.category} none="" /></span> <${Given} value=${one.resource} most=${80} mono /></div>
+    <div><${Given} value=${one.caller_id} most=${60} mono none="nobody" /> <span class="muted">of</span> <${Given} value=${one.host} mono /> <span class="muted"><${Given} value=${one.category} none="" /></span> <${Given} value=${one.resource} most=${80} mono /><${More} more=${more} /></div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 
-function done(/** @type {any} */ one) {
+function More(/** @type {{more: any[]}} */ { more }) {
+  if (!more.length) return null;
+  const others = [...new Set(more.map((one) => one.resource))].slice(0, 4).join(", ");
+  return html` <span class="muted small" title=${plain(others)}>and ${counted(more.length, "other")} within seconds</span>`;
+}
+
+function done(/** @type {any} */ one, /** @type {any[]} */ more) {
   return html`<span class="event-badge"><${Badge} word=${one.event.replace(/^(monitor|message) /, "")} tone=${one.severity === "alarm" ? "deny" : one.severity === "warning" ? "warn" : "note"} /></span><div class="event-body">
-    <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono /></div>
+    <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono /><${More} more=${more} /></div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.detail.category || one.event} most=${200} /></${Link}></div></div>`;
 }

@@ -25,8 +25,9 @@ export function Now() {
   return html`<div class="head"><h1>Now</h1><span class="head-sub">in service for ${lasting(now / 1000 - status.since)}</span></div>
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
-      <div class="stack"><${Curves} /><${Refusals} /><${Doings} /></div>
-      <div class="stack"><${Alarms} alarms=${alarms} incidents=${incidents} /><${Processes} status=${status} /></div>
+      <div class="now-alarms"><${Alarms} alarms=${alarms} incidents=${incidents} /></div>
+      <div class="now-main stack"><${Curves} /><${Refusals} /><${Doings} /></div>
+      <div class="now-processes"><${Processes} status=${status} /></div>
     </div>`;
 }
 
@@ -54,8 +55,8 @@ function Curves() {
   const series = (/** @type {string} */ name, /** @type {any} */ colour, /** @type {(one: any) => number} */ read) => ({ name, colour, points: growth(samples, read) });
   return html`<section class="panel" aria-labelledby="curves"><div class="panel-head"><h2 id="curves">Rates, last 15 minutes</h2></div>
     <div class="panel-body plots">
-      <${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("refused", "c2", (one) => one.denied)]} />
-      <${Plot} label="Messages" span=${SPAN} series=${[series("messages relayed", "c3", (one) => one.messages), series("not taken by slow subscribers", "c4", (one) => one.dropped)]} />
+      <div><h3>Decisions</h3><${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("refused", "c2", (one) => one.denied)]} /></div>
+      <div><h3>Messages through the relay</h3><${Plot} label="Messages" span=${SPAN} series=${[series("relayed", "c3", (one) => one.messages), series("dropped", "c4", (one) => one.dropped)]} /></div>
     </div></section>`;
 }
 

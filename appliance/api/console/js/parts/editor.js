@@ -105,7 +105,7 @@ function look(/** @type {any} */ EditorView, /** @type {string} */ height) {
   return EditorView.theme({
     "&": { height, fontSize: "12.5px", color: "var(--text)", backgroundColor: "var(--surface)" },
     "&.cm-focused": { outline: "none" },
-    ".cm-scroller": { fontFamily: "var(--mono)", lineHeight: "1.6", overflow: "auto" },
+    ".cm-scroller": { fontFamily: "var(--mono)", fontVariantLigatures: "none", lineHeight: "1.6", overflow: "auto" },
     ".cm-content": { caretColor: "var(--text)", padding: "8px 0" },
     ".cm-gutters": { backgroundColor: "var(--sunken)", color: "var(--muted)", border: "none", borderRight: "1px solid var(--line)" },
     ".cm-activeLine": { backgroundColor: "color-mix(in srgb, var(--chosen) 55%, transparent)" },
