@@ -7,122 +7,45 @@ import json
 import re
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from appliance.network.lab import INTERFACE, Lab
 from tests.support.nodes import RosSession
-from tests.support.processes import Event, Process, ThisMachine
+from tests.support.processes import Event
 from tests.support.requirements import need_root
+from tests.support.tunnel_site import ATTACKER, LONG, MASTER, MIDDLE, OCU, OWN, TunnelSite
 from tests.support.tunnels import JoinedHost, need_strongswan
-
-ROBOT, OCU, ATTACKER, MIDDLE = "10.88.0.10", "10.88.0.20", "10.88.0.66", "10.88.0.2"
-MASTER = f"http://{MIDDLE}:11311"
-OWN = "10.113.11.1"
-LONG = 60.0
-POLICY = f"""\
-[Groups]
-trusted = host:ocu-1, {ROBOT}
-[Nodes]
-default = trusted
-[Publishers]
-default = trusted
-[Subscribers]
-default = trusted
-[Commands]
-default = trusted
-"""
-
-
-class Site:
-    """The appliance and its neighbours; `trail` is its audit log as it is written."""
-
-    trail: Process
-
-    def __init__(self, lab: Lab, home: Path) -> None:
-        self.lab, self.home = lab, home
-        self.appliance = Appliance(
-            lab.host("appliance", f"{MIDDLE}/24"), policy=POLICY, options=("--listen", "0.0.0.0:11311")
-        )
-        self.robot = lab.host("robot", f"{ROBOT}/24")
-        self.ocu = lab.host("ocu", f"{OCU}/24")
-        self.attacker = lab.host("attacker", f"{ATTACKER}/24")
-        self.kits = 0
-
-    def kit(self, verb: str = "add", name: str = "ocu-1") -> Path:
-        """Enrol a host, or give it a new certificate: its kit."""
-        self.kits += 1
-        path = self.home / f"kit-{self.kits}.tar.gz"
-        self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--out", str(path))
-        return path
-
-    def join(self, kit: Path, host: Host | None = None) -> JoinedHost:
-        """A host with a kit, not started."""
-        return JoinedHost(host or self.ocu, kit, self.home / f"joined-{time.monotonic_ns()}")
-
-    def state(self, name: str = "ocu-1") -> str:
-        """The state of a host by `rosrv host list`."""
-        lines = self.appliance.rosrv("host", "list", "--json").stdout.splitlines()
-        return next(str(row["state"]) for row in map(json.loads, lines) if row["name"] == name)
-
-    def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
-        """The first audit record with these fields that came after `mark` was taken."""
-        return self.trail.wait_for(since=since, timeout=timeout, **fields)
-
-    def story(self) -> str:
-        """What the appliance said, for the message of a failure."""
-        return self.appliance.story()
-
-    @property
-    def mark(self) -> int:
-        """How many records there are."""
-        return len(self.trail.events)
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
     """One appliance for all tests here; no host is enrolled in the beginning."""
     need_root()
     need_strongswan()
-    with Lab("rosrv-ipsec") as lab:
-        one = Site(lab, tmp_path_factory.mktemp("ipsec"))
-        command = [ROSRV, "audit", "tail", "--json", "--state", str(one.appliance.state)]
-        with (
-            one.appliance,
-            Process(ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail") as one.trail,
-        ):
-            yield one
+    with Lab("rosrv-ipsec") as lab, TunnelSite(lab, tmp_path_factory.mktemp("ipsec")) as one:
+        yield one
 
 
 @pytest.fixture(scope="module")
-def kit(site: Site) -> Path:
+def kit(site: TunnelSite) -> Path:
     """The kit of `ocu-1`, enrolled once."""
     return site.kit()
 
 
 @pytest.fixture
-def joined(site: Site, kit: Path) -> Iterator[JoinedHost]:
+def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
     """`ocu` with its tunnel up."""
-    mark = site.mark
-    with site.join(kit) as host:
-        host.wait_until_up()
-        site.recorded(mark, event="tunnel up")
+    with site.joined(kit) as host:
         yield host
-        mark = site.mark
-        stands = site.state() == "up"
-    if stands:
-        site.recorded(mark, event="tunnel down")
 
 
-def test_without_a_host_there_is_no_tunnel(site: Site) -> None:
+def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
     """Before anybody is enrolled neither charon runs nor a port of IKE is open; what `host:` names is nobody."""
     status = site.appliance.status()
     assert "charon" not in [row["role"] for row in status["processes"]]
@@ -130,7 +53,7 @@ def test_without_a_host_there_is_no_tunnel(site: Site) -> None:
     assert status["policy"]["warnings"] > 0
 
 
-def test_nodes_talk_through_the_tunnel(site: Site, joined: JoinedHost) -> None:
+def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> None:
     """Nodes of both sides find and hear each other; the host is its virtual address; list, status and log show it."""
     assert joined.master == f"http://{OWN}:11311"
     with (
@@ -155,7 +78,7 @@ def test_nodes_talk_through_the_tunnel(site: Site, joined: JoinedHost) -> None:
     assert (row["name"], row["address"], row["state"], row["remote"]) == ("ocu-1", joined.address, "up", OCU)
 
 
-def test_a_forged_address_gets_nowhere(site: Site, kit: Path) -> None:
+def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
     """Packets in clear text from the trusted address are dropped before anything answers, tunnel or no tunnel."""
     forged = "10.113.11.2"
     links.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
@@ -181,7 +104,7 @@ def test_a_forged_address_gets_nowhere(site: Site, kit: Path) -> None:
     assert any(rule["purpose"].endswith("through its tunnel only") for rule in rules)
 
 
-def test_a_foreign_certificate_is_refused(site: Site, kit: Path) -> None:
+def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
     """A certificate in the right name, of another authority, opens no tunnel; the log says who tried and why."""
     site.home.joinpath("foreign").mkdir()
     foreign, key = Authority(site.home / "foreign"), make_key()
@@ -198,7 +121,7 @@ def test_a_foreign_certificate_is_refused(site: Site, kit: Path) -> None:
     assert refused["decision"] == "deny"
 
 
-def test_a_tunnel_that_was_cut_comes_back(site: Site, joined: JoinedHost) -> None:
+def test_a_tunnel_that_was_cut_comes_back(site: TunnelSite, joined: JoinedHost) -> None:
     """With the cable out the tunnel is down within half a minute, and the host is nobody; with it in, all is back."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
@@ -217,7 +140,7 @@ def test_a_tunnel_that_was_cut_comes_back(site: Site, joined: JoinedHost) -> Non
         listener.wait_for(event="received", since=len(listener.events), timeout=LONG)
 
 
-def test_charon_that_dies_is_started_again(site: Site, joined: JoinedHost) -> None:
+def test_charon_that_dies_is_started_again(site: TunnelSite, joined: JoinedHost) -> None:
     """Killed, it is back by itself with every tunnel it had, and the one before has left nothing running."""
     mark = site.mark
     before = site.appliance.kill("charon")
@@ -227,7 +150,7 @@ def test_charon_that_dies_is_started_again(site: Site, joined: JoinedHost) -> No
     assert site.state() == "up"
 
 
-def test_a_replaced_certificate_is_revoked(site: Site, kit: Path, joined: JoinedHost) -> None:
+def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: JoinedHost) -> None:
     """`host kit` gives a new certificate; the one before is on the list of revoked ones and opens nothing."""
     mark = site.mark
     new = site.kit("kit")
@@ -243,7 +166,7 @@ def test_a_replaced_certificate_is_revoked(site: Site, kit: Path, joined: Joined
         revoke_while_it_talks(site, again)
 
 
-def revoke_while_it_talks(site: Site, joined: JoinedHost) -> None:
+def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
     """Revoked, a host loses its registrations, connections and tunnel within a second, and gets none again."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
@@ -273,7 +196,7 @@ def _seconds(record: Event) -> float:
     return int(hours) * 3600 + int(minutes) * 60 + float(seconds)
 
 
-def test_scripts_of_a_kit_are_shell(site: Site, kit: Path) -> None:
+def test_scripts_of_a_kit_are_shell(site: TunnelSite, kit: Path) -> None:
     """join.sh, leave.sh and keep.sh are understood by the shell, and a kit is for its owner only."""
     assert kit.stat().st_mode & 0o777 == 0o600
     folder = site.join(kit).folder
