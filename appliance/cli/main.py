@@ -1,62 +1,88 @@
-"""The `rosrv` command: one app, one module for each verb."""
+"""The `rosrv` command: one app, one module for each verb, imported when it is run (`lazy.py`)."""
 
 import sys
 import traceback
 
-import typer
+from appliance.cli.lazy import Group, Verb, application
 
-from appliance.cli import (
-    audit,
-    config,
-    demo,
-    host,
-    monitor,
-    monitor_running,
-    policy,
-    policy_running,
-    protect,
-    status,
-    token,
-    up,
-)
-from appliance.config_sources import ConfigError
-from appliance.network.namespaces import NetworkError
-from appliance.supervisor.errors import StartError
+VERBS: dict[str, Verb | Group] = {
+    "up": Verb("appliance.cli.up:up", "Start the appliance; ends on SIGTERM or Ctrl-C."),
+    "status": Verb(
+        "appliance.cli.status:status",
+        "Show the running appliance: processes, isolation, policy, graph, audit log.",
+    ),
+    "selftest": Verb(
+        "appliance.cli.selftest:selftest",
+        "Try whether this machine can run the appliance, and whether the running one does what it must.",
+    ),
+    "demo": Verb(
+        "appliance.cli.demo:demo",
+        "Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.",
+    ),
+    "protect": Verb(
+        "appliance.cli.protect:protect", "Close the ROS ports of this machine to all but the appliance."
+    ),
+    "audit": Verb("appliance.cli.audit:app", "Review the audit log and prove that it is complete."),
+    "policy": Verb(
+        "appliance.cli.policy:app", "Check, explain, test, compare, learn and change access policies."
+    ),
+    "monitor": Group(
+        "Monitors: check specifications, try them on a recording, run them on the robot.",
+        {
+            "check": Verb(
+                "appliance.cli.monitor:check",
+                "Report every error and warning with its place; exit status 1 if there is an error.",
+            ),
+            "run": Verb(
+                "appliance.cli.monitor:run",
+                "Give a recording to the monitors and report what came of every message, by the recording's clock.",
+            ),
+            "list": Verb(
+                "appliance.cli.monitor_running:list_monitors",
+                "Show every monitor: enabled or not, what it listens to, what it did.",
+            ),
+            "enable": Verb(
+                "appliance.cli.monitor_running:enable", "Let the events of these monitors happen again."
+            ),
+            "disable": Verb(
+                "appliance.cli.monitor_running:disable",
+                "Let messages pass these monitors untouched; their variables stay.",
+            ),
+            "load": Verb(
+                "appliance.cli.monitor_running:load",
+                "Load specifications while the robot runs; a file of the same name is replaced.",
+            ),
+            "remove": Verb(
+                "appliance.cli.monitor_running:remove",
+                "Remove specifications, by the names of their monitors or files.",
+            ),
+            "reload": Verb(
+                "appliance.cli.monitor_running:reload",
+                "Take what the folder of specifications has now, in the place of what is in force.",
+            ),
+            "resume": Verb(
+                "appliance.cli.monitor_running:resume",
+                "Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).",
+            ),
+            "reset": Verb(
+                "appliance.cli.monitor_offline:reset",
+                "Give up the specifications that were loaded by command: the next start takes those of the folder.",
+            ),
+            "rvstate": Verb(
+                "appliance.cli.monitor_running:rv_state",
+                "ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried.",
+                hidden=True,
+            ),
+        },
+    ),
+    "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
+    "host": Verb("appliance.cli.host:app", "Enrol, list and revoke hosts that come through IPsec tunnels."),
+    "token": Verb("appliance.cli.token:app", "Make, list and revoke access tokens for REST."),
+}
+app = application(VERBS, name="rosrv", help="A network-security appliance for ROS 1 robots.")
 
-app = typer.Typer(
-    name="rosrv",
-    help="A network-security appliance for ROS 1 robots.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-app.command()(up.up)
-app.command()(status.status)
-app.command()(demo.demo)
-app.command()(protect.protect)
-app.add_typer(audit.app, name="audit")
-for verb in (
-    policy_running.reload,
-    policy_running.rollback,
-    policy_running.confirm,
-    policy_running.revisions,
-):
-    policy.app.command()(verb)
-app.add_typer(policy.app, name="policy")
-monitor.app.command(name="list")(monitor_running.list_monitors)
-for order in (
-    monitor_running.enable,
-    monitor_running.disable,
-    monitor_running.load,
-    monitor_running.remove,
-    monitor_running.reload,
-    monitor_running.resume,
-):
-    monitor.app.command()(order)
-monitor.app.command(name="rvstate", hidden=True)(monitor_running.rv_state)
-app.add_typer(monitor.app, name="monitor")
-app.add_typer(config.app, name="config")
-app.add_typer(host.app, name="host")
-app.add_typer(token.app, name="token")
+_TOLD = frozenset({"ConfigError", "StartError", "NetworkError"})
+"""Errors whose text is for a person. By name: their modules are imported only where they can occur."""
 
 
 def main() -> None:
@@ -64,10 +90,12 @@ def main() -> None:
     sys.argv[1:] = _without_old_flags(sys.argv[1:])
     try:
         app()
-    except (ConfigError, StartError, NetworkError) as error:
-        sys.stderr.write(f"rosrv: {error}\n")
-        sys.exit(1)
     except Exception as error:  # noqa: BLE001  the last resort; what it was and where is still told
+        if any(
+            one.__name__ in _TOLD and one.__module__.startswith("appliance.") for one in type(error).__mro__
+        ):
+            sys.stderr.write(f"rosrv: {error}\n")
+            sys.exit(1)
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}:{last.lineno}"
         sys.stderr.write(

@@ -77,7 +77,7 @@ def run(
     ] = None,
     msg: _Folders = None,
 ) -> None:
-    """Give a recording to the monitors and report what came of every message, by the clock of the recording.
+    """Give a recording to the monitors and report what came of every message, by the recording's clock.
 
     Example: rosrv monitor run monitors/safe_triggering.rv --bag drive.bag
     """

@@ -30,6 +30,7 @@ from appliance.cli.policy_output import (
     say_finding,
     say_json,
 )
+from appliance.cli.policy_running import confirm, reload, revisions, rollback
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
     Category,
@@ -47,8 +48,12 @@ from appliance.policy.explain import Explanation, render
 from appliance.policy.findings import Severity
 from appliance.policy.policy import needs_node_rule
 
-app = typer.Typer(help="Check, explain, test, compare and learn access policies.", no_args_is_help=True)
+app = typer.Typer(
+    help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
+)
 app.command("learn")(learn_policy)
+for _verb in (reload, rollback, confirm, revisions):
+    app.command()(_verb)
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]

@@ -66,10 +66,14 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Appliance:
-    """The appliance that a verb is for; `said`: it was named, on the command line or in the environment."""
+    """The appliance that a verb is for.
+
+    `said`: it was named, on the command line or in the environment. `place` is the URL of REST; None over the socket.
+    """
 
     way: Way
     said: bool = False
+    place: str | None = None
 
     def ask(self, request: AdminRequest) -> AdminAnswer:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
@@ -129,7 +133,7 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
     from appliance.cli.rest import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
-        return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True)
+        return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True, place=api)
     except ValueError as error:
         raise usage_error(str(error)) from None
 

@@ -30,7 +30,7 @@ def status(
     Example: rosrv status --state /var/lib/rosrv
     """
     body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
-    troubles = list(_troubles(body))
+    troubles = list(troubles_of(body))
     if as_json:
         sys.stdout.write(json.dumps({**body, "troubles": troubles}) + "\n")
     else:
@@ -38,7 +38,7 @@ def status(
     raise typer.Exit(1 if troubles else 0)
 
 
-def _troubles(body: dict[str, Any]) -> list[str]:
+def troubles_of(body: dict[str, Any]) -> list[str]:
     """What a person should look at, most pressing first."""
     found = []
     if body["audit"]["failed"]:

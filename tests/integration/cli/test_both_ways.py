@@ -83,7 +83,7 @@ def test_looking_is_the_same(appliance: Appliance, verb: tuple[str, ...]) -> Non
 
 
 def test_checkpoints_are_the_same(appliance: Appliance) -> None:
-    """What is written over REST begins with what was in the file before, and is the beginning of what is there after."""
+    """What is written over REST begins with what was in the file before, and the beginning of what is there then."""
     before, over_rest, after = (
         run(appliance, way, "audit", "checkpoints").stdout for way in ("state", "api", "state")
     )

@@ -1,0 +1,91 @@
+"""Verbs whose modules are imported when they are run, not when the command starts.
+
+`rosrv status` must not wait for the compiler of specifications, nor for a network library that one other verb needs.
+What `--help` and completion list is known without importing anything: names and first sentences stand in a table.
+"""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """Where a verb is (`module:function`, or `module:app` for several), and the first sentence of its help."""
+
+    place: str
+    help: str
+    hidden: bool = False
+
+
+Verbs = Mapping[str, "Verb | Group"]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Verbs of several modules with a first word in common."""
+
+    help: str
+    verbs: Mapping[str, Verb]
+
+
+def application(verbs: Verbs, **settings: Any) -> typer.Typer:
+    """An application of typer's with these verbs."""
+    app = typer.Typer(cls=_group_of(verbs), no_args_is_help=True, pretty_exceptions_enable=False, **settings)
+    app.callback()(_nothing)
+    return app
+
+
+def _nothing() -> None:
+    pass
+
+
+def _group_of(verbs: Verbs) -> type[TyperGroup]:
+    class _Lazy(TyperGroup):
+        """A group whose commands are made when they are asked for."""
+
+        def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as typer has it
+            return list(verbs)
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  as typer has it
+            match verbs.get(cmd_name):
+                case Group(help, inner):
+                    return _named(typer.main.get_group(application(inner, help=help)), cmd_name)
+                case Verb() as verb:
+                    return _Deferred(verb, cmd_name)
+                case None:
+                    return None
+
+    return _Lazy
+
+
+def _named(command: Any, name: str) -> Any:
+    command.name = name
+    return command
+
+
+class _Deferred(TyperCommand):
+    """A verb that is not imported yet."""
+
+    def __init__(self, verb: Verb, name: str) -> None:
+        super().__init__(name, help=verb.help, hidden=verb.hidden)
+        self._verb = verb
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """It is run, or completed: from here on it is the real one."""
+        return loaded(self._verb, str(self.name)).make_context(info_name, args, parent, **extra)
+
+
+def loaded(verb: Verb, name: str) -> Any:
+    """The real command of a verb."""
+    module, _colon, attribute = verb.place.partition(":")
+    found = getattr(importlib.import_module(module), attribute)
+    if isinstance(found, typer.Typer):
+        return _named(typer.main.get_group(found), name)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command(name)(found)
+    return typer.main.get_command(app)

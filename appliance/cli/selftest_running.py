@@ -1,0 +1,159 @@
+"""Does the running appliance do what it must: its own status, a call through RVMaster, a message through the relay."""
+
+import time
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
+
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.query import Filter, FilterError
+from appliance.channel.admin import StatusWanted
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.running import Appliance
+from appliance.cli.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.cli.selftest_nodes import TOPIC, RefusedError, call, message_through_the_relay
+from appliance.cli.status import troubles_of
+
+_CALLER = "/rosrv_selftest"
+_MANY_RESTARTS = 3
+_MANY_RECORDS = 200_000
+_RECORD_SECONDS = 5.0
+
+
+def running(appliance: Appliance) -> Iterator[Found]:
+    """Everything of the running appliance."""
+    try:
+        answer = appliance.ask(StatusWanted())
+    except NotRunningError as error:
+        yield fail(
+            "appliance",
+            str(error),
+            "start it (rosrv up), or leave --state and --api out to try the machine only",
+        )
+        return
+    if not answer.ok:
+        yield fail("appliance", answer.error, "the log of rosrv up says why")
+        return
+    status = answer.body
+    yield ok(
+        "appliance",
+        f"{status['version']}, {len(status['processes'])} processes, nodes find it at {status['master']}",
+    )
+    yield from told("status", lambda: _status(status))
+    yield from told("processes", lambda: _processes(status["processes"]))
+    yield from told("audit log", lambda: _audit(appliance))
+    master = _reachable(appliance, str(status["master"]))
+    yield from told("RVMaster", lambda: _call(appliance, master))
+    yield from told("relay", lambda: _message(master))
+
+
+def _status(status: dict[str, Any]) -> Iterator[Found]:
+    troubles = list(troubles_of(status))
+    for trouble in troubles:
+        yield fail("status", trouble, "rosrv status")
+    if not troubles:
+        probe = status["probe"] or "not run yet"
+        hidden = "no firewall" if status["isolation"] == "none" else f"probe of the ROS Master {probe}"
+        yield ok("status", f"isolation {status['isolation']}, {hidden}")
+
+
+def _processes(rows: list[dict[str, Any]]) -> Iterator[Found]:
+    restarted = [
+        f"{row['role']} {row['restarts']} times" for row in rows if row["restarts"] >= _MANY_RESTARTS
+    ]
+    if restarted:
+        yield warn("processes", f"started again: {', '.join(restarted)}", "the log of rosrv up says why")
+    else:
+        yield ok("processes", f"{len(rows)} run")
+
+
+def _audit(appliance: Appliance) -> Iterator[Found]:
+    source = appliance.audit()
+    try:
+        last = source.last()
+        if last > _MANY_RECORDS:
+            yield skip("audit log", f"{last} records are not proven here", "rosrv audit verify")
+            return
+        result = source.verify(None, None, lambda _sequence: None)
+    except (LogUnreadableError, NotRunningError, FilterError) as error:
+        yield skip("audit log", str(error))
+        return
+    if result.ok:
+        yield ok("audit log", f"{result.records} records are complete and unchanged")
+    else:
+        yield fail("audit log", result.findings[0].message, "rosrv audit verify")
+
+
+def _reachable(appliance: Appliance, master: str) -> str:
+    """Where RVMaster is for this machine: over REST the appliance is where REST is, if it names only itself."""
+    place = appliance.place
+    parts = urlsplit(master)
+    if place is None or parts.hostname not in ("127.0.0.1", "::1", "localhost"):
+        return master
+    host = str(urlsplit(place).hostname)
+    shown = f"[{host}]" if ":" in host else host
+    return urlunsplit((parts.scheme, f"{shown}:{parts.port}", "", "", ""))
+
+
+def _call(appliance: Appliance, master: str) -> Iterator[Found]:
+    """A call as any tool makes it: it must be answered, and be in the audit log."""
+    began = time.time_ns()
+    try:
+        call(master, "getPid", _CALLER)
+        text = "a call was allowed"
+    except RefusedError as error:
+        text = f"a call was refused by the policy ({str(error)[:100]})"
+    except OSError as error:
+        yield fail(
+            "RVMaster", f"{master} does not answer: {error}", "is this machine let in (network, firewall)?"
+        )
+        return
+    took = (time.time_ns() - began) / 1e6
+    try:
+        found = _recorded(appliance, began)
+    except (LogUnreadableError, NotRunningError) as error:
+        yield skip("RVMaster", f"{text} in {took:.1f} ms; the audit log cannot be read: {error}")
+        return
+    if found:
+        yield ok("RVMaster", f"{text} in {took:.1f} ms, and recorded")
+    else:
+        yield fail("RVMaster", f"{text}, but is not in the audit log", "rosrv status; rosrv audit verify")
+
+
+def _recorded(appliance: Appliance, since: int) -> bool:
+    wanted = Filter(caller_id=_CALLER, since=since)
+    for entries in appliance.audit().follow(wanted, 100, on=False):
+        if entries:
+            return True
+    deadline = time.monotonic() + _RECORD_SECONDS
+    while time.monotonic() < deadline:
+        if appliance.audit().search(wanted, None, 1, newest_first=True).entries:
+            return True
+    return False
+
+
+def _message(master: str) -> Iterator[Found]:
+    """A message from a publisher to a subscriber here, through the relay."""
+    began = time.monotonic()
+    try:
+        message = message_through_the_relay(master)
+    except RefusedError as error:
+        yield skip(
+            "relay",
+            f"not tried, the policy does not let this machine: {str(error)[:120]}",
+            f"grant {TOPIC} and /rosrv_selftest_* to this machine to try it",
+        )
+    except OSError as error:
+        yield fail(
+            "relay", f"no message came through: {error}", "can the appliance reach this machine? rosrv status"
+        )
+    else:
+        if message.endswith(b"selftest"):
+            yield ok(
+                "relay",
+                f"a message came through in {(time.monotonic() - began) * 1000:.0f} ms, registration included",
+            )
+        else:
+            yield fail(
+                "relay", "a message came through changed", "a monitor on its topic? rosrv monitor list"
+            )
