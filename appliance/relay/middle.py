@@ -41,6 +41,7 @@ _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
 _LONGEST = 2.0
 _LOOK_EVERY = 16  # messages
+_MANY = 256  # messages
 _AFTER_DEFECT = 1.0
 _TOO_LONG = "the monitors take too long for their messages"
 
@@ -202,7 +203,7 @@ class Middle:
         if not monitors.walks(walker, passage.time):
             return False
         telling, place, before = self._telling, passage.place, passage.position
-        began = time.thread_time() if passage.messages > _LOOK_EVERY else None  # else too little to count
+        began = time.thread_time() if passage.messages > _MANY else None  # else too little to count
         try:
             walked = walker.walk(
                 passage.view,

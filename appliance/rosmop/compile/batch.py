@@ -168,11 +168,12 @@ class _Writer:
             *body.lines,
             *(f"            {line}" for line in self._tail(body)),
             "        else:",
-            f"            position = {'end' if body.shape is None else 'following'}",
+            f"            {'position = end' if body.shape is None else 'position += stride'}",
             "            stopped = False",
             "    except x_exception:",
             "        pass",
             *(["    if stopped:", *(f"        {line}" for line in restore)] if restore else []),
+            *(["    n_0 = (position - start) // stride"] if body.always else []),
             *(f"    p_{number}.state = {state}" for number, state in enumerate(states)),
             f"    return {self._result()}",
         ]
@@ -197,11 +198,13 @@ class _Writer:
                 lines.append(f"    {_names('m', len(body.shape.lengths))} = lengths")
             if body.shape.written:
                 lines.append(f"    {_names('o', len(body.shape.written))} = places")
+        if body.always:
+            lines.append("    start = position")
         lines += [f"    n_{number} = x_{number} = y_{number} = 0" for number in numbers]
         if body.several:
             lines.append(f"    changes = [0] * {len(numbers)}")
             lines.append("    last = 0")
-        lines.append("    following = position")
+        lines.append("    following = position" if body.shape is None else "    position -= stride")
         return lines
 
     def _walk(self, body: Body) -> list[str]:
@@ -211,8 +214,7 @@ class _Writer:
             each = f"{names}," if names else "_"
             return [
                 f"        for {each} in frames:",
-                "            position = following",
-                "            following += stride",
+                "            position += stride",
             ]
         length = self._module.struct("<I", "unpack_from")
         return [

@@ -68,6 +68,8 @@ class Body:
     patches: int = 0
     writers: set[int] = field(default_factory=set)
     droppers: set[int] = field(default_factory=set)
+    always: bool = False
+    """The one event happens with every message; it need not be counted."""
 
     def add(self, depth: int, *lines: str) -> None:
         """Append lines, so deep."""
@@ -108,6 +110,8 @@ class Inliner:
             self._body.add(depth, f"if {self._event.guard}:")
             depth += 1
         self._base = depth
+        alike = self._body.shape is not None and not self._body.several
+        self._body.always = alike and all(_refusal(node) is None for node in statements)
         if any(_marks_drop(node) for node in ast.walk(function)):
             self._marks_drops = True
             self._body.add(depth, f"{self._dropped} = False")
@@ -211,10 +215,10 @@ class Inliner:
         self._body.add(
             depth,
             f"if k_{event}: break",
-            f"n_{event} += 1",
+            *([] if self._body.always else [f"n_{event} += 1"]),
             f"x_{event} += 1",
             "if position > run: pieces.append(view[run:position])",
-            "run = following",
+            "run = following" if self._body.shape is None else "run = position + stride",
             "continue",
         )
 
@@ -289,7 +293,9 @@ class Inliner:
         elif self._patches and not body.several:
             differs = " or ".join(patch.differs for patch in self._patches)
             body.add(depth, f"if {differs}: y_{number} += 1")
-        body.add(depth, *steps, f"n_{number} += 1")
+        body.add(depth, *steps)
+        if not body.always:
+            body.add(depth, f"n_{number} += 1")
         if body.several:
             body.add(depth, f"last = {number}")
         return True

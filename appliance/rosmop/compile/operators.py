@@ -110,8 +110,15 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
     left = number(operands.left.code, operands.left.type, kind)
     right = number(operands.right.code, operands.right.type, kind)
     if isinstance(kind, kinds.Floating):
+        if kind.bits == 64 and isinstance(operands.right.type, kinds.Floating):
+            left = _mixed(operands.left, left)
+        elif kind.bits == 64:
+            right = _mixed(operands.right, right)
         return operands.value(kind, _floating(operator, operands, left, right, kind))
     assert isinstance(kind, kinds.Integer)  # noqa: S101  the common type of two numbers
+    divisor = operands.right.constant
+    if operator in ("/", "%") and not kind.signed and isinstance(divisor, int) and divisor > 0:
+        return operands.value(kind, f"({left} {'//' if operator == '/' else '%'} {right})")  # as Python's
     if operator in _BITS:
         return operands.value(kind, f"({left} {operator} {right})")
     if operator == "/":
@@ -119,6 +126,11 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
     if operator == "%":
         return operands.value(kind, f"o_remainder({left}, {right}, {operands.site})")
     return operands.value(kind, wrapped(f"{left} {operator} {right}", kind))
+
+
+def _mixed(value: Value, converted: str) -> str:
+    """An operand beside a double: Python converts an integer as C++ does."""
+    return value.code if isinstance(value.type, kinds.Integer) else converted
 
 
 def _floating(operator: str, operands: Operands, left: str, right: str, kind: kinds.Floating) -> str:

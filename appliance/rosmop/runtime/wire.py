@@ -92,28 +92,51 @@ def put_moments(values: list[int], code: str, out: bytearray) -> None:
 
 
 class Message:
-    """The message that events look at: its bytes as changed so far, and what has become of it."""
+    """The message that events look at: its bytes as changed so far, and what has become of it.
 
-    __slots__ = ("buffer", "dropped", "original", "past", "time")
+    Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
+    copied for a changed stamp.
+    """
+
+    __slots__ = ("_replaced", "_written", "buffer", "dropped", "past", "time")
 
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
         self.time = time
-        self.original: bytes | None = None  # the bytes as received, once something was changed
+        self._written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
+        self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
 
     @property
     def changed(self) -> bool:
         """Whether the bytes differ from those received."""
-        return self.original is not None and self.buffer != self.original
+        if self._replaced is not None:
+            return bytes(self.buffer) != self._replaced
+        if self._written is None:
+            return False
+        ends = -1
+        for start, old in sorted(self._written):
+            if start < ends:  # written twice: it may be as it was
+                return bytes(self.buffer) != self._original()
+            ends = start + len(old)
+        return True  # `patch` has compared them
 
     def patch(self, start: int, new: bytes) -> None:
         """Put bytes in the place of as many."""
         end = start + len(new)
-        if self.buffer[start:end] != new:
-            self._keep()
-            self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
+        old = self.buffer[start:end]
+        if old == new:
+            return
+        if self._replaced is None:
+            if self._written is None:
+                self._written = []
+                if isinstance(self.buffer, bytes) or (
+                    isinstance(self.buffer, memoryview) and self.buffer.readonly
+                ):
+                    self.buffer = bytearray(self.buffer)
+            self._written.append((start, bytes(old)))
+        self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes]]) -> None:
         """Put bytes in the place of those from the first to before the second number, for every edit."""
@@ -121,7 +144,8 @@ class Message:
             for start, _, new in edits:
                 self.patch(start, new)
             return
-        self._keep()
+        if self._replaced is None:
+            self._replaced = self._original()
         pieces = []
         last = 0
         for start, end, new in sorted(edits):
@@ -130,14 +154,14 @@ class Message:
         pieces.append(bytes(self.buffer[last:]))
         self.buffer = bytearray(b"".join(pieces))
 
-    def _keep(self) -> None:
-        """Before the first change: keep the bytes as received, and see that the buffer can be written."""
-        if self.original is None:
-            self.original = bytes(self.buffer)
-            if isinstance(self.buffer, bytes) or (
-                isinstance(self.buffer, memoryview) and self.buffer.readonly
-            ):
-                self.buffer = bytearray(self.buffer)
+    def _original(self) -> bytes:
+        """The bytes as received, while the buffer is as long."""
+        if not self._written:
+            return bytes(self.buffer)
+        original = bytearray(self.buffer)
+        for start, old in reversed(self._written):
+            original[start : start + len(old)] = old
+        return bytes(original)
 
 
 def whole(
