@@ -116,16 +116,19 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
             right = _mixed(operands.right, right)
         return operands.value(kind, _floating(operator, operands, left, right, kind))
     assert isinstance(kind, kinds.Integer)  # noqa: S101  the common type of two numbers
+    if operator in ("/", "%"):
+        return operands.value(kind, _division(operator, operands, left, right, kind))
+    code = f"({left} {operator} {right})" if operator in _BITS else wrapped(f"{left} {operator} {right}", kind)
+    return operands.value(kind, code)
+
+
+def _division(operator: str, operands: Operands, left: str, right: str, kind: kinds.Integer) -> str:
     divisor = operands.right.constant
-    if operator in ("/", "%") and not kind.signed and isinstance(divisor, int) and divisor > 0:
-        return operands.value(kind, f"({left} {'//' if operator == '/' else '%'} {right})")  # as Python's
-    if operator in _BITS:
-        return operands.value(kind, f"({left} {operator} {right})")
+    if not kind.signed and isinstance(divisor, int) and divisor > 0:
+        return f"({left} {'//' if operator == '/' else '%'} {right})"  # of what is not negative: as Python's
     if operator == "/":
-        return operands.value(kind, wrapped(f"o_divide({left}, {right}, {operands.site})", kind))
-    if operator == "%":
-        return operands.value(kind, f"o_remainder({left}, {right}, {operands.site})")
-    return operands.value(kind, wrapped(f"{left} {operator} {right}", kind))
+        return wrapped(f"o_divide({left}, {right}, {operands.site})", kind)
+    return f"o_remainder({left}, {right}, {operands.site})"
 
 
 def _mixed(value: Value, converted: str) -> str:
