@@ -235,6 +235,25 @@ class Ipsec(_Section):
         description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
     )
 
+    ca: Literal["ecdsa", "ed25519"] = Field(
+        default="ecdsa",
+        description="kind of the authority's key, which is made at the first start: P-384, or Ed25519",
+    )
+    ca_passphrase_file: Path | None = Field(
+        default=None,
+        description="file, readable by root only, whose first line encrypts the authority's key;"
+        " also ROSRV_CA_PASSPHRASE_FILE",
+    )
+
+    @field_validator("pool", mode="before")
+    @classmethod
+    def _is_ipv4(cls, pool: object) -> object:
+        if isinstance(pool, str) and ":" in pool:
+            raise ValueError(
+                f"{pool}: virtual addresses are IPv4, which every ROS 1 node speaks; take a private /24"
+            )
+        return pool
+
     @field_validator("pool")
     @classmethod
     def _room_for_hosts(cls, pool: IPv4Network) -> IPv4Network:

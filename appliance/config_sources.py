@@ -32,11 +32,12 @@ _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
 _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
+    ("ipsec", "ca_passphrase_file"),
     ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
 )  # fmt: skip
-_FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
-
 KeyPath = tuple[str | int, ...]
+_SHORT_NAMES: dict[str, KeyPath] = {"ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file")}
+_FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Model = typing.TypeVar("_Model", bound=BaseModel)
 
 
@@ -120,7 +121,9 @@ class _Gathered:
         for name in sorted(environment):
             if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
                 continue
-            path = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
+            path = _SHORT_NAMES.get(name) or tuple(
+                part.lower() for part in name.removeprefix(_PREFIX).split("__")
+            )
             value: Any = environment[name]
             if value[:1] in "[{":
                 try:

@@ -4,6 +4,7 @@ A key that was kept in the clear is encrypted in its place when a passphrase is 
 passphrase is an error that says what to do, and nothing is replaced.
 """
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +23,7 @@ from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 Kind = Literal["ecdsa", "ed25519"]
 Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey
 SETTING, PASSPHRASE_SETTING = "ipsec.ca", "ipsec.ca_passphrase_file"
+_LONGEST_PASSPHRASE = 1023  # bytes, of OpenSSL
 _ENCRYPTED = b"-----BEGIN ENCRYPTED PRIVATE KEY-----"
 
 
@@ -30,6 +32,21 @@ def make_key(kind: Kind) -> Key:
     return (
         ec.generate_private_key(ec.SECP384R1()) if kind == "ecdsa" else ed25519.Ed25519PrivateKey.generate()
     )
+
+
+def read_passphrase(descriptor: int) -> bytes:
+    """The first line of an open file, which is closed. Raises `SignerKeyError`, `OSError`."""
+    with os.fdopen(descriptor, "rb") as file:
+        line = file.read(_LONGEST_PASSPHRASE + 2).partition(b"\n")[0].rstrip(b"\r")
+    if not line:
+        raise SignerKeyError(
+            f"the file that {PASSPHRASE_SETTING} names is empty: its first line is the passphrase"
+        )
+    if len(line) > _LONGEST_PASSPHRASE:
+        raise SignerKeyError(
+            f"the first line of the file that {PASSPHRASE_SETTING} names is longer than {_LONGEST_PASSPHRASE} bytes"
+        )
+    return line
 
 
 def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:

@@ -47,7 +47,9 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
+from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
+from appliance.ipsec.authority_key import Kind, read_passphrase
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 from appliance.ipsec.proof import RequestRefusedError
@@ -174,12 +176,19 @@ class Signer:
         return CertificateMade(wanted.number, issued.certificate, issued.serial, issued.expires)
 
 
-def main(lifeline_fd: int, directory: Path) -> None:
-    """Be the signer: `lifeline_fd` is the lifeline's descriptor, `directory` the signer's own."""
+def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
+    """Be the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the file that has it."""
+    settings = load_resolved(config)
+    serve(lifeline_fd, settings.state / "signer", settings.ipsec.ca, passphrase)
+
+
+def serve(lifeline_fd: int, directory: Path, kind: Kind = "ecdsa", passphrase: int | None = None) -> None:
+    """The same, with the directory of the keys and the kind of the authority's."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
     try:
         os.umask(0o077)
-        key, authority = load_or_create_key(directory), Authority(directory)
+        secret = read_passphrase(passphrase) if passphrase is not None else None
+        key, authority = load_or_create_key(directory), Authority(directory, kind, secret)
     except (SignerKeyError, OSError) as error:
         lifeline.send(Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)

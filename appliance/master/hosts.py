@@ -38,6 +38,7 @@ from appliance.store.state import StateStore
 
 _log = structlog.get_logger()
 _ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
+_SERVED_SECONDS = 10.0
 _RENEWALS_SECONDS = 3600.0
 _CLOCKS_DIFFER = 86_400.0
 
@@ -74,6 +75,7 @@ class Hosts:
         self._renewals: dict[str, float] = {}
         self._warned: set[str] = set()  # serials
         self._pin = ""
+        self._served = asyncio.Event()
         self.changed: Callable[[], int] = lambda: 0
         self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
         self.machines: Callable[[], dict[str, int]] = dict
@@ -110,6 +112,7 @@ class Hosts:
     def served_by(self, pin: str) -> None:
         """The api says by what hosts recognise it."""
         self._pin = pin
+        self._served.set()
 
     async def start(self) -> None:
         """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
@@ -182,6 +185,8 @@ class Hosts:
                 )
             if self._rest.port is None:
                 raise HostRefusedError(self._rest.trouble)
+            if not await self._until_served():
+                raise HostRefusedError("REST is not there: `rosrv status` and the log say why", ours=True)
             if len(self._awaited.rows()) >= MOST:
                 raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
             promised = self._table.address_for(name, address, self._awaited.addresses())
@@ -493,6 +498,8 @@ class Hosts:
         )
 
     async def _kit(self, name: str, warning: str | None) -> dict[str, Any]:
+        if self._rest.inner_port is not None and not await self._until_served():
+            warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
         authority = await self._certificate_of_authority()
         row, certificate = self._table.rows[name], self._table.certificates.get(name)
         if certificate is None or not certificate.certificate:
@@ -509,6 +516,14 @@ class Hosts:
             "authority": authority.decode(),
             "authority_fingerprint": _fingerprint(authority),
         }
+
+    async def _until_served(self) -> bool:
+        """Wait until the api, which starts after control, is there; False when it does not come in time."""
+        try:
+            await asyncio.wait_for(self._served.wait(), _SERVED_SECONDS)
+        except TimeoutError:
+            return False
+        return True
 
     def _places(self) -> dict[str, Any]:
         own, rest = self._table.own_address, self._rest

@@ -37,6 +37,8 @@ class Plan(msgspec.Struct, frozen=True):
     index: int | None = None
     path: str | None = None
     capabilities: tuple[str, ...] = ()
+    takes_secret: bool = False
+    secret: str | None = None
     argv: tuple[str, ...] = ()
     environment: dict[str, str] = {}
 
@@ -57,11 +59,12 @@ def main() -> None:
     setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")
     configure_logs(role)
     try:
+        secret = os.open(plan.secret, os.O_RDONLY | os.O_CLOEXEC) if plan.secret is not None else None
         _prepare(plan)
         if plan.argv:
             _execute(plan)
         else:
-            _call(plan)
+            _call(plan, secret)
     except (OSError, ImportError, UnreachableError) as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
@@ -91,16 +94,18 @@ def _require(account: Account, path: str, mode: int) -> None:
     )
 
 
-def _call(plan: Plan) -> None:
+def _call(plan: Plan, secret: int | None) -> None:
     assert plan.entry is not None  # noqa: S101  a plan has either argv or entry
     _require(plan.account, str(Path(appliance.__file__).parent), os.R_OK | os.X_OK)
     module, _, function = plan.entry.partition(":")
     entry = getattr(importlib.import_module(module), function)
-    arguments: list[int | Path] = [plan.lifeline]
+    arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)
     if plan.path is not None:
         arguments.append(Path(plan.path))
+    if plan.takes_secret:
+        arguments.append(secret)
     os.set_inheritable(plan.lifeline, False)
     entry(*arguments)
 

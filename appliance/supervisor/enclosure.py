@@ -209,7 +209,8 @@ class Contained(Enclosure):
         )
 
     def _api_networks(self) -> tuple[str, ...]:
-        return self._ports.api_networks
+        """Besides those that were configured, the hosts in tunnels: there they renew their certificates."""
+        return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _forwarder(self) -> Forwarder | None:
         if self._ports.syslog is None:

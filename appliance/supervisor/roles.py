@@ -24,6 +24,7 @@ class Facts:
     config: Path
     rosmaster_port: int
     rosout_master: str | None = None
+    ca_passphrase_file: Path | None = None
 
     def part(self, name: str) -> Path:
         """The part of the state directory with this name."""
@@ -50,7 +51,8 @@ class Role:
     readable for it. `listens`: each of its lives is given the listening socket that the supervisor holds for it.
     `dispensable`: when it cannot serve, the others go on without it. `on_demand`: started when control asks for it.
     `group` is the user whose group it is in instead of one of its own, to read what is `readable_by` that.
-    `capabilities` are those of `privileges.SUPERVISORS` that it keeps.
+    `capabilities` are those of `privileges.SUPERVISORS` that it keeps. `secret` is a file that its user may not read:
+    it is opened before the privileges are given up, and `entry` gets the descriptor (or None) as its last argument.
     """
 
     name: str
@@ -72,6 +74,7 @@ class Role:
     on_demand: bool = False
     capabilities: tuple[str, ...] = ()
     group: str | None = None
+    secret: Callable[[Facts], Path | None] | None = None
 
 
 def roles_of(
@@ -105,7 +108,8 @@ def roles_of(
             user="rosrv-signer",
             part="signer",
             entry="appliance.ipsec.signer:main",
-            path=lambda facts: facts.part("signer"),
+            path=lambda facts: facts.config,
+            secret=lambda facts: facts.ca_passphrase_file,
             links=("control",),
             network=False,
             outlives_control=True,

@@ -128,7 +128,12 @@ def _supervise(
     async def supervise() -> None:
         await Supervisor(
             roles,
-            Facts(state=state.path, config=state.config, rosmaster_port=settings.rosmaster_port),
+            Facts(
+                state=state.path,
+                config=state.config,
+                rosmaster_port=settings.rosmaster_port,
+                ca_passphrase_file=settings.ipsec.ca_passphrase_file,
+            ),
             admin=state.open_admin_socket(),
             ready=lambda said: ready(said, settings),
             relays=settings.relays,

@@ -231,6 +231,8 @@ class Supervisor:
             index=post.index if role.indexed else None,
             path=str(role.path(facts)) if role.path else None,
             capabilities=role.capabilities,
+            takes_secret=role.secret is not None,
+            secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
         )
         if role.program is None:
             return plan

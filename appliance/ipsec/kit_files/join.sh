@@ -1,5 +1,7 @@
 #!/bin/sh
-# Joins this machine (Debian or Ubuntu) to the ROSRV appliance as @name@, through an IPsec tunnel.
+# Joins this machine (Debian or Ubuntu) to the ROSRV appliance as @name@, through an IPsec tunnel. Run again, it puts
+# right what is not. With systemd the services rosrv-protect, rosrv-tunnel and rosrv-renew.timer hold it; where there
+# is no systemd (a container) the same programs run in the background until leave.sh.
 set -eu
 
 die() { echo "join.sh: $*" >&2; exit 1; }
@@ -8,13 +10,14 @@ say() { echo "join.sh: $*"; }
 cd "$(dirname "$0")"
 [ "$(id -u)" = 0 ] || die "run it as root: sudo ./join.sh"
 [ -f swanctl/private/rosrv.key ] || die "the private key is not here: put it at swanctl/private/rosrv.key"
-command -v apt-get >/dev/null || die "this script is for Debian and Ubuntu; README says what it does"
 
 missing=""
-for package in charon-systemd strongswan-swanctl libcharon-extra-plugins libstrongswan-standard-plugins nftables iproute2; do
+for package in charon-systemd strongswan-swanctl libcharon-extra-plugins libstrongswan-standard-plugins nftables \
+    iproute2 openssl curl; do
     dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q "ok installed" || missing="$missing $package"
 done
 if [ -n "$missing" ]; then
+    command -v apt-get >/dev/null || die "this script is for Debian and Ubuntu; README says what it does"
     say "installing$missing"
     apt-get update -qq
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $missing
@@ -35,16 +38,31 @@ else
     printf 'kernel-libipsec {\n  load = yes\n}\n' > "$plugin"
 fi
 
-install -d -m 0755 /etc/swanctl/conf.d /etc/swanctl/x509 /etc/swanctl/x509ca /etc/rosrv
-install -d -m 0700 /etc/swanctl/private
-install -m 0644 swanctl/swanctl.conf /etc/swanctl/conf.d/rosrv.conf
-install -m 0644 swanctl/x509/rosrv.pem /etc/swanctl/x509/rosrv.pem
-install -m 0644 swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem
-install -m 0600 swanctl/private/rosrv.key /etc/swanctl/private/rosrv.key
-install -m 0644 protect.nft /etc/rosrv/protect.nft
-install -m 0755 keep.sh /etc/rosrv/keep.sh
+end() { date -u -d "$(openssl x509 -in "$1" -noout -enddate | cut -d= -f2)" +%s; }
+# A certificate that was renewed since this kit was made is not replaced by the kit's, which is revoked by now.
+renewed() {
+    [ -s /etc/swanctl/x509/rosrv.pem ] && [ -s /etc/swanctl/private/rosrv.key ] \
+        && cmp -s swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem \
+        && openssl x509 -in /etc/swanctl/x509/rosrv.pem -noout -subject | grep -q "CN = @name@\$" \
+        && [ "$(end /etc/swanctl/x509/rosrv.pem)" -gt "$(end swanctl/x509/rosrv.pem)" ]
+}
 
-cat > /etc/systemd/system/rosrv-protect.service <<'UNIT'
+install -d -m 0755 /etc/swanctl/conf.d /etc/swanctl/x509 /etc/swanctl/x509ca /etc/swanctl/x509crl /etc/rosrv
+install -d -m 0700 /etc/swanctl/private
+if renewed; then
+    say "the certificate in place was renewed since this kit was made: it stays"
+else
+    install -m 0644 swanctl/x509/rosrv.pem /etc/swanctl/x509/rosrv.pem
+    install -m 0600 swanctl/private/rosrv.key /etc/swanctl/private/rosrv.key
+    rm -f /etc/swanctl/private/rosrv.key.unconfirmed
+fi
+install -m 0644 swanctl/swanctl.conf /etc/swanctl/conf.d/rosrv.conf
+install -m 0644 swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem
+install -m 0644 protect.nft /etc/rosrv/protect.nft
+install -m 0755 keep.sh renew.sh leave.sh /etc/rosrv/
+
+write_units() {
+    cat > /etc/systemd/system/rosrv-protect.service <<'UNIT'
 [Unit]
 Description=Closes the ROS ports of this machine to all but the ROSRV appliance
 Before=network-pre.target
@@ -59,7 +77,7 @@ ExecStop=/usr/sbin/nft delete table inet rosrv_protect
 [Install]
 WantedBy=multi-user.target
 UNIT
-cat > /etc/systemd/system/rosrv-tunnel.service <<'UNIT'
+    cat > /etc/systemd/system/rosrv-tunnel.service <<'UNIT'
 [Unit]
 Description=Asks for the tunnel to the ROSRV appliance whenever it is not there
 After=strongswan.service
@@ -71,19 +89,90 @@ Restart=always
 [Install]
 WantedBy=multi-user.target
 UNIT
-systemctl daemon-reload
-systemctl enable --quiet rosrv-protect.service
-systemctl restart rosrv-protect.service
-systemctl enable --quiet strongswan.service
-systemctl restart strongswan.service
-swanctl --load-all --noprompt >/dev/null || die "strongSwan did not take the tunnel: journalctl -u strongswan"
+    cat > /etc/systemd/system/rosrv-renew.service <<'UNIT'
+[Unit]
+Description=Renews the certificate for the tunnel to the ROSRV appliance
+After=rosrv-tunnel.service
+
+[Service]
+Type=oneshot
+ExecStart=/etc/rosrv/renew.sh
+UNIT
+    cat > /etc/systemd/system/rosrv-renew.timer <<'UNIT'
+[Unit]
+Description=Looks every hour whether the certificate for the ROSRV appliance is to be renewed
+
+[Timer]
+OnBootSec=10min
+OnUnitActiveSec=1h
+RandomizedDelaySec=5min
+
+[Install]
+WantedBy=timers.target
+UNIT
+}
+
+# Where there is no systemd: a program in the background, by its pid file.
+run=/run/rosrv
+running() { [ -s "$run/$1.pid" ] && kill -0 "$(cat "$run/$1.pid")" 2>/dev/null; }
+background() {
+    what=$1
+    shift
+    running "$what" && return
+    mkdir -p "$run"
+    setsid "$@" </dev/null >>"$run/$what.log" 2>&1 &
+    echo $! > "$run/$what.pid"
+}
+restart_charon() {
+    if running charon; then
+        pid=$(cat "$run/charon.pid")
+        kill "$pid"
+        while kill -0 "$pid" 2>/dev/null; do sleep 0.1; done
+    fi
+    rm -f /run/charon.vici
+    background charon charon-systemd
+    tries=0
+    while [ ! -S /run/charon.vici ]; do
+        tries=$((tries + 1))
+        [ "$tries" -lt 150 ] || die "charon does not start: $run/charon.log"
+        sleep 0.1
+    done
+}
+
+if [ -d /run/systemd/system ]; then
+    why="journalctl -u strongswan"
+    write_units
+    systemctl daemon-reload
+    systemctl enable --quiet rosrv-protect.service
+    systemctl restart rosrv-protect.service
+    systemctl enable --quiet strongswan.service
+    systemctl restart strongswan.service
+else
+    why="/run/rosrv/charon.log"
+    nft -f /etc/rosrv/protect.nft
+    restart_charon
+fi
+
+# ML-KEM beside Curve25519, where strongSwan has it here; the appliance takes it where it has it too.
+if swanctl --list-algs 2>/dev/null | grep -q ML_KEM_768; then
+    sed -i 's/\(proposals = \)\([a-z0-9-]*-x25519\),/\1\2-ke1_mlkem768, \2,/' /etc/swanctl/conf.d/rosrv.conf
+fi
+swanctl --load-all --noprompt >/dev/null || die "strongSwan did not take the tunnel: $why"
 
 say "waiting for the tunnel to @endpoint@"
 swanctl --initiate --child @child@ --ike @connection@ --timeout 20 >/dev/null 2>&1 || true
 if ! swanctl --list-sas --ike @connection@ | grep -q INSTALLED; then
-    die "no tunnel. journalctl -u strongswan says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
+    die "no tunnel. $why says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
 fi
-systemctl enable --quiet rosrv-tunnel.service
-systemctl restart rosrv-tunnel.service
+if [ -d /run/systemd/system ]; then
+    systemctl enable --quiet rosrv-tunnel.service rosrv-renew.timer
+    systemctl restart rosrv-tunnel.service rosrv-renew.timer
+else
+    background keep /etc/rosrv/keep.sh
+    background renew sh -c 'while sleep 3600; do /etc/rosrv/renew.sh; done'
+fi
+if [ -n "@rest@" ] && ! curl --silent --fail --max-time 20 --insecure --pinnedpubkey "@pin@" -o /dev/null "@rest@/v1/authority"; then
+    say "warning: the appliance does not answer at @rest@ in the tunnel: the certificate cannot be renewed by itself"
+fi
 say "the tunnel is up: this machine is @address@ to the appliance. For every shell that runs ROS nodes:"
 echo "  export ROS_MASTER_URI=@master@ ROS_IP=@address@"

@@ -1,21 +1,49 @@
 #!/bin/sh
-# Takes away what join.sh made: the tunnel to the ROSRV appliance, its key, and the closed ROS ports.
+# Takes away what join.sh made: the tunnel to the ROSRV appliance, its key and certificates, and the closed ROS ports.
+# What was not there before, as packages, stays. Run again, it finds nothing to do.
 set -eu
 
 [ "$(id -u)" = 0 ] || { echo "leave.sh: run it as root: sudo ./leave.sh" >&2; exit 1; }
+cd /
 
-systemctl disable --quiet --now rosrv-tunnel.service 2>/dev/null || true
-plugin=/etc/strongswan.d/charon/kernel-libipsec.conf
+systemd() { [ -d /run/systemd/system ]; }
+stop() {
+    pid=$(cat "/run/rosrv/$1.pid" 2>/dev/null) || return 0
+    # Each was started in a session of its own, so what it has started ends with it.
+    kill -- "-$pid" 2>/dev/null || kill "$pid" 2>/dev/null || true
+    while kill -0 "$pid" 2>/dev/null; do sleep 0.1; done
+    rm -f "/run/rosrv/$1.pid"
+}
+
+if systemd; then
+    systemctl disable --quiet --now rosrv-tunnel.service rosrv-renew.timer 2>/dev/null || true
+else
+    stop keep
+    stop renew
+fi
 rm -f /etc/swanctl/conf.d/rosrv.conf /etc/swanctl/x509/rosrv.pem /etc/swanctl/x509ca/rosrv-ca.pem
-rm -f /etc/swanctl/private/rosrv.key
+rm -f /etc/swanctl/x509crl/rosrv-crl.pem /etc/swanctl/private/rosrv.key /etc/swanctl/private/rosrv.key.unconfirmed
 swanctl --terminate --ike @connection@ >/dev/null 2>&1 || true
-swanctl --load-all --noprompt >/dev/null 2>&1 || true
+swanctl --load-all --clear --noprompt >/dev/null 2>&1 || true
+plugin=/etc/strongswan.d/charon/kernel-libipsec.conf
 if [ -e "$plugin.rosrv-before" ]; then
     mv "$plugin.rosrv-before" "$plugin"
-    systemctl try-restart strongswan.service
+    if systemd; then systemctl try-restart strongswan.service; fi
 fi
-systemctl disable --quiet --now rosrv-protect.service 2>/dev/null || true
-rm -f /etc/systemd/system/rosrv-protect.service /etc/systemd/system/rosrv-tunnel.service
-rm -f /etc/rosrv/protect.nft /etc/rosrv/keep.sh
-systemctl daemon-reload
+if systemd; then
+    systemctl disable --quiet --now rosrv-protect.service 2>/dev/null || true
+    rm -f /etc/systemd/system/rosrv-protect.service /etc/systemd/system/rosrv-tunnel.service
+    rm -f /etc/systemd/system/rosrv-renew.service /etc/systemd/system/rosrv-renew.timer
+    systemctl daemon-reload
+else
+    stop charon
+    # Sockets that charon leaves behind.
+    rm -f /run/charon.vici /run/charon.ctl /run/charon.dck /run/charon.lkp /run/charon.wlst /run/charon.enfy
+    rm -rf /run/rosrv
+fi
+if command -v nft >/dev/null && nft list table inet rosrv_protect >/dev/null 2>&1; then
+    nft delete table inet rosrv_protect
+fi
+rm -rf /etc/rosrv/protect.nft /etc/rosrv/keep.sh /etc/rosrv/renew.sh /etc/rosrv/leave.sh "/etc/rosrv/@name@"
+rmdir /etc/rosrv 2>/dev/null || true
 echo "leave.sh: this machine (@name@) has left. On the appliance: rosrv host revoke @name@"

@@ -11,19 +11,21 @@ swanctl=${SWANCTL_DIR:-/etc/swanctl}
 die() { echo "renew.sh: $*" >&2; exit 1; }
 field() { sed -n 's/.*"'"$1"'":"\([^"]*\)".*/\1/p' "$2"; }
 call() { curl --silent --show-error --max-time 30 --insecure --pinnedpubkey "$pin" "$@"; }
+# What may be asked twice is, for a tunnel may just be coming up.
+ask() { call --retry 10 --retry-delay 1 --retry-all-errors "$@" 2>"$work/errors" || { cat "$work/errors" >&2; return 1; }; }
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 umask 077
 
-if call --fail -o "$work/crl.pem" "$rest/v1/revocations" && openssl crl -in "$work/crl.pem" -noout \
+if ask --fail -o "$work/crl.pem" "$rest/v1/revocations" && openssl crl -in "$work/crl.pem" -noout \
     -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>/dev/null; then
     install -D -m 0644 "$work/crl.pem" "$swanctl/x509crl/rosrv-crl.pem"
 fi
 
 # What was left in the middle: a certificate that is in place and was not confirmed.
 confirm() {
-    status=$(call -o "$work/answer" -w '%{http_code}' -X POST "$rest/v1/hosts/@name@/renewed") || die "no answer from $rest"
+    status=$(ask -o "$work/answer" -w '%{http_code}' -X POST "$rest/v1/hosts/@name@/renewed") || die "no answer from $rest"
     case $status in
         204) rm -f "$swanctl/private/rosrv.key.unconfirmed"; echo "renew.sh: the new certificate is in force" ;;
         422) rm -f "$swanctl/private/rosrv.key.unconfirmed" ;;

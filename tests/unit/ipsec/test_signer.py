@@ -62,8 +62,8 @@ class SignerProcess:
     def __init__(self, directory: Path) -> None:
         ours, theirs = socket.socketpair()
         command = (
-            "import sys; from pathlib import Path; from appliance.ipsec.signer import main\n"
-            "main(int(sys.argv[1]), Path(sys.argv[2]))"
+            "import sys; from pathlib import Path; from appliance.ipsec.signer import serve\n"
+            "serve(int(sys.argv[1]), Path(sys.argv[2]))"
         )
         self.process = subprocess.Popen(
             [sys.executable, "-c", command, str(theirs.fileno()), str(directory)], pass_fds=[theirs.fileno()]

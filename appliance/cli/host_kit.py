@@ -1,0 +1,127 @@
+"""What `rosrv host` writes for a host: its kit, or the script by which it enrols itself."""
+
+import datetime
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from appliance.api.kits import Wishes, enrolment_of, kit_of
+from appliance.cli.policy_output import say
+from appliance.ipsec.kit import archive
+from appliance.ipsec.requests import make_key, signing_request
+
+_ENDPOINT = re.compile(r"[A-Za-z0-9][A-Za-z0-9.:-]{0,252}")
+_LONGEST_REQUEST = 16 << 10
+_SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
+
+
+def usage_error(text: str) -> typer.Exit:
+    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    typer.echo(f"rosrv host: {text}", err=True)
+    return typer.Exit(2)
+
+
+def moment(seconds: float) -> str:
+    """A time as the lists show it."""
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
+
+
+def wishes_of(appliance: str, ports: str, opened: list[str] | None) -> Wishes:
+    """What the flags ask for. Ends the program with 2 when that makes no sense."""
+    if not _ENDPOINT.fullmatch(appliance):
+        raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
+    try:
+        return Wishes(appliance, ports, tuple(opened or ()))
+    except ValueError as error:
+        raise usage_error(str(error)) from None
+
+
+def new_file(out: Path | None, default: str) -> Path:
+    """Where to write; nothing that is there is replaced. Ends the program with 2."""
+    path = out or Path(default.replace("/", "_"))
+    if path.exists():
+        raise usage_error(f"{path} is there already: remove it, or name another with --out")
+    return path
+
+
+class KitWriter:
+    """Checks everything that can be wrong before the appliance is asked, makes the key, writes the archive."""
+
+    def __init__(self, name: str, wishes: Wishes, *, csr: Path | None, out: Path | None) -> None:
+        self._wishes = wishes
+        self._path = new_file(out, f"rosrv-{name}.tar.gz")
+        self._key: str | None = None
+        if csr is None:
+            key = make_key()
+            self._key = key.decode()
+            self.request = signing_request(key, "host").decode()
+        else:
+            self.request = _read_request(csr)
+
+    def write(self, body: dict[str, Any], *, as_json: bool) -> None:
+        """Write the archive, for its owner only."""
+        again = (
+            f"{body['name']} is enrolled, its kit is not written:"
+            f" rosrv host kit {body['name']} --appliance {self._wishes.endpoint} --out FILE"
+        )
+        _write(self._path, archive(kit_of(body, self._wishes, self._key)), again)
+        if body["warning"]:
+            typer.echo(f"rosrv: {body['warning']}", err=True)
+        if not body["rest_url"]:
+            typer.echo(
+                f"rosrv: {body['name']} cannot renew its certificate by itself: {body['rest_trouble']}",
+                err=True,
+            )
+        if as_json:
+            sys.stdout.write(json.dumps({key: body[key] for key in _SHOWN} | {"kit": str(self._path)}) + "\n")
+            return
+        say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
+        say(
+            f"its kit: {self._path}" + ("" if self._key else " (without the private key, which the host has)")
+        )
+        say("on the host: unpack it, then sudo ./join.sh")
+
+
+def write_script(path: Path, body: dict[str, Any], wishes: Wishes, *, as_json: bool) -> None:
+    """Write the script of a host that was given a one-time token, and print the token."""
+    try:
+        script = body.get("script") or enrolment_of(body, wishes).script()
+    except ValueError as error:
+        typer.echo(f"rosrv: {error}", err=True)
+        raise typer.Exit(1) from None
+    _write(path, script.encode(), "the token is lost: ask for another one")
+    if as_json:
+        shown = {key: body[key] for key in ("name", "address", "token", "token_expires")}
+        sys.stdout.write(json.dumps(shown | {"script": str(path)}) + "\n")
+        return
+    sys.stdout.write(body["token"] + "\n")
+    typer.echo(
+        f"rosrv: {body['name']} is awaited as {body['address']} until {moment(body['token_expires'])}; the token is"
+        f" good once and shown only here.\nrosrv: on the host: sudo sh {path.name}   (it asks for the token)",
+        err=True,
+    )
+
+
+def _write(path: Path, data: bytes, lost: str) -> None:
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+    except OSError as error:
+        typer.echo(f"rosrv: {path}: {error.strerror}; {lost}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _read_request(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(_LONGEST_REQUEST + 1).decode("ascii")
+    except OSError as error:
+        raise usage_error(f"--csr {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise usage_error(f"--csr {path}: not a signing request in PEM") from None

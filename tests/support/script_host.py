@@ -1,0 +1,78 @@
+"""A host of the lab on which a kit's own scripts run, as root on a Debian machine without systemd would run them.
+
+It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` (what is written there is seen
+there alone) and `/run`. Nothing of the machine that runs the test is changed.
+"""
+
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network.lab import Host
+from tests.support.processes import Process
+
+_MOUNTS = """\
+set -e
+mount --make-rprivate /
+mkdir -p "$1" && mount -t tmpfs tmpfs "$1" && mkdir "$1/upper" "$1/work"
+mount -t overlay overlay -o lowerdir=/etc,upperdir="$1/upper",workdir="$1/work" /etc
+mount -t tmpfs tmpfs /run
+echo mounted
+exec sleep infinity
+"""
+
+
+class ScriptHost:
+    """A context manager; `address` is what ROS nodes on it are told to be (set once it has joined)."""
+
+    def __init__(self, host: Host, directory: Path) -> None:
+        self.outer = host
+        self.directory = directory
+        self.address = ""
+        self._upper = directory / "layer"
+        directory.mkdir(parents=True, exist_ok=True)
+        self._holder = Process(
+            host,
+            ["unshare", "-m", "sh", "-c", _MOUNTS, "sh", str(self._upper)],
+            env={"PATH": os.environ["PATH"]},
+            label=f"mounts of {host.name}",
+        )
+
+    def __enter__(self) -> Self:
+        self._holder.wait_for_text("mounted")
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.run("sh", "-c", "for f in /run/rosrv/*.pid; do [ -e $f ] && kill -- -$(cat $f); done; true")
+        self._holder.stop()
+
+    def command(self, args: Sequence[str]) -> list[str]:
+        """A command line that runs this on the host."""
+        return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "--", *args]
+
+    def popen(self, args: Sequence[Any], **options: Any) -> "subprocess.Popen[Any]":
+        """Start a program on the host."""
+        return self.outer.popen(self.command([str(one) for one in args]), **options)
+
+    def run(
+        self, *args: str, check: bool = True, timeout: float = 90, **environment: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a program on the host to its end."""
+        command = self.command(["env", *(f"{name}={text}" for name, text in environment.items()), *args])
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+        if check and done.returncode:
+            raise AssertionError(
+                f"{' '.join(args)}: {done.returncode}\n{done.stdout}\n{done.stderr}\n{self.log()}"
+            )
+        return done
+
+    def log(self) -> str:
+        """What charon said here."""
+        return self.run("sh", "-c", "tail -n 40 /run/rosrv/charon.log 2>/dev/null; true").stdout
+
+    def files(self) -> list[str]:
+        """Everything that was written below /etc, as this host sees it."""
+        upper = self._upper / "upper"
+        return self.run("find", str(upper), "-type", "f").stdout.replace(str(upper), "/etc").split()

@@ -1,0 +1,179 @@
+"""A host enrols itself by a one-time token, with the kit's own scripts run for real: join, renew, leave.
+
+The laptop is a network namespace with its own /etc and /run, without systemd; strongSwan, nft, curl and openssl are
+Debian's. REST is reached before the tunnel from the management network.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.network.lab import Lab
+from tests.support.nodes import RosSession
+from tests.support.requirements import need_program, need_root
+from tests.support.script_host import ScriptHost
+from tests.support.tunnel_site import MASTER, MIDDLE, OWN, POLICY, TunnelSite
+from tests.support.tunnels import need_strongswan
+
+API = 8443
+CONFIG = """\
+api: 0.0.0.0:8443
+api_networks: [10.88.0.0/24]
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
+    """An appliance whose REST the lab's network may reach."""
+    need_root()
+    need_strongswan()
+    for program, package in (("nft", "nftables"), ("curl", "curl"), ("openssl", "openssl")):
+        need_program(program, package)
+    home = tmp_path_factory.mktemp("enrolment")
+    (home / "appliance.yaml").write_text(CONFIG)
+    with Lab("rosrv-enrol") as lab:
+        policy = POLICY.replace("host:ocu-1", "host:laptop host:other")
+        one = TunnelSite(lab, home, policy=policy, options=("--config", str(home / "appliance.yaml")))
+        with one:
+            yield one
+
+
+@pytest.fixture
+def laptop(site: TunnelSite, tmp_path: Path) -> Iterator[ScriptHost]:
+    """A machine that nobody knows."""
+    with ScriptHost(site.ocu, tmp_path / "laptop") as host:
+        yield host
+
+
+def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "add") -> str:
+    """A one-time token; its script is in `out`."""
+    done = site.appliance.rosrv(
+        "host", verb, name, "--appliance", MIDDLE, "--token", "--out", str(out), "--json", *options
+    )
+    return str(json.loads(done.stdout)["token"])
+
+
+def row(site: TunnelSite, name: str) -> dict[str, Any]:
+    """A host by `rosrv host list`."""
+    return next(one for one in site.hosts() if one["name"] == name)
+
+
+def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """By token and script: its key is made there, nodes talk, the certificate is renewed, leaving leaves nothing."""
+    script = tmp_path / "join.sh"
+    before = laptop.files()
+    token = awaited(site, "laptop", script)
+    assert row(site, "laptop")["state"] == "awaited"
+    assert token not in script.read_text()
+    mark = site.mark
+    joined = laptop.run("sh", str(script), token)
+    site.recorded(mark, event="tunnel up")
+    address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]
+    found = row(site, "laptop")
+    assert (found["state"], found["address"], found["token_expires"]) == ("up", address, None)
+    nodes_talk(site, laptop, address)
+    closed(site, laptop)
+    again(site, laptop, script)
+    renew(site, laptop)
+    leave(site, laptop, before)
+    refused = laptop.run("sh", str(script), token, check=False)
+    assert refused.returncode == 1
+    assert "403" in refused.stderr
+    assert "was used before" in refused.stderr
+
+
+def nodes_talk(site: TunnelSite, laptop: ScriptHost, address: str) -> None:
+    """Unmodified nodes of both sides hear each other."""
+    laptop.address = address
+    with (
+        RosSession(MASTER, site.home, site.robot) as on_robot,
+        RosSession(f"http://{OWN}:11311", site.home, laptop) as on_laptop,
+    ):
+        on_laptop.talker("roscpp", "/orders", name="boss")
+        on_robot.listener("rospy", "/orders", name="arm").wait_for(event="received")
+
+
+def closed(site: TunnelSite, laptop: ScriptHost) -> None:
+    """Its ROS ports are closed to a neighbour; what an operator's check saw is shown."""
+    rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
+    assert OWN in rules
+    assert row(site, "laptop")["ports"]["state"] == "unknown"
+
+
+def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
+    """The script run again changes nothing and needs no token."""
+    serial = row(site, "laptop")["serial"]
+    mark = site.mark
+    done = laptop.run("sh", str(script))
+    assert "enrolled already" in done.stdout
+    site.recorded(mark, event="tunnel up")
+    assert row(site, "laptop")["serial"] == serial
+
+
+def renew(site: TunnelSite, laptop: ScriptHost) -> None:
+    """Nothing to do while most of its life is left; with --now a new key and certificate, the one before revoked."""
+    assert "nothing to do" in laptop.run("/etc/rosrv/renew.sh").stdout
+    key = laptop.run("cat", "/etc/swanctl/private/rosrv.key").stdout
+    before = row(site, "laptop")["serial"]
+    mark = site.mark
+    assert "in force" in laptop.run("/etc/rosrv/renew.sh", "--now").stdout
+    renewed = site.recorded(mark, event="host renewed")
+    assert renewed["detail"]["replaced"] == before
+    site.recorded(mark, event="tunnel down")
+    site.recorded(mark, event="tunnel up")
+    assert laptop.run("cat", "/etc/swanctl/private/rosrv.key").stdout != key
+    after = row(site, "laptop")
+    assert after["serial"] != before
+    assert not after["renewing"]
+    revoked = laptop.run(
+        "openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv-crl.pem", "-noout", "-text"
+    ).stdout
+    assert before.upper() not in revoked, "the list is from before the renewal"
+    early = laptop.run("/etc/rosrv/renew.sh", "--now", check=False)
+    assert early.returncode == 1
+    assert "again in" in early.stderr
+    fresh = laptop.run(
+        "openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv-crl.pem", "-noout", "-text"
+    ).stdout
+    assert before.upper() in fresh
+
+
+def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
+    """Nothing that joining made is left: no file, no rule, no process; a second time it is fine too."""
+    mark = site.mark
+    laptop.run("/etc/rosrv/leave.sh")
+    site.recorded(mark, event="tunnel down")
+    left = set(laptop.files()) - set(before) - {"/etc/strongswan.d/charon/kernel-libipsec.conf"}
+    assert left == set()
+    conf = "/etc/strongswan.d/charon/kernel-libipsec.conf"
+    assert "load = no" in laptop.run("cat", conf).stdout
+    assert laptop.run("ls", "-A", "/run").stdout.split() == []
+    assert laptop.run("nft", "list", "tables").stdout == ""
+    processes = laptop.outer.namespace.processes()
+    commands = [Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ") for pid in processes]
+    assert [one for one in commands if b"sleep infinity" not in one and b"nsenter" not in one] == []
+
+
+def test_somebody_in_between_gets_nothing(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """A server with another key is refused before the token is sent, and so is another authority's answer."""
+    script = tmp_path / "join.sh"
+    token = awaited(site, "other", script)
+    text = script.read_text()
+    pin = re.findall(r'^pin="(.*)"', text, re.MULTILINE)[0]
+    script.write_text(text.replace(pin, "sha256//" + "A" * 43 + "="))
+    mark = site.mark
+    done = laptop.run("sh", str(script), token, check=False)
+    assert done.returncode == 1
+    assert "one with another key" in done.stderr
+    assert row(site, "other")["state"] == "awaited", "the token was not used"
+    authority = re.findall(r'^authority="(.*)"', text, re.MULTILINE)[0]
+    script.write_text(text.replace(authority, "0" * 64))
+    done = laptop.run("sh", str(script), token, check=False)
+    assert "is another than the one this script was made for" in done.stderr
+    assert not laptop.run("ls", "/etc/rosrv/other/rosrv-other", check=False).stdout
+    site.recorded(mark, event="host enrolled")
+    site.appliance.rosrv("host", "revoke", "other")

@@ -1,0 +1,54 @@
+"""Tests of renewal by signature: only the holder of the present key of the same name gets the next certificate."""
+
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from appliance.ipsec.authority import Authority
+from appliance.ipsec.proof import RequestRefusedError
+from appliance.ipsec.requests import make_key, signing_request
+
+
+def sign(key: bytes, request: bytes) -> bytes:
+    """As `openssl pkeyutl -sign -rawin -digest sha384` does."""
+    private = load_pem_private_key(key, None)
+    assert isinstance(private, ec.EllipticCurvePrivateKey)
+    return private.sign(request, ec.ECDSA(hashes.SHA384()))
+
+
+def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
+    """Signed by the key of the present certificate, a request for another key is granted."""
+    authority, old, new = Authority(tmp_path), make_key(), make_key()
+    present = authority.issue(signing_request(old, "a"), "a", 1)
+    request = signing_request(new, "a")
+    following = authority.issue(request, "a", 1, proof=sign(old, request), former=present.certificate)
+    assert following.serial != present.serial
+
+
+def test_nobody_else_does(tmp_path: Path) -> None:
+    """Another key, another request, no proof, another name, another authority's or an ended certificate: refused."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "foreign").mkdir()
+    authority, foreign = Authority(tmp_path / "mine"), Authority(tmp_path / "foreign")
+    old, thief = make_key(), make_key()
+    present = authority.issue(signing_request(old, "a"), "a", 1).certificate
+    other = authority.issue(signing_request(old, "b"), "b", 1).certificate
+    strange = foreign.issue(signing_request(thief, "a"), "a", 1).certificate
+    ended = authority.issue(signing_request(old, "a"), "a", 1e-9).certificate
+    request = signing_request(thief, "a")
+    for proof, former, reason in (
+        (sign(thief, request), present, "not signed by the key"),
+        (sign(old, request + b" "), present, "not signed by the key"),
+        (b"", present, "not signed by the key"),
+        (b"x" * 5000, present, "not signed by the key"),
+        (sign(old, request), other, "in another name"),
+        (sign(thief, request), strange, "not one of this authority"),
+        (sign(old, request), ended, "has ended"),
+        (sign(old, request), b"rubbish", "not one of this authority"),
+        (sign(old, request), b"", "not one of this authority"),
+    ):
+        with pytest.raises(RequestRefusedError, match=reason):
+            authority.issue(request, "a", 1, proof=proof, former=former)
