@@ -269,11 +269,11 @@ class Supervisor:
                 self._child_ready(life, detail)
             case Failed(said):
                 reason = _printable(said)
-                log.error("process cannot serve", role=life.role, reason=reason)
                 if next(post for post in self._posts if post.life is life).role.dispensable:
+                    log.error("process cannot serve", role=life.role, reason=reason)
                     life.kill()
                 else:
-                    self.stop(reason)
+                    self.stop(reason)  # which says it, as the last line
             case _:
                 self._control_said(life, message, descriptors)
 
