@@ -152,6 +152,9 @@ class Replaced(Model):
     removed: list[str]
     warnings: list[Finding]
     monitors: list[str] = Field(description="those that there are (would be), in order")
+    moved: list[str] = Field(
+        default=[], description="monitors that began anew because another relay process has them now"
+    )
 
 
 class Switch(Model):

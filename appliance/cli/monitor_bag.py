@@ -41,7 +41,20 @@ def open_bag(path: Path) -> Reader:
         reader.open()
     except (ReaderError, OSError) as error:
         raise usage_error(f"cannot read the bag {path}: {error}") from error
+    _order_by_place(reader)
     return reader
+
+
+def _order_by_place(reader: Reader) -> None:
+    """Have messages with equal times come in the order in which they stand in the file.
+
+    The reader merges an index for each connection, by time only; so it is given one index with everything, as if of the
+    first connection. Whose a message is stands in its own record.
+    """
+    everything = [entry for entries in reader.indexes.values() for entry in entries]
+    everything.sort(key=lambda entry: (entry.time, entry.chunk_pos, entry.offset))
+    for number, connection in enumerate(reader.connections):
+        reader.indexes[connection.id] = everything if number == 0 else []
 
 
 def definitions_of(reader: Reader) -> Definitions:

@@ -175,6 +175,9 @@ def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
     parts = [f"{word} {', '.join(body[word])}" for word in ("added", "changed", "removed") if body[word]]
     what = "; ".join(parts) or "nothing is different"
     say(f"revision {body['revision']} of the specifications is in force (was {body['replaced']}): {what}")
+    if body["moved"]:
+        names = ", ".join(body["moved"])
+        say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
     if body["warnings"]:
         say(counted(len(body["warnings"]), "warning"), "yellow")
 

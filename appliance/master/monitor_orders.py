@@ -88,4 +88,5 @@ def _replaced(replaced: Replaced) -> dict[str, Any]:
         "changed": replaced.changed,
         "removed": replaced.removed,
         "warnings": replaced.warnings,
+        "moved": replaced.moved,
     }

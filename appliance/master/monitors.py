@@ -112,7 +112,7 @@ class Monitors:
         last = self._store.monitor_revision()
         if last is not None and (restarted or last.who != _DISK):
             sources = Sources(**json.loads(last.sources))
-            self._enforce(sources, check(sources), last)
+            self._enforce(sources, _check_kept(sources, last), last)
         else:
             sources = self._read()
             checked = check(sources)
@@ -351,3 +351,30 @@ class Monitors:
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.revision = sources, checked, row.revision
         self.who, self.note, self.loaded = row.who, row.note, row.loaded
+
+
+def forget_revision(store: StateStore, now: float) -> int | None:
+    """Have the next start take the folder; the revision that is given up, None if it was the folder's already.
+
+    For an appliance that does not run.
+    """
+    last = store.monitor_revision()
+    if last is None or last.who == _DISK:
+        return None
+    nothing = json.dumps({"files": {}, "definitions": {}})
+    store.save_monitor_revision(
+        MonitorRevisionRow(last.revision + 1, nothing, now, _DISK, f"revision {last.revision} was given up")
+    )
+    return last.revision
+
+
+def _check_kept(sources: Sources, row: MonitorRevisionRow) -> Checked:
+    """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
+    try:
+        return check(sources)
+    except SpecificationsRefusedError as error:
+        way = (
+            f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."
+            " To give it up and start with the folder (--monitors): rosrv monitor reset --state DIR"
+        )
+        raise SpecificationsRefusedError([*error.findings, way]) from error

@@ -109,7 +109,7 @@ class Middle:
             monitor.held = monitor.held or (
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
             )
-        self._telling.keep([one.name for one in result.monitors], began)
+        self._telling.keep([one.name for one in result.monitors], began, now)
         self._telling.told(outcome, ("", ""))
         self._taken(message, began)
 

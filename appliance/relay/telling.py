@@ -33,8 +33,9 @@ class Telling:
         self._again: dict[tuple[tuple[str, ...], Place], int] = {}
         self._shown: set[Place] = set()
 
-    def keep(self, names: list[str], began: list[str]) -> None:
-        """Other monitors are in force; those that began count anew."""
+    def keep(self, names: list[str], began: list[str], time: int) -> None:
+        """Other monitors are in force; those that began count anew, and not what happened to those before them."""
+        self._sum_up(time)
         self._counters = {
             name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
         }
@@ -142,6 +143,10 @@ class Telling:
 
     def tick(self, time: int) -> None:
         """A second is over: sum up."""
+        self._sum_up(time)
+        self._shown.clear()
+
+    def _sum_up(self, time: int) -> None:
         for events, count in self._happened.items():
             for event in events:
                 self._counter(event.partition(".")[0]).events += count
@@ -151,7 +156,6 @@ class Telling:
             self._counter(monitor).changes += count
             self._observations.add("change", monitor, place, time, count)
         self._again.clear()
-        self._shown.clear()
 
     def row(self, monitor: Monitor) -> MonitorRow:
         """The state and counters of one monitor."""

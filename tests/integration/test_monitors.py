@@ -2,8 +2,10 @@
 
 import json
 import signal
+import sqlite3
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -181,6 +183,30 @@ def test_what_was_loaded_and_switched_survives_a_restart(appliance: Appliance, t
     assert said[1].endswith("['words']]")
     assert said[2] == "[1, 'RV State']"
     assert said[3] == "-1"
+
+
+def test_a_kept_revision_that_is_not_understood_any_more_has_a_way_back(
+    appliance: Appliance, tmp_path: Path
+) -> None:
+    """As after an upgrade: the start says which verb gives it up, and the next one has the folder's monitors."""
+    spec = tmp_path / "more.rv"
+    spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
+    appliance.rosrv("monitor", "load", str(spec))
+    assert json.loads(appliance.rosrv("-rvstate", "--json").stdout)[2] == [
+        ["more", "/other", 0, 0], ["words", "/chatter", 0, 0]
+    ]  # fmt: skip
+    appliance.stop()
+    with closing(sqlite3.connect(appliance.state / "control" / "state.db")) as database, database:
+        database.execute("UPDATE monitor_revision SET sources = replace(sources, 'event said', 'evnt said')")
+    with pytest.raises(AssertionError):
+        appliance.start()
+    assert "more.rv:5:" in appliance.story()
+    assert "rosrv monitor reset --state" in appliance.story()
+    said = appliance.rosrv("monitor", "reset").stdout
+    assert "is given up" in said
+    appliance.start()
+    assert monitor(appliance, "words")["enabled"] is True
+    assert len(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()) == 1
 
 
 def test_a_start_with_a_bad_file_is_an_error_that_says_where(folder: Path) -> None:

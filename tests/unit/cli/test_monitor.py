@@ -253,6 +253,19 @@ def test_specifications_run_in_the_order_of_their_names(tmp_path: Path) -> None:
     assert records(invoke("run", two, one, "--bag", bag, "--json"))[0]["events"] == ["one.e", "two.e"]
 
 
+def test_messages_with_equal_times_come_as_they_stand_in_the_file(tmp_path: Path) -> None:
+    """Whichever connection they are of; a message that was recorded later with an earlier time comes by its time."""
+    topics = ["/b", "/a", "/a", "/c", "/b", "/a"]
+    messages = [(topic, "std_msgs/Int32", 2, number(value)) for value, topic in enumerate(topics)]
+    bag = make_bag(tmp_path / "in.bag", [*messages, ("/c", "std_msgs/Int32", 1, number(9))])
+    events = " ".join(
+        f"event {name}(int x) /{name} std_msgs/Int32 '{{data:x}}' {{ printf(\"%d\", x); }}" for name in "abc"
+    )
+    found = records(invoke("run", write(tmp_path, "a.rv", f"s() {{ {events} }}"), "--bag", bag, "--json"))
+    assert [record["topic"] for record in found] == ["/c", *topics]
+    assert [record["log"][0]["text"] for record in found] == ["9", "0", "1", "2", "3", "4", "5"]
+
+
 def test_the_types_of_the_recording_are_known(tmp_path: Path) -> None:
     """A type that only the recorded publisher defines is taken from its connection header."""
     path = tmp_path / "in.bag"

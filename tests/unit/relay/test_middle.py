@@ -454,3 +454,40 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
     assert heard[-1] == f"6 {sent}"
     marks = [text.split(" ")[0] for text in heard]
     assert sorted(set(marks)) == sorted(["", "0", "1", "2", "3", "6"])
+
+
+def test_a_monitor_that_is_replaced_counts_anew_and_not_what_its_predecessor_saw(world: Monitored) -> None:
+    """Also what had not been summed up when it came; one that stays goes on counting."""
+    other = "other() { event e() /chatter std_msgs/String '{}' { } }"
+    world.load(other, GUARD)
+    publisher, subscriber = world.typed()
+    for text in ("one", "one", "bad"):
+        publisher.send(string(text))
+    world.until(lambda: data_of(subscriber).count(b"two") == 2)
+    world.load(other, GUARD.replace("a longer text", "another text"), revision=2)
+    publisher.send(string("one"))
+
+    def counted() -> dict[str, tuple[int, int, int]]:
+        found = [message.rows for message in world.told if isinstance(message, MonitorsCounted)]
+        return {row.name: (row.events, row.changes, row.drops) for row in found[-1]} if found else {}
+
+    world.until(lambda: counted().get("guard", (0, 0, 0))[0] == 1)
+    assert counted() == {"guard": (1, 1, 0), "other": (4, 0, 0)}
+
+
+def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_declared_so(
+    world: Monitored,
+) -> None:
+    """It begins in its initial state here, as after a restart; others of the same text do not."""
+    held = "hold gate() { event e() /chatter std_msgs/String '{}' { } }"
+    free = "free() { event e() /other std_msgs/String '{}' { } }"
+    world.load(free)
+    files = [("gate.rv", held), ("free.rv", free)]
+    world.state(SpecificationsStated(2, files, {}, {}, False, moved=("gate", "free")))
+    taken = world.until(lambda: world.taken(SpecificationsTaken, 2))
+    assert (taken.began, taken.held) == (["gate"], ["gate"])
+    world.state(SpecificationsStated(3, files, {}, {}, False, moved=("gate", "free")))
+    assert world.until(lambda: world.taken(SpecificationsTaken, 3)).held == ["gate"]
+    world.state(MonitorResumed("gate"))
+    world.state(SpecificationsStated(4, files, {}, {}, False, moved=("gate", "free")))
+    assert world.until(lambda: world.taken(SpecificationsTaken, 4)).held == []

@@ -1,0 +1,69 @@
+"""The way back to the folder's specifications, while the appliance does not run."""
+
+import json
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from appliance.cli.main import app
+from appliance.store.state import MonitorRevisionRow, StateStore
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.state import StateDirectory
+
+
+def state_with(tmp_path: Path, who: str) -> Path:
+    """A state directory whose last specifications came from `who`."""
+    home = tmp_path / "control"
+    home.mkdir()
+    store = StateStore(home, failed=print)
+    store.save_monitor_revision(MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, who, ""))
+    store.close()
+    return tmp_path
+
+
+def reset(state: Path, *options: str) -> tuple[int, str]:
+    """Exit status and output."""
+    result = CliRunner().invoke(app, ["monitor", "reset", "--state", str(state), *options])
+    if isinstance(result.exception, StartError):
+        return 1, str(result.exception)
+    return result.exit_code, result.output
+
+
+def last(state: Path) -> MonitorRevisionRow | None:
+    """The last revision."""
+    store = StateStore(state / "control", failed=print)
+    try:
+        return store.monitor_revision()
+    finally:
+        store.close()
+
+
+def test_what_was_loaded_by_command_is_given_up(tmp_path: Path) -> None:
+    """The next start reads the folder; the revision before is kept, and a second time there is nothing to do."""
+    state = state_with(tmp_path, "operator")
+    assert json.loads(reset(state, "--json")[1]) == {"given_up": 7}
+    row = last(state)
+    assert row is not None
+    assert (row.revision, row.who) == (8, "disk")
+    status, said = reset(state)
+    assert status == 0
+    assert "nothing to give up" in said
+
+
+def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
+    """It has a verb for that."""
+    state = state_with(tmp_path, "operator")
+    running = StateDirectory(state)
+    status, said = reset(state)
+    running.close()
+    assert status == 1
+    assert "an appliance uses the state directory" in said
+    assert last(state) == MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, "operator", "")
+
+
+def test_a_directory_without_a_state(tmp_path: Path) -> None:
+    """Exit status 2, and nothing is made."""
+    status, said = reset(tmp_path / "nowhere")
+    assert status == 2
+    assert "--state" in said
+    assert not (tmp_path / "nowhere").exists()
