@@ -1,6 +1,8 @@
 """`/metrics`: what is measured, in Prometheus's format."""
 
 import os
+import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -115,6 +117,7 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_registrations": [((kind,), count) for kind, count in body["registrations"].items()],
         "rosrv_rosmaster_reachable": [((), status["rosmaster"] == "reachable")],
         "rosrv_delivery_queue": [((), body["queued_deliveries"])],
+        **_tunnels(body["hosts"]),
         "rosrv_audit_queue": [((), audit["lag_records"])],
         "rosrv_audit_lag_seconds": [((), audit["lag_seconds"])],
         "rosrv_audit_failed": [((), audit["failed"] is not None)],
@@ -137,6 +140,27 @@ def _forwarding(forwarding: dict[str, Any] | None) -> dict[str, _Samples]:
         "rosrv_syslog_lag_records": [((), forwarding["behind"])],
         "rosrv_syslog_lag_seconds": [((), forwarding["seconds"])],
         "rosrv_syslog_missed_total": [((), forwarding["missed"])],
+    }
+
+
+_PORTS = {"open": 1, "closed": 0, "unknown": -1}
+
+
+def _tunnels(hosts: list[dict[str, Any]]) -> dict[str, _Samples]:
+    """Of the hosts that may come; a revoked one is only counted."""
+    enrolled = [one for one in hosts if one["serial"] is not None and one["revoked"] is None]
+    now = time.time()
+    return {
+        "rosrv_tunnel_up": [((one["name"],), one["remote"] is not None) for one in enrolled],
+        "rosrv_tunnel_age_seconds": [((one["name"],), one["seconds"] or 0) for one in enrolled],
+        "rosrv_tunnel_bytes": [
+            ((one["name"], direction), one[f"bytes_{direction}"] or 0)
+            for one in enrolled
+            for direction in ("in", "out")
+        ],
+        "rosrv_host_certificate_expiry_seconds": [((one["name"],), one["expires"] - now) for one in enrolled],
+        "rosrv_host_ports_open": [((one["name"],), _PORTS[one["ports"]["state"]]) for one in enrolled],
+        "rosrv_hosts": [((state,), count) for state, count in Counter(one["state"] for one in hosts).items()],
     }
 
 

@@ -1,5 +1,6 @@
 """Tests of `appliance.metrics` and `appliance.api.metrics`."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,19 @@ def body() -> dict[str, Any]:
         "drop_at": {"/b": [5]}, "change_at": {"/b": [6], "(others)": [1]},
         "connections": {"topic": 7},
         "rest": [(("GET", "200"), 8)],
+        "hosts": [
+            host("a", "up", remote="10.0.0.9", seconds=7, bytes_in=100, bytes_out=50, expires=time.time() + 1000),
+            host("b", "revoked", revoked=5.0),
+            host("c", "not enrolled", serial=None),
+        ],
     }  # fmt: skip
+
+
+def host(name: str, state: str, **more: Any) -> dict[str, Any]:
+    """A row of the hosts."""
+    row: dict[str, Any] = {"name": name, "state": state, "serial": "1f", "revoked": None, "expires": 9.0}
+    row |= dict.fromkeys(("remote", "seconds", "bytes_in", "bytes_out"))
+    return row | {"ports": {"state": "closed"}} | more
 
 
 def test_every_metric_is_given_as_it_is_listed() -> None:
@@ -72,6 +85,24 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_syslog_up", ()] == 0
     assert samples["rosrv_syslog_lag_records", ()] == 4
     assert samples["rosrv_process_resident_bytes", (("role", "control"),)] > 0
+
+
+def test_tunnels_are_measured() -> None:
+    """Of an enrolled host: up, age, bytes, when its certificate ends, ports; of a revoked one nothing but its count."""
+    samples = {
+        (one.name, tuple(sorted(one.labels.items()))): one.value
+        for family in text_string_to_metric_families(rendered(body()).decode())
+        for one in family.samples
+        if "tunnel" in one.name or "host" in one.name
+    }
+    a = (("host", "a"),)
+    assert samples["rosrv_tunnel_up", a] == 1
+    assert samples["rosrv_tunnel_age_seconds", a] == 7
+    assert samples["rosrv_tunnel_bytes", (("direction", "in"), *a)] == 100
+    assert 900 < samples["rosrv_host_certificate_expiry_seconds", a] <= 1000
+    assert samples["rosrv_host_ports_open", a] == 0
+    assert samples["rosrv_hosts", (("state", "revoked"),)] == 1
+    assert ("rosrv_tunnel_up", (("host", "b"),)) not in samples
 
 
 def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:
