@@ -13,8 +13,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
+from appliance.ros.errors import PeerError
 from appliance.ros.tcpros import FrameParser, HeaderParser, encode_frame, encode_header
-from appliance.ros.xmlrpc import build_call, build_response, parse_call, parse_response
+from appliance.ros.xmlrpc import FaultReceived, build_call, build_response, parse_call, parse_response
 
 TOPIC = "/rosrv_selftest"
 _PUBLISHER, _SUBSCRIBER = "/rosrv_selftest_publisher", "/rosrv_selftest_subscriber"
@@ -36,7 +37,9 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
             "POST", place.path or "/", build_call(method, arguments), {"Content-Type": "text/xml"}
         )
         answer = parse_response(connection.getresponse().read())
-    except http.client.HTTPException as error:
+    except FaultReceived as fault:
+        raise RefusedError(str(fault)) from fault
+    except (http.client.HTTPException, PeerError) as error:
         raise OSError(f"{uri}: {error}") from error
     finally:
         connection.close()

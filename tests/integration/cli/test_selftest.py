@@ -1,0 +1,94 @@
+"""`rosrv selftest` against a running appliance: what works is tried for real, what does not is found."""
+
+import json
+import os
+import signal
+import subprocess
+import xmlrpc.client
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.processes import LIMIT
+
+STRICT = OPEN_POLICY.replace("*", "10.9.9.9")
+Rows = dict[str, dict[str, str]]
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with REST over TLS."""
+    with Appliance(options=("--api", "127.0.0.1:0")) as running:
+        running.rest()
+        yield running
+
+
+def selftest(appliance: Appliance, way: str = "state") -> tuple[int, Rows]:
+    """The exit status and what was found by check, tried over the state directory or over REST."""
+    env = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
+    command = [ROSRV, "selftest", "--json", "--state", str(appliance.state)]
+    if way == "api":
+        certificate = appliance.state / "api" / "certificate.pem"
+        command[3:] = ["--api", str(appliance.ready["api"]), "--api-ca", str(certificate)]
+        env["ROSRV_TOKEN"] = str(appliance.ready["token"])
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=2 * LIMIT, check=False)
+    assert not done.stderr, done.stderr
+    return done.returncode, {row["check"]: row for row in map(json.loads, done.stdout.splitlines())}
+
+
+def failures(found: Rows) -> list[dict[str, str]]:
+    """What failed."""
+    return [row for row in found.values() if row["outcome"] == "fail"]
+
+
+def test_a_message_really_goes_through(appliance: Appliance) -> None:
+    """Both ways: a call is answered and recorded, a message comes through the relay, and nothing is left behind."""
+    for way in ("state", "api"):
+        status, found = selftest(appliance, way)
+        assert status == 0, failures(found)
+        for check in ("appliance", "status", "processes", "audit log", "RVMaster", "relay"):
+            assert found[check]["outcome"] == "ok", found[check]
+        assert "a message came through" in found["relay"]["text"]
+    assert ("firewall" in found) is False
+    with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        state = str(master.getSystemState("/looker"))
+    assert "selftest" not in state
+    records = appliance.audit("--caller", "/rosrv_selftest_publisher", "--category", "publish")
+    assert {one["resource"] for one in records} == {"/rosrv_selftest"}
+
+
+def test_a_strict_policy_is_no_failure(appliance: Appliance) -> None:
+    """A refusal with its record proves RVMaster; the relay is not tried, which is said, with what would let it be."""
+    appliance.reload(STRICT)
+    status, found = selftest(appliance)
+    assert status == 0, failures(found)
+    assert "refused by the policy" in found["RVMaster"]["text"]
+    assert found["RVMaster"]["text"].endswith("and recorded")
+    assert found["relay"]["outcome"] == "skip"
+    appliance.reload(OPEN_POLICY)
+
+
+def test_a_relay_that_carries_nothing_is_found(appliance: Appliance) -> None:
+    """A relay that hangs, before its supervisor has noticed: the message does not come, and that is a failure."""
+    pids = appliance.pids("relay")
+    supervisor = appliance.pids("supervisor")[0]
+    for pid in (supervisor, *pids):
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        status, found = selftest(appliance, "api")
+    finally:
+        for pid in (*pids, supervisor):
+            os.kill(pid, signal.SIGCONT)
+    assert status == 1
+    assert found["relay"]["outcome"] == "fail"
+    assert found["relay"]["advice"]
+
+
+def test_where_none_runs_it_is_a_failure(appliance: Appliance) -> None:
+    """An appliance that was named and does not run: the machine is tried, and that it does not run is told."""
+    appliance.stop()
+    status, found = selftest(appliance)
+    assert status == 1
+    assert found["appliance"]["outcome"] == "fail"
+    assert found["policy"]["outcome"] in ("ok", "warn")
