@@ -97,6 +97,23 @@ def add_address(namespace: Namespace, name: str, address: str) -> None:
     )
 
 
+def delete_address(namespace: Namespace, name: str, address: str) -> None:
+    """Take an address from the interface `name`. Deleting what is not there is fine."""
+    interface = ipaddress.ip_interface(address)
+
+    def delete(route: Any) -> None:
+        for index in route.link_lookup(ifname=name):
+            held = [
+                f"{one.get_attr('IFA_ADDRESS')}/{one['prefixlen']}" for one in route.get_addr(index=index)
+            ]
+            if str(interface) in held:
+                route.addr(
+                    "del", index=index, address=str(interface.ip), prefixlen=interface.network.prefixlen
+                )
+
+    _netlink(namespace, f"taking {address} from {name}", delete)
+
+
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
     """Route `destination` (a network, or "default") through the address `via`."""
     family = _family(via)

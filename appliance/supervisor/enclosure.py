@@ -110,6 +110,7 @@ class Contained(Enclosure):
         self._backend = backend
         self._firewall: Firewall | None = None
         self._tunnels: tuple[str, Esp] | None = None  # the pool of their addresses
+        self._own: str | None = None  # the appliance's address in the tunnels
 
     def build(self) -> None:
         """Install the firewall. Raises `StartError`."""
@@ -124,13 +125,15 @@ class Contained(Enclosure):
         log.info("firewall is in force", backend=chosen, isolation=self.kind)
 
     def remove(self) -> None:
-        """Take every rule away again."""
+        """Take every rule away again, and the address that the tunnels end at."""
         if self._firewall is None:
             return
         try:
             self._firewall.remove()
+            if self._own is not None:
+                links.delete_address(self._namespace, "lo", self._own)
         except NetworkError as error:
-            log.error("rules of the firewall may be left", error=str(error))
+            log.error("rules of the firewall, or the address of the tunnels, may be left", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
         """Close both to everybody but rosmaster's user."""
@@ -153,6 +156,7 @@ class Contained(Enclosure):
         own = f"{ipaddress.IPv4Address(address)}/32"
         if own not in links.addresses(self._namespace):
             links.add_address(self._namespace, "lo", own)
+        self._own = own
         return esp
 
     def report(self) -> dict[str, Any]:

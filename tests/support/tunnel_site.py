@@ -6,12 +6,14 @@
 import contextlib
 import json
 import re
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.lab import Host, Lab
+from appliance.network import links
+from appliance.network.lab import INTERFACE, Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
@@ -80,7 +82,7 @@ class TunnelSite:
             self.recorded(mark, event="tunnel up", host=joined.address)
             yield joined
             mark = self.mark
-            stands = joined.address in [row["address"] for row in self.hosts() if row["state"] == "up"]
+            stands = self.stands(joined.address)
         if stands:
             self.recorded(mark, event="tunnel down", host=joined.address)
 
@@ -95,6 +97,13 @@ class TunnelSite:
             listener = here.listener("rospy", "/orders", name="arm")
             listener.wait_for(event="received")
             yield talker, listener
+
+    def stands(self, address: str) -> bool:
+        """Whether the tunnel of this virtual address is up, by the audit log."""
+        changes = [
+            one for one in self.trail.seen(host=address) if one["event"] in ("tunnel up", "tunnel down")
+        ]
+        return bool(changes) and changes[-1]["event"] == "tunnel up"
 
     def hosts(self) -> list[dict[str, Any]]:
         """`rosrv host list`."""
@@ -136,6 +145,26 @@ class TunnelSite:
         self.trail = Process(
             ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail"
         ).__enter__()
+
+
+def left_behind(host: Host) -> dict[str, str]:
+    """What an appliance has left on its host of rules, IPsec's states, routes, interfaces and addresses."""
+
+    def told(*command: str) -> str:
+        process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        return str(process.communicate(timeout=LIMIT)[0]).strip()
+
+    iptables = told("iptables-legacy-save") + told("ip6tables-legacy-save")
+    found = {
+        "states": told("ip", "xfrm", "state"),
+        "policies": told("ip", "xfrm", "policy"),
+        "nftables": told("nft", "list", "ruleset"),
+        "iptables": "ROSRV" if "ROSRV" in iptables else "",
+        "routes": told("ip", "route", "show", "table", "220"),
+        "interfaces": " ".join(one for one in links.links(host.namespace) if one not in ("lo", INTERFACE)),
+        "addresses": OWN if OWN in " ".join(links.addresses(host.namespace)) else "",
+    }
+    return {name: text for name, text in found.items() if text}
 
 
 def numbers(listener: Process) -> list[int]:

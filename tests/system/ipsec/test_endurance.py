@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.network.lab import INTERFACE, Lab
+from appliance.network.lab import INTERFACE, Host, Lab
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_root
-from tests.support.tunnel_site import LONG, TunnelSite, numbers
+from tests.support.tunnel_site import LONG, TunnelSite, left_behind, numbers
 from tests.support.tunnels import JoinedHost, need_strongswan
 
 SHORT_LIVES = """
@@ -135,3 +135,16 @@ def test_both_ends_restart(site: TunnelSite, how: int) -> None:
         with site.talking(host):
             pass
         assert site.state() == "up"
+
+
+def test_an_end_leaves_nothing(site: TunnelSite) -> None:
+    """Stopped in order with a tunnel up, the appliance leaves no rule, route, interface or address."""
+    host = site.appliance.host
+    assert isinstance(host, Host)
+    with site.join(site.kit()) as joined:
+        joined.wait_until_up()
+        assert set(left_behind(host)) == {"nftables", "routes", "interfaces", "addresses"}, (
+            "in force until then"
+        )
+        assert site.appliance.stop() == 0
+        assert left_behind(host) == {}

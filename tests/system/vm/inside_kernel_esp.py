@@ -10,7 +10,7 @@ from appliance.network import links
 from appliance.network.lab import INTERFACE, Host, Lab
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
-from tests.support.tunnel_site import ATTACKER, LONG, MIDDLE, OCU, OWN, TunnelSite
+from tests.support.tunnel_site import ATTACKER, LONG, MIDDLE, OCU, OWN, TunnelSite, left_behind
 from tests.support.tunnels import JoinedHost
 from tests.support.wire import connect
 from tests.system.ipsec import test_attacks as attacks
@@ -69,7 +69,7 @@ def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHos
     address, through the kernel's states."""
     with site.talking(joined, rate=20) as (_talker, listener):
         listener.wait_for_count(20, event="received", timeout=LONG)
-    (registered,) = [one for one in site.appliance.audit(event="registered") if one["caller_id"] == "/boss"]
+    registered = site.trail.seen(event="registered", caller_id="/boss")[0]
     assert registered["host"] == joined.address
     used = [
         line for line in told(middle(site), "ip", "-s", "xfrm", "state").splitlines() if "(bytes)" in line
@@ -109,15 +109,5 @@ def _spis(host: Host) -> list[str]:
 
 def stop_and_look(site: TunnelSite) -> None:
     """A clean stop leaves no rule, no state, no policy, no interface and no address."""
-    host = middle(site)
     assert site.appliance.stop() == 0
-    left = {
-        "states": told(host, "ip", "xfrm", "state"),
-        "policies": told(host, "ip", "xfrm", "policy"),
-        "nftables": told(host, "nft", "list", "ruleset"),
-        "routes": told(host, "ip", "route", "show", "table", "220"),
-    }
-    assert {name: text for name, text in left.items() if text.strip() and "does not exist" not in text} == {}
-    assert "ROSRV" not in told(host, "iptables-legacy-save") + told(host, "ip6tables-legacy-save")
-    assert sorted(links.links(host.namespace)) == [INTERFACE, "lo"]
-    assert OWN not in " ".join(links.addresses(host.namespace))
+    assert left_behind(middle(site)) == {}
