@@ -69,7 +69,7 @@ class RestLink:
         channel.attach(
             asyncio.get_running_loop(),
             lambda message, _descriptors: self._received(channel, message),
-            lambda: self._lost(channel, "it ended"),
+            lambda: self._lost(channel, None),
             lambda reason: self._lost(channel, reason),
         )
         self._state_tokens()
@@ -145,8 +145,10 @@ class RestLink:
             channel.close()
             _log.error("the api does not read its answers: its link is closed")
 
-    def _lost(self, channel: Channel, reason: str) -> None:
+    def _lost(self, channel: Channel, wrong: str | None) -> None:
+        """The link is gone; `wrong` is what the api did to lose it, None when it ended: the supervisor says why."""
         if self._channel is channel:
             self._channel = None
             self._waiting.clear()
-            _log.warning("no api", reason=reason)
+            if wrong is not None:
+                _log.error("the api's link is closed; another one is started", reason=wrong)
