@@ -168,7 +168,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
     """A request that makes a token, a message of another link and nonsense close it; another api is served."""
 
     async def play(world: Everything, link: RestLink) -> None:
-        token = {"message": "RequestMade", "number": 1, "who": "w", "request": {"verb": "token list"}}
+        token = {"message": "RequestMade", "number": 1, "who": "w", "request": {"verb": "token add"}}
         for body in (
             msgspec.msgpack.encode(token),
             msgspec.msgpack.encode(messages.Stop()),
