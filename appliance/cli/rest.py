@@ -109,7 +109,7 @@ class RestClient:
             with self._client.stream(
                 method, path, params=params, json=body, headers=headers, timeout=timeout
             ) as answer:
-                if answer.status_code != httpx.codes.OK:
+                if answer.status_code not in (httpx.codes.OK, httpx.codes.CREATED):
                     raise self._problem(answer)
                 yield answer
         except httpx.ConnectError as error:

@@ -5,6 +5,7 @@ from urllib.parse import quote
 
 from appliance.channel import admin
 from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.rest_host_orders import carry_out_on_hosts
 
 
 class Calls(Protocol):
@@ -48,7 +49,7 @@ def carry_out(rest: Calls, request: admin.AdminRequest) -> dict[str, Any]:
         case admin.TokenAdd() | admin.TokenList() | admin.TokenRevoke():
             return _tokens(rest, request)
         case _:
-            raise NotRunningError(f"{rest.url}: this cannot be asked over REST; run it with --state")
+            return carry_out_on_hosts(rest, request)
 
 
 def _tokens(rest: Calls, request: admin.TokenAdd | admin.TokenList | admin.TokenRevoke) -> dict[str, Any]:
