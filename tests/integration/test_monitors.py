@@ -202,6 +202,7 @@ def test_a_kept_revision_that_is_not_understood_any_more_has_a_way_back(
         appliance.start()
     assert "more.rv:5:" in appliance.story()
     assert "rosrv monitor reset --state" in appliance.story()
+    appliance.stop()
     said = appliance.rosrv("monitor", "reset").stdout
     assert "is given up" in said
     appliance.start()

@@ -1,0 +1,76 @@
+"""A rospy subscriber of what `flood_talker.py` says: counting_listener.py TOPIC [--slow SECONDS].
+
+`first` with the first number; for a line on its input `counted`: the first and the last number, how many came, gaps as
+pairs of the numbers around them, whether a number came that was not larger than the one before, and the words that the
+monitors put behind the messages, in the order in which they changed, each with the number it began with.
+"""
+
+import argparse
+import sys
+import threading
+
+import rospy
+from report import report
+from std_msgs.msg import String
+
+
+class Count:
+    """What came so far."""
+
+    def __init__(self, slow):
+        self.slow = slow
+        self.first = self.last = self.came = 0
+        self.backwards = False
+        self.never = threading.Event()
+        self.gaps = []
+        self.words = []
+
+    def heard(self, message):
+        """One message."""
+        parts = message.data.split(" ")
+        number, word = int(parts[0]), " ".join(parts[2:])
+        if not self.came:
+            self.first = number
+            report("first", number=number)
+        elif number <= self.last:
+            self.backwards = True
+        elif number != self.last + 1:
+            self.gaps.append([self.last, number])
+        if not self.words or self.words[-1][0] != word:
+            self.words.append([word, number])
+        self.last = number
+        self.came += 1
+        if self.slow:
+            self.never.wait(self.slow)
+
+    def tell(self):
+        """Report it for each line of the input."""
+        for _line in sys.stdin:
+            report(
+                "counted",
+                first=self.first,
+                last=self.last,
+                came=self.came,
+                gaps=self.gaps,
+                backwards=self.backwards,
+                words=self.words,
+            )
+
+
+def main():
+    """Listen until told to end."""
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("topic")
+    arguments.add_argument("--slow", type=float, default=0.0)
+    options = arguments.parse_args(rospy.myargv()[1:])
+    rospy.init_node("counting_listener")
+    count = Count(options.slow)
+    rospy.Subscriber(options.topic, String, count.heard, tcp_nodelay=True)
+    threading.Thread(target=count.tell, daemon=True).start()
+    report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
+    rospy.spin()
+    report("ended")
+
+
+if __name__ == "__main__":
+    main()
