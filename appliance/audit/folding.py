@@ -3,7 +3,8 @@
 Invariants:
 1. The first denial of its kind is recorded in full; every repetition is counted in exactly one summary.
 2. Memory is bounded: at most `keys_per_host` kinds of one host, `keys` in all. Past that a host's further
-   denials are one kind (`scope` "host"); past `keys` all further ones are one kind (`scope` "all").
+   denials are one kind (`scope` "host"); past `keys` all further ones are one kind (`scope` "all"). Who and what such a
+   kind is made of is counted by name, for the first names of each; the rest is counted together.
 3. A kind is forgotten when it did not repeat for `seconds`; its next denial is recorded in full again.
 4. An allow for the same host, caller, category and resource ends the kinds it contradicts: their summaries
    come before it.
@@ -19,7 +20,9 @@ import msgspec
 from appliance.audit.record import Record, RuleReference, Severity
 
 Key = tuple[str | int | None, ...]
-_SAMPLES = 8
+_NAMES = 8
+OTHERS = "(others)"  # no name of ROS, and no address, has a bracket
+_LONGEST_NAME = 256
 _ABOUT = ("call", "key", "node", "subgraph")  # fields of `detail` that say what a call was about
 
 
@@ -57,7 +60,8 @@ class FoldState(msgspec.Struct, kw_only=True):
     last_id: str = ""
     first_time: int = 0
     last_time: int = 0
-    resources: list[str] = []
+    about: dict[str, str] = {}
+    tallies: dict[str, dict[str, int]] = {}
 
 
 class Folder:
@@ -109,14 +113,8 @@ class Folder:
             state.first_id, state.first_time = record.id, record.time
         state.count += 1
         state.last_id, state.last_time = record.id, record.time
-        resource = record.resource
-        if (
-            scope != "kind"
-            and resource
-            and len(state.resources) < _SAMPLES
-            and resource not in state.resources
-        ):
-            state.resources.append(resource)
+        if scope != "kind":
+            _tally(state.tallies, record)
         self.touched.add(key)
         return False
 
@@ -181,7 +179,7 @@ class Folder:
         if state.count:
             yield summary(state, self._make_id(), self._clock())
             state.count = 0
-            state.resources = []
+            state.tallies = {}
             self.touched.add(key)
 
 
@@ -193,8 +191,24 @@ def _new_state(record: Record, scope: str) -> FoldState:
     return FoldState(
         scope=scope, event=record.event, severity=record.severity, decision=record.decision, host=record.host,
         caller_id=record.caller_id, category=record.category, resource=record.resource, rule=record.rule,
-        revision=record.revision, reason=record.reason, recorded_id=record.id,
+        revision=record.revision, reason=record.reason, recorded_id=record.id, about=_about(record),
     )  # fmt: skip
+
+
+def _about(record: Record) -> dict[str, str]:
+    """What the call was about, as far as its record says."""
+    return {name: str(record.detail[name])[:_LONGEST_NAME] for name in _ABOUT if name in record.detail}
+
+
+def _tally(tallies: dict[str, dict[str, int]], record: Record) -> None:
+    """Count who it was and what was asked, by the first names of each."""
+    named = {"hosts": record.host, "callers": record.caller_id, "resources": record.resource}
+    for what, name in (named | {"calls": record.detail.get("call")}).items():
+        if name:
+            counts = tallies.setdefault(what, {})
+            key = str(name)[:_LONGEST_NAME]
+            key = key if key in counts or len(counts) < _NAMES else OTHERS
+            counts[key] = counts.get(key, 0) + 1
 
 
 def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> Record:
@@ -205,8 +219,7 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
         "first_time": state.first_time, "last_time": state.last_time,
     }  # fmt: skip
     exact = state.scope == "kind"
-    if not exact:
-        detail["resources"] = state.resources
+    detail |= state.about if exact else state.tallies
     if recovered:
         detail["recovered"] = True
     return Record(

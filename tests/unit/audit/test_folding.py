@@ -97,7 +97,10 @@ def test_varied_names_are_folded_per_host() -> None:
     (host,) = [one for one in summaries if one.detail["scope"] == "host"]
     assert host.host == "10.0.0.1"
     assert host.resource is None
-    assert 0 < len(host.detail["resources"]) <= 8
+    resources = host.detail["resources"]
+    assert len(resources) == 9
+    assert resources["(others)"] > 1
+    assert sum(resources.values()) == host.detail["count"]
 
 
 def test_varied_addresses_are_folded_together() -> None:
@@ -108,6 +111,46 @@ def test_varied_addresses_are_folded_together() -> None:
     summaries = list(folder.finish())
     assert len(written) + sum(one.detail["count"] for one in summaries) == 20_000
     assert len(folder) == 0
+    (everybody,) = [one for one in summaries if one.detail["scope"] == "all"]
+    assert len(everybody.detail["hosts"]) == 9
+    assert sum(everybody.detail["hosts"].values()) == everybody.detail["count"]
+
+
+def test_a_summary_says_who_and_what() -> None:
+    """Which call of which node on what was repeated is in the summary itself, not only in the record it points to."""
+    folder = make_folder()
+    detail = {"call": "getParam", "key": "/secret", "node": "/arm", "unrelated": 1}
+    offer(folder, *(denial(resource="getParam", detail=detail) for _ in range(5)))
+    (one,) = folder.finish()
+    assert one.caller_id == denial().caller_id
+    assert {name: one.detail[name] for name in ("call", "key", "node")} == {
+        "call": "getParam", "key": "/secret", "node": "/arm",
+    }  # fmt: skip
+    assert "unrelated" not in one.detail
+
+
+def test_who_is_behind_a_flood_of_many_names() -> None:
+    """A host that is folded as a whole is still told by caller and call: the loudest are there with their counts."""
+    folder = make_folder(keys_per_host=4)
+    calls = ["setParam", "getParam", "deleteParam"]
+    flood = [
+        denial(f"/{number}", caller_id=f"/node{number % 3}", detail={"call": calls[number % 3]})
+        for number in range(3000)
+    ]
+    offer(folder, *flood)
+    (host,) = [one for one in folder.finish() if one.detail["scope"] == "host"]
+    assert set(host.detail["callers"]) == {"/node0", "/node1", "/node2"}
+    assert set(host.detail["calls"]) == set(calls)
+    assert sum(host.detail["callers"].values()) == sum(host.detail["calls"].values()) == host.detail["count"]
+    assert all(count > 900 for count in host.detail["callers"].values())
+
+
+def test_long_names_are_bounded() -> None:
+    """Names of strangers take bounded room in a summary, however long they are."""
+    folder = make_folder(keys_per_host=1)
+    offer(folder, *(denial("/" + "x" * 100_000 + str(number)) for number in range(50)))
+    (host,) = [one for one in folder.finish() if one.detail["scope"] == "host"]
+    assert all(len(name) <= 256 for name in host.detail["resources"])
 
 
 def test_zero_seconds_records_everything() -> None:
