@@ -29,10 +29,8 @@ class Calls(Protocol):
 def carry_out(rest: Calls, request: admin.AdminRequest) -> dict[str, Any]:
     """Ask over REST; the body that the admin socket's answer would have."""
     match request:
-        case admin.StatusWanted():
-            return rest.call("GET", "/v1/status")
-        case admin.GraphWanted():
-            return rest.call("GET", "/v1/graph")
+        case admin.StatusWanted() | admin.GraphWanted():
+            return rest.call("GET", "/v1/status" if isinstance(request, admin.StatusWanted) else "/v1/graph")
         case admin.RegistrationsWanted():
             return {"registrations": _registrations(rest.call("GET", "/v1/graph"))}
         case admin.PolicyReload() | admin.PolicyRollback() | admin.PolicyConfirm() | admin.PolicyRevisions():
