@@ -1,4 +1,4 @@
-"""Tests of `appliance.cli.rest`: where a token is sent, where it is not, and what a user is told when it does not work."""
+"""Tests of `appliance.cli.rest`: where a token is sent, where not, and what a user is told when it does not work."""
 
 import datetime
 import ipaddress
@@ -42,7 +42,7 @@ class Server:
         server = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:  # noqa: N802  as http.server calls it
+            def do_GET(self) -> None:
                 server.seen.append((self.command, self.path, self.headers.get("Authorization")))
                 self.send_response(server.status)
                 for name, text in server.headers.items():
