@@ -1,15 +1,22 @@
 """`rosrv protect`: close the ROS ports of the machine the nodes run on, and check from outside that they are.
 
-It reads and writes no state directory, so it runs on any machine that has this program. Exit status: 0 done,
-or closed; 1 a port is open; 2 it could not be done, or nothing answered.
+It needs no state directory, so it runs on any machine that has this program; where an appliance is named, its address
+is asked for, and what a check saw is told to it. Exit status: 0 done, or closed; 1 a port is open; 2 it could not be
+done, or nothing answered.
 """
 
 import json
 import sys
-from typing import Annotated, Any, NoReturn
+import time
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NoReturn
+from urllib.parse import urlsplit
 
 import typer
 
+from appliance.channel.admin import HostPorts, StatusWanted
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.running import Appliance, speaks
 from appliance.network import protect as protection
 from appliance.network.firewall.rules import PortRange
 from appliance.network.namespaces import NetworkError
@@ -17,6 +24,7 @@ from appliance.network.scan import ScanResult, addresses_of, scan
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # open ports named on a terminal
+_MOST_TOLD = 100
 
 HELP = """Close the ROS ports of this machine to all but the appliance.
 
@@ -24,8 +32,10 @@ Nodes listen on ports of the local port range. Without a verb the nftables file 
 
 \b
   rosrv protect --appliance 192.168.1.20                    look at it
+  rosrv protect --state /var/lib/rosrv                      the appliance that runs on this machine
   sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
   rosrv protect --check 192.168.1.10                        on ANOTHER machine: is it closed?
+  rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and tell the appliance (role operator)
   sudo rosrv protect --remove
 
 \b
@@ -38,12 +48,15 @@ The check tries TCP. Run it from a machine that is not the appliance: the applia
 """
 
 
+@speaks
 def protect(
+    running: Appliance,
     *,
     appliance: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ADDRESS", help="Address of the appliance, as this machine sees it. Repeatable."
+            metavar="ADDRESS",
+            help="Address of the appliance, as this machine sees it. Repeatable. [default: the one at --state]",
         ),
     ] = None,
     open_services: Annotated[
@@ -62,6 +75,12 @@ def protect(
     check: Annotated[
         str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here.")
     ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--as", metavar="NAME", help="Check: the machine's name as an enrolled host, to be told."
+        ),
+    ] = None,
     remove: Annotated[bool, typer.Option("--remove", help="Take it away.")] = False,
     seconds: Annotated[
         float, typer.Option(min=0.05, max=60, help="Check: how long to wait for an answer of each port.")
@@ -75,11 +94,11 @@ def protect(
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
         if check is not None:
-            _check(check, chosen, services, seconds, as_json)
+            _check(_Checked(check, name, chosen, services, seconds), running, as_json)
         elif remove:
             _remove(as_json)
         else:
-            _make(appliance or [], chosen, services, apply, as_json)
+            _make(appliance or [_own(running)], chosen, services, apply, as_json)
     except (ValueError, NetworkError) as error:
         _fail(str(error))
 
@@ -94,11 +113,6 @@ def _make(
     apply: bool,
     as_json: bool,
 ) -> None:
-    if not appliances:
-        raise ValueError(
-            "which appliance may reach this machine? Give its address as this machine sees it: "
-            "--appliance 192.168.1.20 (`rosrv status` on the appliance shows it)"
-        )
     text = protection.protection([protection.parse_address(one) for one in appliances], ports, services)
     for service in services:
         if service.ports.last < ports.first or service.ports.first > ports.last:
@@ -122,30 +136,69 @@ def _remove(as_json: bool) -> None:
     _say(as_json, {"event": "removed", "was_applied": was}, words)
 
 
-def _check(
-    host: str, ports: PortRange, services: tuple[protection.Service, ...], seconds: float, as_json: bool
-) -> None:
-    stay_open = {
-        port
-        for service in services
-        if service.protocol == "tcp"
-        for port in range(service.ports.first, service.ports.last + 1)
-    }
-    wanted = [port for port in range(ports.first, ports.last + 1) if port not in stay_open]
-    results = [scan(address, wanted, seconds) for address in addresses_of(host)]
+@dataclass(frozen=True)
+class _Checked:
+    """What is tried, under which name it is told; a None is the address that was tried."""
+
+    host: str
+    name: str | None
+    ports: PortRange
+    services: tuple[protection.Service, ...]
+    seconds: float
+
+    def wanted(self) -> list[int]:
+        """The TCP ports that are to be closed."""
+        stay_open = {
+            port
+            for service in self.services
+            if service.protocol == "tcp"
+            for port in range(service.ports.first, service.ports.last + 1)
+        }
+        return [port for port in range(self.ports.first, self.ports.last + 1) if port not in stay_open]
+
+
+def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
+    results = [scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)]
     opened = any(result.open for result in results)
     unknown = not all(result.answered for result in results)
-    state = "open" if opened else "unknown" if unknown else "closed"
+    state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
     addresses = [
         {"address": one.address, "open": one.open, "refused": one.refused, "silent": one.silent}
         for one in results
     ]
-    report = {"event": "check", "host": host, "ports": str(ports), "state": state, "addresses": addresses}
-    _say(as_json, report, "".join(_sentence(result, ports) for result in results))
+    report = {
+        "event": "check",
+        "host": checked.host,
+        "ports": str(checked.ports),
+        "state": state,
+        "addresses": addresses,
+    }
+    _say(as_json, report, "".join(_sentence(result, checked.ports) for result in results))
+    if running.said:
+        found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
+        name = checked.name or results[0].address
+        body = running.ask_or_exit(HostPorts(name, state, found, time.time()), as_json=as_json)
+        sys.stderr.write(f"rosrv: the appliance knows it: the ports of {body['name']} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)
     if unknown:
         raise typer.Exit(ERROR_STATUS)
+
+
+def _own(running: Appliance) -> str:
+    """The address of the appliance that runs on this machine. Raises `ValueError`."""
+    hint = "give its address as this machine sees it: --appliance 192.168.1.20"
+    if running.remote:
+        raise ValueError(f"how this machine sees the appliance is not known over REST; {hint}")
+    try:
+        answer = running.ask(StatusWanted())
+    except NotRunningError as error:
+        raise ValueError(f"which appliance may reach this machine? {error}; or {hint}") from None
+    if not answer.ok:
+        raise ValueError(f"{answer.error}; {hint}")
+    if answer.body["isolation"] == "none":
+        raise ValueError(f"the appliance runs on this machine without isolation, as loopback; {hint}")
+    return str(urlsplit(answer.body["master"]).hostname)
 
 
 def _sentence(result: ScanResult, ports: PortRange) -> str:

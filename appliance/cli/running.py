@@ -73,6 +73,12 @@ class Appliance:
 
     way: Way
     said: bool = False
+
+    @property
+    def remote(self) -> bool:
+        """Whether it is asked over REST, perhaps from another machine."""
+        return not isinstance(self.way, AdminSocket)
+
     place: str | None = None
 
     def ask(self, request: AdminRequest) -> AdminAnswer:

@@ -550,8 +550,9 @@ class Hosts:
         except ValueError:
             self._table.enrolled_row(name)  # says which there are
             raise
+        behind = [one.name for one in self._tunnels.seen.values() if one.remote == address]
         row = self._table.at(address)
-        return row.name if row is not None else address
+        return row.name if row is not None else behind[0] if len(behind) == 1 else address
 
     def _machines(self) -> dict[str, int]:
         pool = self._table.pool

@@ -5,7 +5,9 @@ Debian's. REST is reached before the tunnel from the management network.
 """
 
 import json
+import os
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,16 +15,18 @@ from typing import Any
 import pytest
 
 from appliance.network.lab import Lab
+from tests.support.appliance import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
-from tests.support.tunnel_site import MASTER, MIDDLE, OWN, POLICY, TunnelSite
+from tests.support.tunnel_site import MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
 
 API = 8443
-CONFIG = """\
-api: 0.0.0.0:8443
+CONFIG = f"""\
+api: 0.0.0.0:{API}
 api_networks: [10.88.0.0/24]
+api_names: [{MIDDLE}]
 """
 
 
@@ -102,6 +106,24 @@ def closed(site: TunnelSite, laptop: ScriptHost) -> None:
     rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
     assert OWN in rules
     assert row(site, "laptop")["ports"]["state"] == "unknown"
+    ready = site.appliance.ready
+    (site.home / "api.pem").write_text((site.appliance.state / "api/certificate.pem").read_text())
+    told = site.attacker.popen(
+        [
+            ROSRV, "protect", "--check", OCU, "--ports", "40000-40049", "--as", "laptop", "--seconds", "1",
+            "--api", f"https://{MIDDLE}:{API}", "--api-ca", str(site.home / "api.pem"),
+        ],
+        env={"ROSRV_TOKEN": str(ready["token"]), "PATH": os.environ["PATH"]},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )  # fmt: skip
+    out, _ = told.communicate(timeout=60)
+    assert told.returncode == 0, out
+    assert "the ports of laptop are closed" in out
+    seen = row(site, "laptop")["ports"]
+    assert (seen["state"], seen["open"], seen["who"]) == ("closed", [], "first")
+    assert site.appliance.status()["ipsec"]["ports"]["laptop"]["state"] == "closed"
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
@@ -15,7 +18,12 @@ from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.master.authority import Authority, AuthorityError
 from appliance.master.declared import Declared
-from appliance.master.host_table import HostRefusedError, HostTable
+from appliance.master.host_table import (
+    HostForbiddenError,
+    HostRefusedError,
+    HostsChangedError,
+    HostTable,
+)
 from appliance.master.hosts import Hosts
 from appliance.master.recorder import Recorder
 from appliance.master.rest_place import RestPlace
@@ -61,6 +69,14 @@ class Bench:
         self.declared = directory / "hosts.yaml"
         self.authority = NearAuthority(directory)
         recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.records: list[tuple[str, str]] = []
+        happened = recorder.happened
+
+        def noted(event: str, reason: str, **fields: Any) -> str:
+            self.records.append((event, reason))
+            return str(happened(event, reason, **fields))
+
+        recorder.happened = noted  # type: ignore[method-assign]  # beside what it does
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
         self.tunnels = Tunnels(self.table, recorder, self.authority, listen=(listen, 11311), say=self._said)
         self.hosts = Hosts(
@@ -92,6 +108,13 @@ class Bench:
     def _expel(self, address: Address, reason: str) -> int:
         self.order.append(f"expel {address}")
         return 2
+
+
+def sign(key: bytes, request: str) -> bytes:
+    """The proof of a renewal, as `openssl pkeyutl` makes it."""
+    private = load_pem_private_key(key, None)
+    assert isinstance(private, ec.EllipticCurvePrivateKey)
+    return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
 
 
 def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, dict[str, Any]]:
@@ -249,5 +272,328 @@ def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
             await bench.hosts.reload("tester")
         assert [row["name"] for row in bench.hosts.rows()] == ["a", "laptop"]
         assert any("hosts.yaml" in trouble for trouble in bench.hosts.status()["troubles"])
+
+    run(tmp_path, work)
+
+
+def request_of(name: str) -> str:
+    """A signing request for a new key."""
+    return signing_request(make_key(), name).decode()
+
+
+def token(
+    bench: Bench, name: str, *, seconds: float = 60, new: bool = True
+) -> Coroutine[Any, Any, dict[str, Any]]:
+    """A one-time token."""
+    kit = {"endpoint": "10.0.0.1", "ports": "32768-60999", "open": ""}
+    return bench.hosts.token(name, kit=kit, seconds=seconds, days=90, address=None, new=new, who="tester")
+
+
+def recorded(bench: Bench, event: str) -> list[str]:
+    """The reasons of all records of an event."""
+    return [reason for name, reason in bench.records if name == event]
+
+
+def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
+    """Used again, or after a newer one of the name, it opens nothing; it is nowhere in the state."""
+
+    async def work(bench: Bench) -> None:
+        first = await token(bench, "a")
+        second = await token(bench, "a")
+        for text in (first["token"], "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
+            with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
+                await bench.hosts.enrol(text, request_of("a"), "10.9.9.9")
+        assert bench.hosts.rows()[0]["state"] == "awaited"
+        body = await bench.hosts.enrol(second["token"], request_of("a"), "10.9.9.9")
+        assert body["address"] == second["address"]
+        assert body["kit"]["endpoint"] == "10.0.0.1"
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.enrol(second["token"], request_of("a"), "10.9.9.9")
+        secret = second["token"].rpartition("_")[2].encode()
+        for file in tmp_path.rglob("*"):
+            if file.is_file():
+                assert secret not in file.read_bytes(), file
+
+    run(tmp_path, work)
+
+
+def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> None:
+    """It is used up before the authority is asked."""
+
+    async def work(bench: Bench) -> None:
+        text = (await token(bench, "a"))["token"]
+        both = await asyncio.gather(
+            bench.hosts.enrol(text, request_of("a"), "10.9.9.8"),
+            bench.hosts.enrol(text, request_of("a"), "10.9.9.9"),
+            return_exceptions=True,
+        )
+        assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
+
+    run(tmp_path, work)
+
+
+def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
+    """The host may come again with a right one; an ended or revoked token is good for nothing."""
+
+    async def work(bench: Bench) -> None:
+        text = (await token(bench, "a"))["token"]
+        with pytest.raises(HostRefusedError, match="not a signing request"):
+            await bench.hosts.enrol(text, "rubbish", "10.9.9.9")
+        await bench.hosts.enrol(text, request_of("a"), "10.9.9.9")
+        short = (await token(bench, "b", seconds=0.05))["token"]
+        await asyncio.sleep(0.06)
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.enrol(short, request_of("b"), "10.9.9.9")
+        taken_back = (await token(bench, "c"))["token"]
+        assert (await bench.hosts.revoke("c", "tester"))["serial"] == ""
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.enrol(taken_back, request_of("c"), "10.9.9.9")
+
+    run(tmp_path, work)
+
+
+def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
+    """Whoever is awaited is awaited after a crash too."""
+    texts: list[str] = []
+
+    async def before(bench: Bench) -> None:
+        texts.append((await token(bench, "a"))["token"])
+
+    async def after(bench: Bench) -> None:
+        assert (await bench.hosts.enrol(texts[0], request_of("a"), "10.9.9.9"))["name"] == "a"
+
+    run(tmp_path, before)
+    run(tmp_path, after)
+
+
+@pytest.mark.parametrize("how", ["kit", "token", "itself"])
+def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
+    """What is under way for a revoked host comes to nothing, however it comes; it stays revoked."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        text = (await token(bench, "a", new=False))["token"]
+        tasks: list[asyncio.Task[Any]] = []
+
+        def revoke() -> None:
+            bench.authority.meanwhile = lambda: None
+            tasks.append(asyncio.get_running_loop().create_task(bench.hosts.revoke("a", "tester")))
+
+        bench.authority.meanwhile = revoke
+        request = request_of("a")
+        with pytest.raises(HostForbiddenError, match="revoked meanwhile"):
+            if how == "kit":
+                await bench.hosts.renew("a", request, days=90, who="tester")
+            elif how == "token":
+                await bench.hosts.enrol(text, request, "10.9.9.9")
+            else:
+                await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+        await asyncio.gather(*tasks)
+        assert bench.hosts.rows()[0]["state"] == "revoked"
+        assert bench.hosts.addresses == {}
+
+    run(tmp_path, work)
+
+
+def test_a_host_renews_itself(tmp_path: Path) -> None:
+    """In its tunnel and with its key: both certificates are good until it says that the new one is in place."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        request = request_of("a")
+        made = await bench.hosts.renew_itself("a", request, sign(key, request), "::ffff:10.113.11.2")
+        assert made["serial"] != first["serial"]
+        assert bench.hosts.rows()[0]["renewing"]
+        assert bench.store.hosts.revoked() == []
+        await bench.hosts.renewed("a", "10.113.11.2")
+        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [first["serial"]]
+        assert bench.hosts.rows()[0]["serial"] == made["serial"]
+        with pytest.raises(HostRefusedError, match="renew first"):
+            await bench.hosts.renewed("a", "10.113.11.2")
+        with pytest.raises(HostRefusedError, match="again in"):
+            await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+
+    run(tmp_path, work)
+
+
+def test_nobody_renews_for_another(tmp_path: Path) -> None:
+    """Another address, another host's tunnel, another key, another name, no tunnels at all: refused and recorded."""
+
+    async def work(bench: Bench) -> None:
+        key, other = make_key(), make_key()
+        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        await bench.hosts.add("b", signing_request(other, "b").decode(), days=90, who="tester")
+        request = request_of("a")
+        good = sign(key, request)
+        for name, peer in (
+            ("a", "192.168.1.5"),
+            ("a", "10.113.11.3"),
+            ("zz", "10.113.11.2"),
+            ("b", "10.113.11.2"),
+        ):
+            with pytest.raises(HostForbiddenError):
+                await bench.hosts.renew_itself(name, request, good, peer)
+            with pytest.raises(HostForbiddenError):
+                await bench.hosts.renewed(name, peer)
+        with pytest.raises(HostRefusedError, match="not signed by the key"):
+            await bench.hosts.renew_itself("a", request, sign(other, request), "10.113.11.2")
+        assert len(recorded(bench, "renewal refused")) == 8
+        bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.renew_itself("a", request, good, "10.113.11.2")
+
+    run(tmp_path, work)
+
+
+def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> None:
+    """The one that was to follow is as dead as the present one, over a restart too."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        request = request_of("a")
+        made = await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+        await bench.hosts.revoke("a", "tester")
+        assert {serial for serial, _moment in bench.store.hosts.revoked()} == {
+            first["serial"],
+            made["serial"],
+        }
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.renewed("a", "10.113.11.2")
+        again = await add(bench, "a")
+        assert again["address"] == first["address"]
+        assert again["serial"] not in {first["serial"], made["serial"]}
+
+    run(tmp_path, work)
+
+
+def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
+    """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
+
+    async def work(bench: Bench) -> None:
+        seen = bench.hosts.overview()["revision"]
+        await add(bench, "a")
+        for late in (
+            bench.hosts.revoke("a", "tester", seen),
+            bench.hosts.renew("a", request_of("a"), days=90, who="tester", expected=seen),
+            bench.hosts.tell_ports("a", "closed", [], checked=1.0, who="tester", expected=seen),
+            bench.hosts.reload("tester", seen),
+        ):
+            with pytest.raises(HostsChangedError):
+                await late
+        await bench.hosts.revoke("a", "tester", bench.hosts.overview()["revision"])
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("name", ["Laptop", "LAPTOP", "ROSRV-Appliance"])
+def test_names_that_ike_does_not_tell_apart(tmp_path: Path, name: str) -> None:
+    """IKE compares names without regard to case: no second host may answer to the first one's."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "laptop")
+        with pytest.raises(HostRefusedError, match=r"large and small letters|no name"):
+            await add(bench, name)
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("name", ["a.b-c_d", "0", "x" * 63, "con.fig", "host-a"])
+def test_odd_names_that_are_names(tmp_path: Path, name: str) -> None:
+    """Everything the form allows can be enrolled, listed and revoked."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, name)
+        assert bench.hosts.rows()[0]["name"] == name
+        await bench.hosts.revoke(name, "tester")
+
+    run(tmp_path, work)
+
+
+def test_two_hundred_hosts(tmp_path: Path) -> None:
+    """Each has an address of its own, and all of them are there after a restart."""
+
+    async def work(bench: Bench) -> None:
+        request = request_of("x")
+        for number in range(200):
+            await bench.hosts.add(f"h{number}", request, days=1, who="tester")
+        assert len({row["address"] for row in bench.hosts.rows()}) == 200
+
+    async def again(bench: Bench) -> None:
+        assert len(bench.hosts.rows()) == 200
+        assert len(bench.table.admitted()) == 200
+
+    run(tmp_path, work, pool="10.113.0.0/16")
+    run(tmp_path, again, pool="10.113.0.0/16")
+
+
+def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
+    """On reload a host goes out of the policy and loses what it has; wanted again it is back; none is lost."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        await add(bench, "b")
+        bench.order.clear()
+        bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
+        body = await bench.hosts.reload("tester")
+        assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
+        assert (body["closed"], body["opened"]) == (["a"], [])
+        assert body["divergence"] == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
+        rows = {row["name"]: row for row in bench.hosts.rows()}
+        assert (rows["a"]["state"], rows["a"]["groups"], rows["b"]["state"]) == (
+            "not wanted",
+            ["ocu"],
+            "down",
+        )
+        bench.declared.unlink()
+        assert (await bench.hosts.reload("tester"))["opened"] == ["a"]
+        assert sorted(bench.hosts.addresses) == ["a", "b"]
+
+    run(tmp_path, work)
+
+
+def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
+    """In the log once, in the status as long as it is so; a short life warns in its last third."""
+
+    async def work(bench: Bench) -> None:
+        await bench.hosts.add("short", request_of("a"), days=10, who="tester")
+        assert bench.hosts.status()["troubles"] == []
+        await bench.hosts.renew("short", request_of("a"), days=1e-5, who="tester")
+        await asyncio.sleep(0.7)
+        bench.tunnels.each_hour()
+        bench.tunnels.each_hour()
+        ended = recorded(bench, "certificate ends soon") + recorded(bench, "certificate ended")
+        assert len(ended) == 1
+        assert "short" in bench.hosts.status()["troubles"][0]
+
+    run(tmp_path, work)
+
+
+def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
+    """By a host's name, its address, or a machine's in clear text; a name nobody has is refused."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        bench.hosts.machines = lambda: {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
+        assert (await bench.hosts.tell_ports("10.113.11.2", "open", [40001], checked=5.0, who="eve"))[
+            "name"
+        ] == "a"
+        await bench.hosts.tell_ports("10.0.0.7", "closed", [], checked=6.0, who="eve")
+        with pytest.raises(HostRefusedError, match="enrolled are: a"):
+            await bench.hosts.tell_ports("nobody", "open", [], checked=5.0, who="eve")
+        with pytest.raises(HostRefusedError, match="a day ahead"):
+            await bench.hosts.tell_ports("a", "closed", [], checked=4e9, who="eve")
+        overview = bench.hosts.overview()
+        assert overview["hosts"][0]["ports"] == {
+            "state": "open",
+            "checked": 5.0,
+            "open": [40001],
+            "who": "eve",
+        }
+        assert [(one["address"], one["nodes"], one["ports"]["state"]) for one in overview["machines"]] == [
+            ("10.0.0.7", 3, "closed")
+        ]
 
     run(tmp_path, work)
