@@ -44,6 +44,7 @@ _REQUEST_BODY = 24 << 10  # of a host that brings a signing request
 _RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for a host in its tunnel, which is who it is
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
+_PAGE_SHARE = 10  # so many times the requests of REST may be for the console's files
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -75,6 +76,8 @@ class Gate:
         self._journal = journal
         self._names = {"localhost", *(name.lower() for name in names)}
         self._rate = Buckets(limits.requests_per_second, limits.burst)
+        # A page is many small files at once; they cost nobody but this process anything.
+        self._page_rate = Buckets(limits.requests_per_second * _PAGE_SHARE, limits.burst * _PAGE_SHARE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -96,7 +99,8 @@ class Gate:
 
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
         host = scope["client"][0]
-        wait = self._rate.take(host, time.monotonic())
+        rate = self._page_rate if is_console(scope["path"]) else self._rate
+        wait = rate.take(host, time.monotonic())
         if wait:
             raise ProblemError(
                 429,

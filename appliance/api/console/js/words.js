@@ -10,6 +10,8 @@ const UNSEEN = new RegExp(
   "\\u{1d173}-\\u{1d17a}\\u{e0000}-\\u{e0fff}\\u{f0000}-\\u{10ffff}\\ud800-\\udfff]", "gu",
 );
 
+const TOLD = 600; // from this length on it is said how long a text is that was cut
+
 /** @typedef {{text: string, unseen: boolean}} Piece */
 
 /**
@@ -31,7 +33,8 @@ export function pieces(value, most = 200) {
     at = match.index + match[0].length;
   }
   if (at < text.length) found.push({ text: text.slice(at), unseen: false });
-  if (cut) found.push({ text: `… ${whole.length.toLocaleString("en")} characters`, unseen: true });
+  if (cut && whole.length < TOLD) found.push({ text: "…", unseen: false });
+  else if (cut) found.push({ text: `… ${whole.length.toLocaleString("en")} characters`, unseen: true });
   return found;
 }
 

@@ -1,6 +1,6 @@
 /** Audit: search the log, follow it, open one record, prove it whole, take it along. */
 
-import { html, useEffect, useState } from "../html.js";
+import { html, useEffect, useRef, useState } from "../html.js";
 import { counted } from "../numbers.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
@@ -37,8 +37,11 @@ export function Audit() {
 
 /** j and k go through the records, Escape closes the one that is open. */
 function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
+  const newest = useRef({ records, chosen, filter });
+  newest.current = { records, chosen, filter };
   useEffect(() => {
     const heard = (/** @type {KeyboardEvent} */ event) => {
+      const { records, chosen, filter } = newest.current;
       if (typing(event) || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || !records) return;
       if (event.key === "Escape" && chosen) go(auditPath(filter));
       const step = { j: 1, k: -1 }[event.key];
@@ -49,5 +52,5 @@ function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ cho
     };
     addEventListener("keydown", heard);
     return () => removeEventListener("keydown", heard);
-  }, [records, chosen]);
+  }, []);
 }

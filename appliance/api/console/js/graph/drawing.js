@@ -65,7 +65,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
 }
 
 function Tip(/** @type {{id: string}} */ { id }) {
-  return html`<marker id=${id} class=${id} viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto"><path d="M0 0.500L8 4L0 7.500z" /></marker>`;
+  return html`<marker id=${id} class=${id} viewBox="0 0 8 8" refX="7" refY="4" markerUnits="userSpaceOnUse" markerWidth="10" markerHeight="10" orient="auto"><path d="M0 0.500L8 4L0 7.500z" /></marker>`;
 }
 
 function Box(/** @type {any} */ { item, spot, chosen, faint, choose }) {

@@ -25,7 +25,7 @@ export function Button({ role = "viewer", tone = "", small = false, disabled = f
     }
   };
   return html`<button type="button" class=${`button ${tone}${small ? " small" : ""}`} aria-disabled=${off ? "true" : undefined}
-    aria-busy=${busy ? "true" : undefined} title=${reason} onClick=${click} ...${more}>${children}${!allowed && html`<span class="sr-only"> (${reason})</span>`}</button>`;
+    aria-busy=${busy ? "true" : undefined} ...${more} title=${reason ?? more.title} onClick=${click}>${children}${!allowed && html`<span class="sr-only"> (${reason})</span>`}</button>`;
 }
 
 /** On or off. @param {{on: boolean, label: string, change: () => any, role?: "viewer" | "operator" | "admin"}} given */

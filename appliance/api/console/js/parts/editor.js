@@ -76,10 +76,22 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
         mirror.StreamLanguage.define(language === "policy" ? policyLanguage : rvLanguage),
         mirror.syntaxHighlighting(colours(mirror)), look(EditorView, height),
         EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable) }),
+        EditorView.domEventHandlers({ beforeinput: typedOver }),
         EditorView.updateListener.of((/** @type {any} */ update) => update.docChanged && newest.current.change?.(update.state.doc.toString())),
       ],
     }),
   });
+}
+
+/**
+ * Text typed over a selection is put there by us: left to the browser it would first merge the lines in the page and
+ * give them style attributes, which the policy forbids.
+ */
+function typedOver(/** @type {InputEvent} */ event, /** @type {any} */ view) {
+  if (event.inputType !== "insertText" || event.data === null || view.state.selection.main.empty || view.state.readOnly) return false;
+  event.preventDefault();
+  view.dispatch(view.state.update(view.state.replaceSelection(event.data), { userEvent: "input.type", scrollIntoView: true }));
+  return true;
 }
 
 function diagnostic(/** @type {any} */ state, /** @type {any} */ finding) {

@@ -1,0 +1,101 @@
+"""The browser, and an appliance whose console it opens."""
+
+import json
+import os
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+from tests.support.appliance import Appliance
+from tests.support.requirements import need_program
+from tests.system.console.reader import Reader
+
+POLICY = """\
+[Nodes]
+default = *
+/operator = 10.9.9.9
+
+[Publishers]
+default = *
+/guarded = 10.9.9.9                 # nobody here
+
+[Subscribers]
+default = *
+
+[Commands]
+default = *
+shutdown = 10.9.9.9
+"""
+REPOSITORY = Path(__file__).resolve().parents[3]
+CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 500, burst: 2000}\n"
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """Chromium of the machine, for all tests."""
+    chromium = need_program("chromium", "chromium")
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium)
+        yield browser
+        browser.close()
+
+
+def launch(playwright: Any, chromium: str) -> Browser:
+    """A browser without a window; as root it cannot have a sandbox of its own."""
+    arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+    started: Browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
+    return started
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance for the tests of a file, with the monitors of the repository."""
+    config = tmp_path_factory.mktemp("console") / "appliance.yaml"
+    config.write_text(CONFIG)
+    options = ("--config", str(config), "--monitors", str(REPOSITORY / "monitors"))
+    with Appliance(policy=POLICY, options=options) as running:
+        yield running
+
+
+@pytest.fixture
+def token(appliance: Appliance) -> Callable[..., str]:
+    """Makes a token of a role."""
+
+    def make(role: str, name: str | None = None, expires: str = "1d") -> str:
+        made = appliance.rosrv(
+            "token", "add", name or f"some-{role}", "--role", role, "--expires", expires, "--json"
+        )
+        return str(json.loads(made.stdout)["token"])
+
+    return make
+
+
+@pytest.fixture
+def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Reader]]:
+    """Opens windows on the appliance's console, by default with the first token, an admin's."""
+    with ExitStack() as stack:
+
+        def open_window(token: str | None = None, **look: Any) -> Reader:
+            given = token or str(appliance.ready["token"])
+            return stack.enter_context(Reader(browser, str(appliance.ready["api"]), given, **look))
+
+        yield open_window
+
+
+@pytest.fixture
+def attempt(appliance: Appliance) -> Callable[..., Any]:
+    """Makes a call of the Master API as a node would."""
+
+    def call(method: str, *arguments: Any) -> Any:
+        with xmlrpc.client.ServerProxy(appliance.master_uri, allow_none=True) as master:
+            try:
+                return getattr(master, method)(*arguments)
+            except xmlrpc.client.Error as error:
+                return error
+
+    return call

@@ -1,0 +1,99 @@
+"""Everybody can use it: axe finds nothing in any view and theme, and all of it goes by keys."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import Reader
+
+VIEWS = ["now", "graph", "audit?decision=deny", "policy", "monitors", "monitors/safeTrigger", "hosts"]
+
+
+@pytest.fixture(autouse=True)
+def refused(attempt: Callable[..., Any]) -> None:
+    """Something is there to be shown."""
+    attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]) -> None:
+    """Every view, dark and light, wide and narrow, with a record, an error and a dialog open: no violation; and no
+    view is wider than its window.
+    """
+    reader = opened(theme=theme, width=width)
+    found: dict[str, list[str]] = {}
+    for view in VIEWS:
+        heading = "safeTrigger" if view.endswith("safeTrigger") else None
+        page = reader.go(view, heading=heading)
+        expect(page.locator("[data-standing=live]")).to_be_visible()
+        expect(page.locator(".skeleton")).to_have_count(0)
+        if view.startswith("audit"):
+            page.locator("tbody tr").first.click()
+            expect(page.locator(".record .facts").first).to_be_visible()
+        if view == "policy":
+            reader.write("bogus")
+            expect(page.locator(".finding").first).to_be_visible()
+        found[view] = reader.axe()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, view
+    reader.page.get_by_role("button", name="Enrol a host").click()
+    found["a dialog"] = reader.axe()
+    assert {view: rows for view, rows in found.items() if rows} == {}
+
+
+def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
+    """The page for the token, too, in both themes."""
+    for theme in ("light", "dark"):
+        with Reader(browser, str(appliance.ready["api"]), theme=theme) as reader:
+            reader.page.goto(reader.url)
+            expect(reader.page.get_by_label("Access token")).to_be_focused()
+            assert reader.axe() == []
+
+
+def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
+    """The first Tab leads past the navigation; digits change the view; ? lists the keys; t the theme; focus is seen."""
+    reader = opened()
+    page = reader.go("now")
+    page.keyboard.press("Tab")
+    skip = page.get_by_role("link", name="Skip to the view")
+    expect(skip).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("main")).to_be_focused()
+    for key, view in (
+        ("2", "Graph"),
+        ("3", "Audit"),
+        ("4", "Policy"),
+        ("5", "Monitors"),
+        ("6", "Hosts"),
+        ("1", "Now"),
+    ):
+        page.keyboard.press(key)
+        expect(page.get_by_role("heading", level=1, name=view)).to_be_visible()
+        assert page.url.endswith(f"/console/{view.lower()}")
+    before = page.evaluate("document.documentElement.dataset.theme")
+    page.keyboard.press("t")
+    assert page.evaluate("document.documentElement.dataset.theme") != before
+    page.keyboard.press("?")
+    expect(page.get_by_role("dialog", name="Keys")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page.get_by_role("link", name=re.compile("^Audit")).first.focus()
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    page.keyboard.press("Enter")
+    page.locator("tbody tr a").first.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("region", name=re.compile(r"^Record \d"))).to_be_visible()
+
+
+def test_the_theme_is_the_readers_until_he_chooses(opened: Callable[..., Reader]) -> None:
+    """It follows the system's theme; the switch overrides it, over a reload too."""
+    reader = opened(theme="dark")
+    page = reader.go("now")
+    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+    page.get_by_role("button", name="Use the light theme").click()
+    page.reload()
+    assert page.evaluate("document.documentElement.dataset.theme") == "light"

@@ -1,0 +1,110 @@
+"""Audit: a record is found and followed to the line that decided; the log is followed, proven, taken along."""
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import Reader
+
+
+def refuse(attempt: Callable[..., Any], node: str) -> None:
+    """An attempt that the policy denies."""
+    assert attempt("registerPublisher", node, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")[0] != 1
+
+
+def test_a_record_leads_to_the_line_that_decided(
+    opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """From the list to the record, its rule with the lines around it, and on to that line in the policy."""
+    refuse(attempt, "/follow_me")
+    reader = opened()
+    page = reader.go("audit?decision=deny")
+    page.get_by_role("row", name="/follow_me").first.click()
+    record = page.get_by_role("region", name=re.compile(r"^Record \d"))
+    expect(record).to_contain_text("[Publishers] /guarded")
+    expect(record.locator(".excerpt-line.here")).to_contain_text("/guarded = 10.9.9.9")
+    record.get_by_role("link", name="line 7").click()
+    expect(page.get_by_role("heading", level=1, name="Policy")).to_be_visible()
+    expect(page.locator(".cm-lineNumbers .cm-activeLineGutter")).to_have_text("7")
+
+
+def test_records_come_while_it_is_followed(
+    opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """With `Follow live`, what is recorded from then on appears at the top, and only what the filter lets through."""
+    reader = opened()
+    page = reader.go("audit?decision=deny&caller_id=/live_*")
+    expect(page.get_by_text("No record matches")).to_be_visible()
+    page.get_by_role("button", name="Follow live").click()
+    refuse(attempt, "/other")
+    refuse(attempt, "/live_1")
+    expect(page.get_by_role("row", name="/live_1")).to_be_visible()
+    refuse(attempt, "/live_2")
+    expect(page.locator("tbody tr").first).to_contain_text("/live_2")
+    expect(page.locator("tbody tr")).to_have_count(2)
+
+
+def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """A hundred at a time; `Older records` goes on where the page ended, without a gap and without a double."""
+    for number in range(120):
+        attempt("getParam", f"/reader_{number}", "/nothing")
+    reader = opened()
+    page = reader.go("audit")
+    expect(page.locator("tbody tr")).to_have_count(100)
+    page.get_by_role("button", name="Older records").click()
+    expect(page.locator("tbody tr").nth(110)).to_be_visible()
+    numbers = page.eval_on_selector_all("tbody tr", "rows => rows.map(row => Number(row.dataset.sequence))")
+    assert numbers == sorted(set(numbers), reverse=True)
+    assert numbers[0] - numbers[-1] == len(numbers) - 1
+
+
+def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """Verify says that the chain is whole; Export gives what the filter finds as a file of JSON lines."""
+    refuse(attempt, "/exported")
+    reader = opened()
+    page = reader.go("audit?decision=deny&caller_id=/exported")
+    expect(page.get_by_role("row", name="/exported").first).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Export").click()
+    lines = [json.loads(line) for line in download.value.path().read_text().splitlines()]
+    assert lines
+    assert {line["caller_id"] for line in lines} == {"/exported"}
+    assert download.value.suggested_filename.endswith(".ndjson")
+    page.get_by_role("button", name="Verify").click()
+    expect(page.get_by_role("dialog")).to_contain_text("The chain is whole")
+
+
+def test_a_record_that_is_not_there_is_said(opened: Callable[..., Reader]) -> None:
+    """An address with an unknown record shows what the appliance says of it, and the list beside it."""
+    page = opened().go("audit/ffffffffffffffffffff")
+    expect(page.get_by_role("alert")).to_contain_text("there is no record")
+    expect(page.locator("tbody tr").first).to_be_visible()
+
+
+def test_times_are_the_readers_and_utc_on_hover(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """A time is shown in the reader's zone and carries UTC, to the nanosecond, as its title."""
+    page = opened().go("audit")
+    moment = page.locator("tbody time").first
+    expect(moment).to_have_attribute("title", re.compile(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{9} UTC$"))
+
+
+def test_the_list_goes_by_keys(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """j and k open the next and the previous record, Escape closes it, / goes to the search."""
+    refuse(attempt, "/keys_1")
+    refuse(attempt, "/keys_2")
+    page = opened().go("audit?caller_id=/keys_*&event=decision")
+    expect(page.locator("tbody tr")).to_have_count(2)
+    page.keyboard.press("j")
+    expect(page.locator("tbody tr.chosen")).to_contain_text("/keys_2")
+    page.keyboard.press("j")
+    expect(page.locator("tbody tr.chosen")).to_contain_text("/keys_1")
+    page.keyboard.press("k")
+    expect(page.locator("tbody tr.chosen")).to_contain_text("/keys_2")
+    page.keyboard.press("Escape")
+    expect(page.locator("tbody tr.chosen")).to_have_count(0)
+    page.keyboard.press("/")
+    expect(page.get_by_label("Text")).to_be_focused()

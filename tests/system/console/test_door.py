@@ -1,0 +1,98 @@
+"""Who may come in: tokens that are wrong, right, of a lesser role, revoked; nothing of them stays behind."""
+
+from collections.abc import Callable
+
+from playwright.sync_api import Browser, expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import Reader
+
+
+def test_a_wrong_token_stays_outside_and_a_right_one_shows_its_role(
+    browser: Browser, appliance: Appliance, token: Callable[..., str]
+) -> None:
+    """The door says what was wrong with a token; the right one opens, and its name and role are shown."""
+    with Reader(browser, str(appliance.ready["api"])) as reader:
+        page = reader.page
+        page.goto(reader.url)
+        page.get_by_label("Access token").fill("rosrv_000000000000_nothing")
+        page.get_by_role("button", name="Sign in").click()
+        expect(page.get_by_role("alert")).to_contain_text("wrong, or was revoked")
+        page.get_by_label("Access token").fill(token("viewer", "reader-1"))
+        page.get_by_role("button", name="Sign in").click()
+        expect(page.get_by_role("heading", level=1, name="Now")).to_be_visible()
+        expect(page.locator("[data-role]")).to_have_text("viewer")
+        expect(page.locator(".who-name")).to_have_text("reader-1")
+        assert "rosrv_" not in page.url
+
+
+def test_the_token_is_forgotten(browser: Browser, appliance: Appliance) -> None:
+    """Not kept: a reload asks again. Kept for the tab: a reload does not. Signed out: it is nowhere."""
+    with Reader(browser, str(appliance.ready["api"])) as reader:
+        page = reader.page
+        for keep in (False, True):
+            page.goto(f"{reader.url}/console/audit")
+            page.get_by_label("Access token").fill(str(appliance.ready["token"]))
+            page.get_by_label("Stay signed in").set_checked(keep)
+            page.get_by_role("button", name="Sign in").click()
+            expect(page.get_by_role("heading", level=1, name="Audit")).to_be_visible()
+            page.reload()
+            expected = (
+                page.get_by_role("heading", level=1, name="Audit")
+                if keep
+                else page.get_by_label("Access token")
+            )
+            expect(expected).to_be_visible()
+        page.get_by_role("button", name="Sign out").click()
+        expect(page.get_by_label("Access token")).to_be_visible()
+        assert (
+            page.evaluate("[...Object.values(sessionStorage), ...Object.values(localStorage)].join()") == ""
+        )
+
+
+def test_a_revoked_token_ends_the_session_at_once(
+    appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
+) -> None:
+    """Revoked while the page is open: the reader stands at the door and is told why, without touching anything."""
+    reader = opened(token("operator", "leaver"))
+    reader.go("now")
+    expect(reader.page.locator("[data-standing=live]")).to_be_visible()
+    appliance.rosrv("token", "revoke", "leaver")
+    expect(reader.page.get_by_label("Access token")).to_be_visible()
+    expect(reader.page.get_by_role("status").filter(has_text="Signed out")).to_contain_text("revoked")
+    assert reader.page.evaluate("sessionStorage.getItem('rosrv.token')") is None
+
+
+def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Callable[..., Reader]) -> None:
+    """A token that ends while the page is open takes the reader to the door, who is told what to do."""
+    reader = opened(token("viewer", "short", "12h"))
+    reader.page.clock.install()
+    reader.go("now")
+    expect(reader.page.locator("[data-standing=live]")).to_be_visible()
+    reader.page.clock.fast_forward("13:00:00")
+    expect(reader.page.get_by_label("Access token")).to_be_visible()
+    expect(reader.page.get_by_role("status").filter(has_text="Signed out")).to_contain_text("rosrv token add")
+
+
+def test_what_a_viewer_may_not_do_is_said_and_not_done(
+    appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
+) -> None:
+    """A viewer's buttons that change something are off and name the role they are for; and REST refuses them too."""
+    viewer = token("viewer")
+    reader = opened(viewer)
+    page = reader.go("policy")
+    for name, role in (("Dry run", "operator"), ("Load", "admin")):
+        button = page.get_by_role("button", name=name).first
+        expect(button).to_have_attribute("aria-disabled", "true")
+        expect(button).to_have_attribute(
+            "title", f"For the role {role}{'' if role == 'admin' else ' or admin'}; yours is viewer"
+        )
+        button.click(force=True)
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page = reader.go("monitors")
+    expect(page.get_by_role("switch").first).to_be_disabled()
+    page = reader.go("hosts")
+    expect(page.get_by_role("button", name="Enrol a host")).to_have_attribute("aria-disabled", "true")
+    rest = appliance.rest(viewer)
+    assert rest.post("/v1/policy", {"text": "[Nodes]\n"}, match='"1"').status == 403
+    assert rest.get("/v1/policy").json["revision"] == 1

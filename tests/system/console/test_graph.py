@@ -1,0 +1,88 @@
+"""Graph: what is connected, what was refused and by which rule; and a robot of a thousand topics."""
+
+import threading
+from collections.abc import Callable, Iterator
+from socketserver import ThreadingMixIn
+from typing import Any
+from xmlrpc.server import SimpleXMLRPCServer
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.system.console.reader import LIMIT, Reader
+
+NODES, TOPICS = 100, 1000
+
+
+class _Quiet(ThreadingMixIn, SimpleXMLRPCServer):
+    daemon_threads = True
+
+
+@pytest.fixture(scope="module")
+def node_api() -> Iterator[str]:
+    """The API of a node that agrees to everything; all nodes of a test share it."""
+    server = _Quiet(("127.0.0.1", 0), logRequests=False, allow_none=True)
+
+    class Agree:
+        def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> list[Any]:
+            return [1, "", 4711 if method == "getPid" else 0]
+
+    server.register_instance(Agree())
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}/"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_a_refused_attempt_is_red_and_leads_to_its_rule(
+    opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str
+) -> None:
+    """Nodes and topics are drawn, mediated ones marked; an attempt appears in red by itself; a click names the line."""
+    assert attempt("registerPublisher", "/talker", "/chatter", "std_msgs/String", node_api)[0] == 1
+    assert attempt("registerSubscriber", "/listener", "/chatter", "std_msgs/String", node_api)[0] == 1
+    reader = opened()
+    page = reader.go("graph")
+    expect(page.locator('[data-key="n/talker"]')).to_be_visible()
+    expect(page.locator('[data-key="t/chatter"]')).to_have_class("box topic mediated")
+    before = page.locator('[data-key="t/chatter"]').get_attribute("transform")
+    attempt("registerPublisher", "/talker", "/guarded", "std_msgs/String", node_api)
+    line = page.locator("g.attempt").first
+    expect(line).to_be_attached()
+    assert page.locator('[data-key="t/chatter"]').get_attribute("transform") == before
+    line.focus()
+    page.keyboard.press("Enter")
+    details = page.get_by_role("region", name="Refused")
+    expect(details).to_contain_text("[Publishers] /guarded")
+    details.get_by_role("link", name="line 7").click()
+    expect(page.locator(".cm-lineNumbers .cm-activeLineGutter")).to_have_text("7")
+
+
+def test_a_thousand_topics(opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str) -> None:
+    """A hundred nodes and a thousand topics are drawn as some dozens of groups; one is opened, one topic is found;
+    the table has all of them; and the page answers all the while.
+    """
+    for number in range(TOPICS):
+        node = f"/fleet/robot_{number % NODES:03}"
+        topic = f"/fleet/robot_{number % NODES:03}/sensor_{number // NODES}"
+        assert attempt("registerPublisher", node, topic, "std_msgs/String", node_api)[0] == 1
+    reader = opened()
+    page = reader.go("graph")
+    expect(page.locator(".head-sub")).to_contain_text("1,0")
+    drawn = page.locator(".drawing")
+    expect(drawn).to_be_visible()
+    assert 2 <= int(drawn.get_attribute("data-items") or 0) <= 150
+    page.locator(".box.topic.many").first.focus()
+    page.keyboard.press("Enter")
+    page.get_by_role("button", name="Open the group").click()
+    expect(page.get_by_role("button", name="Close groups")).to_be_visible()
+    assert int(drawn.get_attribute("data-items") or 0) <= 200
+    page.get_by_label("Search the graph").fill("robot_042/sensor_7")
+    expect(page.locator('[data-key="t/fleet/robot_042/sensor_7"]')).to_be_visible(timeout=LIMIT)
+    expect(page.locator('[data-key="n/fleet/robot_042"]')).to_be_visible()
+    page.get_by_label("Search the graph").fill("")
+    page.get_by_role("button", name="Table").click()
+    expect(page.get_by_text(" of 1,0")).to_be_visible()
+    page.get_by_role("button", name="More").click()
+    expect(page.get_by_text("101 to 200")).to_be_visible()

@@ -1,0 +1,87 @@
+"""Hosts: let in by a kit and by a token, seen, let out; with the appliance in a network of its own."""
+
+import json
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect, sync_playwright
+
+from appliance.network.lab import Lab
+from tests.support.appliance import Appliance
+from tests.support.requirements import need_program, need_root
+from tests.support.tunnels import need_strongswan
+from tests.system.console.conftest import POLICY, launch
+from tests.system.console.reader import Reader
+
+
+@pytest.fixture
+def appliance(tmp_path: Path) -> Iterator[Appliance]:
+    """An appliance on a host of a lab."""
+    need_root()
+    need_strongswan()
+    config = tmp_path / "appliance.yaml"
+    config.write_text("api: 127.0.0.1:8443\n")
+    with Lab("rosrv-console") as lab:
+        host = lab.host("machine", "10.84.0.2/24")
+        with Appliance(
+            host, policy=POLICY, options=("--config", str(config), "--listen", "0.0.0.0:11311")
+        ) as running:
+            yield running
+
+
+@pytest.fixture
+def browser(appliance: Appliance) -> Iterator[Browser]:
+    """A browser on that host: the console is served on its loopback only."""
+    chromium = need_program("chromium", "chromium")
+    with appliance.host.entered():  # type: ignore[union-attr]  # a host of the lab
+        manager = sync_playwright()
+        playwright = manager.start()
+        browser = launch(playwright, chromium)
+    yield browser
+    browser.close()
+    playwright.stop()
+
+
+def test_a_host_is_enrolled_and_revoked(appliance: Appliance, browser: Browser) -> None:
+    """A kit is saved and has a key in it; the host is in the list; revoking asks for its name and ends it. A token is
+    shown once, with the script that uses it.
+    """
+    with Reader(browser, str(appliance.ready["api"]), str(appliance.ready["token"])) as reader:
+        page = reader.go("hosts")
+        expect(page.get_by_text("No host is enrolled")).to_be_visible()
+        page.get_by_role("button", name="Enrol a host").click()
+        dialog = page.get_by_role("dialog", name="Enrol a host")
+        dialog.get_by_label("Name").fill("ocu-1")
+        dialog.get_by_label("How").select_option("kit")
+        dialog.get_by_label("Address of the appliance").fill("10.84.0.2")
+        with page.expect_download() as download:
+            dialog.get_by_role("button", name="Make the kit").click()
+        with tarfile.open(download.value.path()) as kit:
+            assert [name for name in kit.getnames() if "/private/" in name], kit.getnames()
+        row = page.locator("[data-host=ocu-1]")
+        expect(row).to_contain_text("down")
+
+        page.get_by_role("button", name="Enrol a host").click()
+        dialog.get_by_label("Name").fill("ocu-2")
+        dialog.get_by_role("button", name="Make the token").click()
+        made = page.get_by_role("dialog", name="ocu-2 may enrol itself")
+        expect(made.locator("[data-token]").last).to_contain_text("rosrv-enrol_")
+        with page.expect_download() as script:
+            made.get_by_role("button", name="Download the script").click()
+        assert script.value.path().read_text().startswith("#!")
+        made.get_by_role("button", name="Done").click()
+        expect(page.locator("[data-host=ocu-2]")).to_contain_text("awaited")
+
+        row.get_by_role("button", name="Revoke").click()
+        question = page.get_by_role("dialog", name="Revoke ocu-1?")
+        button = question.get_by_role("button", name="Revoke ocu-1")
+        expect(button).to_have_attribute("aria-disabled", "true")
+        question.get_by_label("Type ocu-1 to confirm").fill("ocu-1")
+        button.click()
+        expect(row).to_contain_text("revoked")
+    listed = map(json.loads, appliance.rosrv("host", "list", "--json").stdout.splitlines())
+    assert {one["name"]: one["state"] for one in listed} == {"ocu-1": "revoked", "ocu-2": "awaited"}
+    events = appliance.audit("--event", "host revoked")
+    assert [one["detail"]["name"] for one in events] == ["ocu-1"]

@@ -1,0 +1,78 @@
+"""Monitors: switched, read, written wrongly and rightly, replaced, removed."""
+
+from collections.abc import Callable
+from typing import Any
+
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import Reader
+
+SPECIFICATION = """\
+counting() {
+    int seen = 0;
+    event message(string text) /chatter std_msgs/String '{data:text}' {
+        seen++;
+    }
+}
+"""
+
+
+def state(appliance: Appliance, name: str) -> Any:
+    """The row of a monitor; None when there is none."""
+    rows = appliance.rest().get("/v1/monitors").json["monitors"]
+    return next((row for row in rows if row["name"] == name), None)
+
+
+def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """The switch is what the appliance has, both ways, and who did it is in the audit log."""
+    reader = opened()
+    page = reader.go("monitors")
+    switch = page.get_by_role("switch", name="safeZone enabled")
+    before = state(appliance, "safeZone")["enabled"]
+    expect(switch).to_have_attribute("aria-checked", str(before).lower())
+    switch.click()
+    expect(switch).to_have_attribute("aria-checked", str(not before).lower())
+    assert state(appliance, "safeZone")["enabled"] is not before
+    switch.click()
+    expect(switch).to_have_attribute("aria-checked", str(before).lower())
+    assert state(appliance, "safeZone")["enabled"] is before
+    events = [one for one in appliance.audit("--event", "monitor *abled") if one["resource"] == "safeZone"]
+    assert {one["detail"]["who"] for one in events} == {"first"}
+
+
+def test_a_specification_is_loaded_replaced_and_removed(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """An error stands at its line and loads nothing; mended, it is loaded; then it is replaced, and removed."""
+    reader = opened()
+    page = reader.go("monitors")
+    page.get_by_role("button", name="Load a specification").click()
+    dialog = page.get_by_role("dialog", name="Load a specification")
+    dialog.get_by_label("File name").fill("counting.rv")
+    reader.write(SPECIFICATION.replace("seen++", "sen++"))
+    dialog.get_by_role("button", name="Load", exact=True).click()
+    expect(dialog.locator(".finding").first).to_contain_text("4:")
+    expect(page.locator(".cm-lint-marker-error")).to_have_count(1)
+    assert state(appliance, "counting") is None
+    reader.write(SPECIFICATION)
+    dialog.get_by_role("button", name="Dry run").click()
+    expect(dialog).to_contain_text("It can be loaded")
+    dialog.get_by_role("button", name="Load", exact=True).click()
+    page.get_by_role("link", name="counting", exact=True).click()
+    expect(page.get_by_role("heading", level=1, name="counting")).to_be_visible()
+    assert state(appliance, "counting")["topics"] == ["/chatter"]
+
+    reader.write(SPECIFICATION.replace("/chatter", "/gossip"))
+    page.get_by_role("button", name="Replace", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Replace").click()
+    expect(page.get_by_role("tabpanel")).to_contain_text("No property")
+    page.get_by_role("tab", name="Events").click()
+    expect(page.get_by_role("tabpanel")).to_contain_text("/gossip")
+    assert state(appliance, "counting")["topics"] == ["/gossip"]
+
+    page.get_by_role("button", name="Remove").click()
+    page.get_by_role("dialog").get_by_role("button", name="Remove").click()
+    expect(page.get_by_role("heading", level=1, name="Monitors")).to_be_visible()
+    expect(page.get_by_role("link", name="counting", exact=True)).to_have_count(0)
+    assert state(appliance, "counting") is None

@@ -1,0 +1,70 @@
+"""Now: what happens is seen as it happens, and the page says when it does not know."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import LIMIT, Reader
+
+
+def test_a_refusal_is_seen_live(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """A node that the policy denies appears under `Refused lately` without a reload, and leads to its record."""
+    reader = opened()
+    page = reader.go("now")
+    refused = page.get_by_role("region", name="Refused lately")
+    expect(refused).to_contain_text("Nothing was refused")
+    assert (
+        attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")[0]
+        != 1
+    )
+    expect(refused.get_by_role("listitem").first).to_contain_text("/intruder")
+    expect(refused.get_by_role("listitem").first).to_contain_text("/guarded")
+    refused.get_by_role("link", name=re.compile("not among the hosts")).first.click()
+    expect(page.get_by_role("region", name=re.compile(r"^Record \d"))).to_contain_text(
+        "[Publishers] /guarded"
+    )
+
+
+def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """The figures are those of `rosrv status`; every process has its row."""
+    page = opened().go("now")
+    expect(page.get_by_role("region", name="Health")).to_contain_text("In service")
+    expect(page.get_by_role("region", name="Health")).to_contain_text("Revision 1")
+    status = appliance.status()
+    for process in status["processes"]:
+        row = page.get_by_role("region", name="Processes").get_by_role("row", name=process["role"])
+        expect(row).to_contain_text(str(process["pid"]))
+
+
+def test_the_page_says_that_it_is_not_live_and_comes_back(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """When the api process dies the page says so at once, tries again by itself, and is live again."""
+    reader = opened()
+    page = reader.go("now")
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+    appliance.kill("api")
+    expect(page.locator(".banner").get_by_text("Not live")).to_be_visible()
+    expect(page.locator("[data-standing=live]")).to_be_visible(timeout=2 * LIMIT)
+    expect(page.locator(".banner").get_by_text("Not live")).to_have_count(0)
+
+
+def test_an_alarm_is_open_until_its_cause_is_gone(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """A policy that goes back unless confirmed is an open alarm, with the way to it; confirmed, it is none."""
+    page = opened().go("now")
+    alarms = page.get_by_role("region", name="Open alarms")
+    expect(alarms).to_contain_text("Nothing is open")
+    rest = appliance.rest()
+    current = rest.get("/v1/policy")
+    loaded = rest.post(
+        "/v1/policy?confirm_within=600", current.json["text"] + "\n# later\n", match=current.etag
+    )
+    assert loaded.status == 200, loaded.body
+    expect(alarms).to_contain_text("goes back by itself unless it is confirmed")
+    assert rest.post("/v1/policy/confirm", match=loaded.etag).status == 200
+    expect(alarms).not_to_contain_text("goes back by itself")
