@@ -46,6 +46,7 @@ from appliance.channel.messages import (
 )
 from appliance.ipsec.charon import PROGRAM, CharonError, Material, Vici
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.refusals import Refusals
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.ipsec.strongswan import Tunnel, configuration
@@ -155,6 +156,8 @@ class TunnelProcess:
             await self._say_how_it_stands(vici)
 
     async def _start(self, wanted: TunnelsStated) -> Vici:
+        if wanted.esp == "kernel":
+            await asyncio.to_thread(clear_leftovers, wanted.address)
         conf, sock = self._directory / "strongswan.conf", self._directory / "vici.sock"
         conf.write_text(configuration(self._directory, wanted.esp))
         sock.unlink(missing_ok=True)

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 import structlog
 
+from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.network import links
 from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
@@ -129,11 +130,19 @@ class Contained(Enclosure):
         if self._firewall is None:
             return
         try:
-            self._firewall.remove()
             if self._own is not None:
-                links.delete_address(self._namespace, "lo", self._own)
+                self._end_tunnels(self._own)
+            self._firewall.remove()
         except NetworkError as error:
-            log.error("rules of the firewall, or the address of the tunnels, may be left", error=str(error))
+            log.error("rules of the firewall may be left", error=str(error))
+
+    def _end_tunnels(self, own: str) -> None:
+        """Take away their address, and what a charon that was killed has left in the kernel."""
+        try:
+            self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
+            links.delete_address(self._namespace, "lo", own)
+        except (NetworkError, LeftoversError) as error:
+            log.error("something of the tunnels may be left", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
         """Close both to everybody but rosmaster's user."""

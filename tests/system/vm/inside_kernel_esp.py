@@ -91,7 +91,7 @@ def test_a_forged_address_gets_nowhere(site: TunnelSite, joined: JoinedHost) -> 
 
 
 def test_charon_that_dies_leaves_nothing_behind(site: TunnelSite, joined: JoinedHost) -> None:
-    """charon is killed: the kernel's states of its life are gone or replaced, and the tunnel is back."""
+    """charon is killed: the kernel's states of its life, with their keys, are gone, and the tunnel is back."""
     assert joined.charon is not None
     mark, before = joined.charon.mark(), set(_spis(middle(site)))
     site.appliance.kill("charon")

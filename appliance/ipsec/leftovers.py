@@ -1,0 +1,72 @@
+"""What a charon that was killed has left in the kernel: states and policies of IPsec, with their keys.
+
+The kernel goes on to take packets by them, also of a host that was revoked meanwhile; so they are taken away before
+charon is started again, and when the appliance ends. Foreign IPsec is left alone: ours are the states of ESP in UDP on
+port 4500, which is charon's alone, and the policies from and to the appliance's address in the tunnels.
+"""
+
+import itertools
+import re
+import subprocess
+
+_SECONDS = 10.0
+_STATE = re.compile(r"^src (\S+) dst (\S+)\s*\n\s+proto esp spi (0x[0-9a-f]+)", re.MULTILINE)
+_ENCAPSULATED = re.compile(r"^\s+encap type espinudp sport (\d+) dport (\d+)", re.MULTILINE)
+_POLICY = re.compile(r"^src (\S+) dst (\S+).*\n\s+dir (in|out|fwd)\b", re.MULTILINE)
+_PORT = "4500"
+
+
+class LeftoversError(Exception):
+    """Something of an earlier life stays in the kernel; the message says what."""
+
+
+def clear_leftovers(own: str) -> int:
+    """Take away what is left in the namespace of the calling thread; how many that were. No charon may run there.
+
+    `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
+    """
+    orders = _orders(own)
+    if orders:
+        _ip("-force", "-batch", "-", text="".join(f"{order}\n" for order in orders))
+        left = _orders(own)
+        if left:
+            raise LeftoversError(f"the kernel keeps what an earlier charon left: {'; '.join(left)[:400]}")
+    return len(orders)
+
+
+def state_orders(listed: str) -> list[str]:
+    """The orders that delete charon's states, from what `ip xfrm state list nokeys` says."""
+    starts = [*(found.start() for found in re.finditer(r"^src ", listed, re.MULTILINE)), len(listed)]
+    orders = []
+    for begin, end in itertools.pairwise(starts):
+        state = _STATE.match(listed[begin:end])
+        encapsulated = _ENCAPSULATED.search(listed[begin:end])
+        if state is not None and encapsulated is not None and _PORT in encapsulated.groups():
+            orders.append(f"xfrm state delete src {state[1]} dst {state[2]} proto esp spi {state[3]}")
+    return orders
+
+
+def policy_orders(listed: str, own: str) -> list[str]:
+    """The orders that delete the policies from and to `own`, from what `ip xfrm policy` says."""
+    return [
+        f"xfrm policy delete src {source} dst {destination} dir {direction}"
+        for source, destination, direction in _POLICY.findall(listed)
+        if f"{own}/32" in (source, destination)
+    ]
+
+
+def _orders(own: str) -> list[str]:
+    return [
+        *policy_orders(_ip("xfrm", "policy"), own),
+        *state_orders(_ip("xfrm", "state", "list", "nokeys")),
+    ]
+
+
+def _ip(*arguments: str, text: str = "") -> str:
+    try:
+        done = subprocess.run(
+            ["ip", *arguments], input=text, capture_output=True, text=True, timeout=_SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise LeftoversError(f"what an earlier charon left in the kernel cannot be told: {error}") from error
+    return done.stdout
