@@ -40,6 +40,13 @@ def ask(path: Path) -> AdminAnswer:
             return msgspec.json.decode(answer.readline(), type=AdminAnswer)
 
 
+def no_relay(presence: str) -> str:
+    """What it means that not every relay process is there."""
+    if presence == "away":
+        return "no relay process: topics and services carry nothing"
+    return f"of the relay processes {presence}: their topics and services carry nothing"
+
+
 def unserved(answer: AdminAnswer) -> str | None:
     """Why nodes are not served now; None when they are."""
     if not answer.ok:
@@ -50,7 +57,7 @@ def unserved(answer: AdminAnswer) -> str | None:
     if body["audit"]["failed"]:
         return f"the audit log cannot be written: {body['audit']['failed']}"
     if body["relay"] != "connected":
-        return "no relay process: topics and services carry nothing"
+        return no_relay(body["relay"])
     return None if body["rosmaster"] == "reachable" else "the ROS Master is being rebuilt: calls wait"
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
+from appliance.cli.healthy import no_relay
 from appliance.cli.policy_output import counted
 from appliance.cli.running import Appliance, speaks
 
@@ -61,7 +62,7 @@ def troubles_of(body: dict[str, Any]) -> list[str]:
     if monitors["failing"]:
         found.append(f"monitors fail: {', '.join(monitors['failing'])}; their messages are dropped")
     if body["relay"] != "connected":
-        found.append("no relay process: topics and services carry nothing")
+        found.append(no_relay(body["relay"]))
     if body["rosmaster"] != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
     found += body["ipsec"]["troubles"]

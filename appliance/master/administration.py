@@ -241,7 +241,7 @@ class Administration:
             "ipsec": self._hosts.status(),
             "monitors": monitors_status(self._master.monitors),
             "rosmaster": "reachable" if self._master.rosmaster.reachable else "being rebuilt",
-            "relay": "connected" if relay.connected else "away",
+            "relay": relay.presence,
             "nodes": lives.count(Life.LIVE),
             "shadows": lives.count(Life.SHADOW),
             "topics": len(

@@ -61,9 +61,12 @@ class RelayControl:
         self.carried = Carried(recorder, self._known_name, allocation.relays)
 
     @property
-    def connected(self) -> bool:
-        """Whether every relay is there."""
-        return all(post.there for post in self._posts)
+    def presence(self) -> str:
+        """`connected` when every relay is there, `away` when none is, else how many are away."""
+        away = sum(not post.there for post in self._posts)
+        if not away:
+            return "connected"
+        return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
         """The port that stands for a publication or a service of an incarnation."""
