@@ -1,0 +1,129 @@
+"""The page of audit events, made from the registry and from what the program really records.
+
+`python -m appliance.audit.catalogue` prints docs/audit-events.md; a test holds the page against it. Severities and the
+fields of `detail` are read off the calls that record an event, so they cannot be forgotten; what is recorded under
+names that are computed (the log's own records, what monitors did) is in `ELSEWHERE`.
+"""
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import appliance
+from appliance.audit.events import EVENTS
+from appliance.audit.record import Severity
+
+_FIELDS = frozenset(
+    {"severity", "host", "caller_id", "category", "resource", "rule", "decision", "more", "reason"}
+)
+_LOGS_OWN = {
+    "log begun": ("log", "earlier_log_missing"),
+    "log failed": ("since", "until"),
+    "records lost": ("count", "first_time", "last_time"),
+    "checkpoint": ("number", "sequence", "hash"),
+    "signature refused": ("number",),
+    "records removed": (
+        "first_sequence", "last_sequence", "last_hash", "first_time", "last_time", "last_checkpoint",
+        "last_checkpoint_hash", "count",
+    ),
+}  # fmt: skip
+_MONITOR = ("monitor", "happened", "before", "after", "before_fields", "after_fields", "size", "count")
+ELSEWHERE: dict[str, tuple[str, ...]] = {
+    **_LOGS_OWN,
+    "decision": ("call", "key", "node", "subgraph"),
+    "denials folded": (
+        "count", "of", "scope", "recorded_id", "first_id", "last_id", "first_time", "last_time", "call", "key", "node",
+        "callers", "resources", "calls", "hosts", "recovered",
+    ),
+    **dict.fromkeys(
+        ("monitor verdict", "message dropped", "message changed", "monitor fault", "monitor log", "monitor published"),
+        _MONITOR,
+    ),
+}  # fmt: skip
+
+_HEAD = """\
+# Audit events
+
+Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
+with, and the fields of its `detail`. The fields that every record has are in [audit.md](audit.md). A name is never
+renamed or given another meaning.
+
+| event | meaning | severity | fields of `detail` |
+|---|---|---|---|
+"""
+
+
+class Use(NamedTuple):
+    """One place that records an event under a literal name."""
+
+    event: str
+    place: str
+    severities: frozenset[str]
+    fields: tuple[str, ...]
+
+
+def uses() -> Iterator[Use]:
+    """Every such place in the program."""
+    root = Path(appliance.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call):
+                yield from _use(node, f"{path.relative_to(root)}:{node.lineno}")
+
+
+def _use(node: ast.Call, place: str) -> Iterator[Use]:
+    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
+    if called == "Record" and "event" in named:
+        event = named["event"]
+    elif called in ("happened", "_own") and node.args:
+        event = node.args[0]
+    else:
+        return
+    fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
+    for name in _texts(event):
+        yield Use(name, place, _severities(node, called), fields)
+
+
+def _texts(node: ast.expr) -> Iterator[str]:
+    """The texts an expression can be: a literal, or one of two."""
+    match node:
+        case ast.Constant(value=str(text)):
+            yield text
+        case ast.IfExp(body=one, orelse=other):
+            yield from _texts(one)
+            yield from _texts(other)
+
+
+def _severities(node: ast.Call, called: str) -> frozenset[str]:
+    known = {one.name: one.value for one in Severity}
+    found = {
+        known[one.attr]
+        for one in ast.walk(node)
+        if isinstance(one, ast.Attribute) and getattr(one.value, "id", "") == "Severity" and one.attr in known
+    }
+    plain = not any(one.arg == "severity" for one in node.keywords)
+    return frozenset(found or ({Severity.INFO.value} if called == "happened" and plain else set()))
+
+
+def markdown() -> str:
+    """The page."""
+    severities: dict[str, set[str]] = {name: set() for name in EVENTS}
+    fields: dict[str, list[str]] = {name: list(ELSEWHERE.get(name, ())) for name in EVENTS}
+    for use in uses():
+        if use.event in EVENTS:
+            severities[use.event] |= use.severities
+            fields[use.event] += [one for one in use.fields if one not in fields[use.event]]
+    order = [one.value for one in Severity]
+    rows = [
+        f"| `{name}` | {meaning} | {', '.join(sorted(severities[name], key=order.index)) or 'by case'} |"
+        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} |"
+        for name, meaning in EVENTS.items()
+    ]
+    return _HEAD + "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())
