@@ -44,6 +44,7 @@ from appliance.channel.messages.message import (
     Message,
 )
 from appliance.channel.messages.relay import (
+    DELAY_BOUNDS,
     ClientGranted,
     ClientRevoked,
     ConnectionClosed,
@@ -111,6 +112,7 @@ from appliance.channel.messages.tunnels import (
 
 __all__ = [
     "APPLIANCE_NAME",
+    "DELAY_BOUNDS",
     "Announced",
     "ApiLink",
     "ApplianceStopRequested",

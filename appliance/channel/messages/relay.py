@@ -168,8 +168,16 @@ class ConnectionRefused(Message):
     count: int  # repeated identical refusals are folded
 
 
+DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.1)
+"""Bounds (seconds) of the delays that `TopicTraffic` counts."""
+
+
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
-    """What went through one relayed topic since the last report."""
+    """What went through one relayed topic since the last report.
+
+    `delays` counts messages by how long the relay took from receiving them to handing them to the subscribers'
+    sockets: up to each of `DELAY_BOUNDS`, and beyond; empty if none was delivered. `delay_seconds` is their sum.
+    """
 
     key: str
     resource: str
@@ -177,6 +185,8 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     bytes: int
     dropped: int  # at slow subscribers
     subscribers: int
+    delays: list[int] = msgspec.field(default_factory=list)
+    delay_seconds: float = 0.0
 
 
 class TrafficReported(Message):
