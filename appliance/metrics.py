@@ -12,6 +12,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+from appliance.channel.messages import DELAY_BOUNDS
+
 BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)  # seconds
 
 
@@ -22,6 +24,8 @@ class Metric(NamedTuple):
     kind: Literal["counter", "gauge", "histogram"]
     labels: tuple[str, ...]
     help: str
+    bounds: tuple[float, ...] = BOUNDS
+    """Of a histogram, in seconds."""
 
 
 METRICS = (
@@ -40,6 +44,13 @@ METRICS = (
     Metric("rosrv_relay_bytes_total", "counter", ("resource",), "bytes relayed, by topic or service"),
     Metric(
         "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
+    ),
+    Metric(
+        "rosrv_relay_delay_seconds",
+        "histogram",
+        ("resource",),
+        "messages by the delay the relay and its monitors added, by topic",
+        DELAY_BOUNDS,
     ),
     Metric("rosrv_monitor_dropped_total", "counter", ("resource",), "messages that monitors dropped"),
     Metric("rosrv_monitor_changed_total", "counter", ("resource",), "messages that monitors changed"),

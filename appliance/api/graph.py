@@ -34,6 +34,9 @@ class Flow(_Model):
     dropped: int = Field(description="messages that slow subscribers did not get")
     messages_per_second: float
     bytes_per_second: float
+    delay_seconds: float = Field(
+        description="that the relay added to a message of the last second, on average; of services 0"
+    )
 
 
 class Publisher(Flow):

@@ -3,7 +3,7 @@
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.core import Metric as Family
 from prometheus_client.registry import Collector
+from prometheus_client.utils import floatToGoString
 from starlette.responses import Response
 
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
-from appliance.metrics import BOUNDS, METRICS, Metric
+from appliance.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]
@@ -72,7 +73,7 @@ def _family(metric: Metric, samples: _Samples) -> Family:
     if metric.kind == "histogram":
         histogram = HistogramMetricFamily(metric.name, metric.help, labels=metric.labels)
         for labels, (counts, total) in samples:
-            histogram.add_metric(labels, _buckets(counts), total)
+            histogram.add_metric(labels, _buckets(metric.bounds, counts), total)
         return histogram
     kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
     family = kind(metric.name, metric.help, labels=metric.labels)
@@ -81,9 +82,10 @@ def _family(metric: Metric, samples: _Samples) -> Family:
     return family
 
 
-def _buckets(counts: list[int]) -> list[tuple[str, float]]:
-    total, buckets = 0, []
-    for bound, count in zip([*map(str, BOUNDS), "+Inf"], counts, strict=True):
+def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str, float]]:
+    total: float = 0
+    buckets = []
+    for bound, count in zip([*map(floatToGoString, bounds), "+Inf"], counts, strict=True):
         total += count
         buckets.append((bound, float(total)))
     return buckets
@@ -104,6 +106,9 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
         "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_relay_delay_seconds": [
+            ((name,), (row[:-1], row[-1])) for name, row in body["delayed"].items()
+        ],
         "rosrv_monitor_dropped_total": [((name,), row[0]) for name, row in body["drop_at"].items()],
         "rosrv_monitor_changed_total": [((name,), row[0]) for name, row in body["change_at"].items()],
         "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body["monitors"]],

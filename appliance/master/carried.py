@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import zip_longest
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
@@ -37,6 +38,9 @@ class Traffic:
     seconds: float = 0.0  # monotonic, of the last report
     messages_per_second: float = 0.0  # between the last two reports
     bytes_per_second: float = 0.0
+    delays: list[int] = field(default_factory=list)  # as `TopicTraffic` has them
+    delay_seconds: float = 0.0
+    delay: float = 0.0  # of a message, on average, in the last report; seconds
 
     def add(self, row: TopicTraffic, now: float) -> None:
         """Count what the relay reported; it reports once a second, and only what changed."""
@@ -47,6 +51,10 @@ class Traffic:
         self.messages_per_second = row.messages / passed
         self.bytes_per_second = row.bytes / passed
         self.seconds = now
+        if row.delays:
+            self.delays = [a + b for a, b in zip_longest(self.delays, row.delays, fillvalue=0)]
+            self.delay_seconds += row.delay_seconds
+        self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
 
 
 class Carried:
@@ -69,6 +77,7 @@ class Carried:
             "dropped": traffic.dropped,
             "messages_per_second": round(traffic.messages_per_second, 2) if flows else 0.0,
             "bytes_per_second": round(traffic.bytes_per_second, 1) if flows else 0.0,
+            "delay_seconds": round(traffic.delay, 6) if flows else 0.0,
         }
 
     def lost(self, relay: int) -> None:

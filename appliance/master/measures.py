@@ -10,6 +10,7 @@ from appliance.master.registry import Life
 from appliance.policy.model import Category
 
 MOST_RESOURCES = 2000
+MOST_DELAYED = 200  # topics with a histogram of their own
 OTHERS = "(others)"  # no name of ROS has a bracket
 
 
@@ -22,7 +23,8 @@ _DECISIONS = tuple(
 def measures_of(master: Master) -> dict[str, Any]:
     """Counters of requests, and the state of registry and relay at this moment.
 
-    Topics and services are named as far as `MOST_RESOURCES` goes: who registers names without end fills `OTHERS`.
+    Topics and services are named as far as `MOST_RESOURCES` goes (histograms: `MOST_DELAYED`): who registers names
+    without end fills `OTHERS`.
     """
     lives = Counter(one.life for one in master.registry.all() if not one.own)
     kinds = Counter(one.kind.value for node, one in master.registry.in_order() if not node.own)
@@ -39,6 +41,14 @@ def measures_of(master: Master) -> dict[str, Any]:
         "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         "registrations": dict(kinds),
         "relayed": relayed,
+        "delayed": by_resource(
+            (
+                (resource, (*traffic.delays, traffic.delay_seconds))
+                for (_key, resource), traffic in master.relay.traffic.items()
+                if traffic.delays
+            ),
+            MOST_DELAYED,
+        ),
         "monitors": [
             [kind, name, count]
             for (kind, name), count in from_zero(
@@ -60,11 +70,13 @@ def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dic
     return dict.fromkeys(expected, 0) | dict(counts)
 
 
-def by_resource(rows: Iterable[tuple[str, tuple[int, ...]]]) -> dict[str, list[int]]:
-    """The sums of each resource's rows; of the first `MOST_RESOURCES` by name, of all others together."""
-    sums: dict[str, list[int]] = {}
+def by_resource(
+    rows: Iterable[tuple[str, tuple[float, ...]]], most: int = MOST_RESOURCES
+) -> dict[str, list[float]]:
+    """The sums of each resource's rows; of the first `most` by name, of all others together."""
+    sums: dict[str, list[float]] = {}
     for resource, values in rows:
-        name = resource if resource in sums or len(sums) < MOST_RESOURCES else OTHERS
+        name = resource if resource in sums or len(sums) < most else OTHERS
         row = sums.setdefault(name, [0] * len(values))
         for place, more in enumerate(values):
             row[place] += more

@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from appliance.channel.messages import TopicTraffic
+from appliance.relay.delays import Delays
 from appliance.relay.frames import Batch, MemoryBudget
 from appliance.relay.recent import Recent
 
@@ -111,6 +112,7 @@ class RelayedTopic:
         self._wanted = False
         self._reported = True
         self._messages = self._bytes = self._dropped = 0
+        self._delays = Delays()
 
     @property
     def members(self) -> tuple[Member, ...]:
@@ -179,17 +181,16 @@ class RelayedTopic:
         self._settle_recent()
         self._forget_header()
 
-    def received(self, batch: Batch) -> None:
-        """Frames have come from the publisher: through the middle, to the subscribers."""
+    def received(self, batch: Batch, since: float) -> None:
+        """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers."""
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False
-        if self._through is None:
-            self._pass_on(batch)
-            return
-        left = self._through(batch)
+        left = batch if self._through is None else self._through(batch)
         if left is not None:
             self._pass_on(left)
+            if self._served:
+                self._delays.add(self._clock() - since, left.messages)
 
     def published(self, batch: Batch) -> None:
         """A monitor publishes: to the subscribers, and to no monitor."""
@@ -227,7 +228,13 @@ class RelayedTopic:
         if self._reported:
             return None
         row = TopicTraffic(
-            self.key, self.topic, self._messages, self._bytes, self._dropped, len(self._served)
+            self.key,
+            self.topic,
+            self._messages,
+            self._bytes,
+            self._dropped,
+            len(self._served),
+            *self._delays.take(),
         )
         self._messages = self._bytes = self._dropped = 0
         self._reported = True

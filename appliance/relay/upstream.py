@@ -33,6 +33,7 @@ class Publisher:
         objection: Callable[[dict[str, str]], str] = lambda _header: "",
     ) -> None:
         self._loop = context.loop
+        self._clock = context.loop.clock
         self._topic = topic
         self._reporter = context.reporter
         self._limits = limits = context.limits
@@ -214,13 +215,14 @@ class Publisher:
             self._lose("the publisher closed the connection")
 
     def _take(self, count: int) -> None:
+        since = self._clock()
         try:
             batch = self._received(count)
         except PeerError as error:
             self._lose(str(error))
             return
         if batch is not None:
-            self._topic.received(batch)
+            self._topic.received(batch, since)
 
     def _broken(self, reason: str) -> None:
         self._lose(f"no connection to the publisher: {reason}")

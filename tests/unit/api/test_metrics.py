@@ -34,6 +34,7 @@ def body() -> dict[str, Any]:
         "registrations": {"publication": 3},
         "monitors": [["drop", "safeTrigger", 4]],
         "relayed": {"/a\"\\\n": [1, 2, 3]},
+        "delayed": {"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
         "drop_at": {"/b": [5]}, "change_at": {"/b": [6], "(others)": [1]},
         "connections": {"topic": 7},
         "rest": [(("GET", "200"), 8)],
@@ -79,6 +80,11 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_decision_seconds_bucket", (("le", str(BOUNDS[-1])),)] == 1
     assert samples["rosrv_decision_seconds_bucket", (("le", "+Inf"),)] == 2
     assert samples["rosrv_relay_bytes_total", (("resource", '/a"\\\n'),)] == 2
+    topic = ("resource", "/a")
+    assert samples["rosrv_relay_delay_seconds_bucket", (("le", "5e-05"), topic)] == 5
+    assert samples["rosrv_relay_delay_seconds_bucket", (("le", "0.0001"), topic)] == 9
+    assert samples["rosrv_relay_delay_seconds_bucket", (("le", "+Inf"), topic)] == 10
+    assert samples["rosrv_relay_delay_seconds_sum", (topic,)] == 0.25
     assert samples["rosrv_audit_failed", ()] == 0
     assert samples["rosrv_monitor_dropped_total", (("resource", "/b"),)] == 5
     assert samples["rosrv_monitor_changed_total", (("resource", "(others)"),)] == 1

@@ -21,3 +21,9 @@ def test_names_without_end() -> None:
     assert len(sums) == MOST_RESOURCES + 1
     assert sums[OTHERS] == [500]
     assert sum(row[0] for row in sums.values()) == MOST_RESOURCES + 500
+
+
+def test_few_topics_have_a_histogram_of_their_own() -> None:
+    """Histograms have many series each, so fewer names are told one by one."""
+    sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
+    assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}

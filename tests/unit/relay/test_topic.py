@@ -3,7 +3,9 @@
 import struct
 from collections.abc import Mapping
 
-from appliance.channel.messages import TopicTraffic
+import pytest
+
+from appliance.channel.messages import DELAY_BOUNDS, TopicTraffic
 from appliance.relay.frames import Batch, MemoryBudget
 from appliance.relay.topic import RelayedTopic
 
@@ -93,6 +95,10 @@ class Story:
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream
 
+    def receive(self, frames: Batch, late: float = 0.0) -> None:
+        """Frames have come, so long ago."""
+        self.topic.received(frames, self.now - late)
+
     def join(self, caller_id: str = "/listener") -> RecordedMember:
         """One more subscriber."""
         member = RecordedMember(caller_id=caller_id)
@@ -114,9 +120,9 @@ def test_everybody_gets_every_message_in_order() -> None:
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     second = story.join()
-    story.topic.received(batch(b"2", b"3"))
+    story.receive(batch(b"2", b"3"))
     assert first.received == bytes(batch(b"1", b"2", b"3").view)
     assert second.received == bytes(batch(b"2", b"3").view)
 
@@ -137,7 +143,7 @@ def test_a_latched_message_is_given_once_to_each() -> None:
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
-    story.topic.received(batch(b"old", b"new"))
+    story.receive(batch(b"old", b"new"))
     second = story.join()
     assert first.received == bytes(batch(b"old", b"new").view)
     assert second.received == bytes(batch(b"new").view)
@@ -148,7 +154,7 @@ def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert story.join().received == b""
 
 
@@ -164,17 +170,17 @@ def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -
     """A second's messages, without a gap to what follows; who comes soon after the first gets them as well."""
     story = monitored()
     for number in range(4):
-        story.topic.received(batch(b"%d" % number))
+        story.receive(batch(b"%d" % number))
         story.now += 0.4
     first = story.join()
-    story.topic.received(batch(b"4"))
+    story.receive(batch(b"4"))
     assert first.received == bytes(batch(b"2", b"3", b"4").view)
     second = story.join("/second")
     assert second.received == bytes(batch(b"2", b"3", b"4").view)
     story.topic.leave(second)
     assert story.join("/second").received == b""
     story.now += 1.1
-    story.topic.received(batch(b"5"))
+    story.receive(batch(b"5"))
     assert story.join("/third").received == b""
     assert first.received.endswith(bytes(batch(b"5").view))
     assert story.budget.used == 0
@@ -183,14 +189,14 @@ def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
     """The last message of a latched one; the next message of one whose subscriber triggered the connection."""
     story = monitored(latching="1")
-    story.topic.received(batch(b"1"))
-    story.topic.received(batch(b"2"))
+    story.receive(batch(b"1"))
+    story.receive(batch(b"2"))
     assert story.join().received == bytes(batch(b"2").view)
     story = Story()
     story.topic.monitor(lambda batch: batch, wanted=True)
     story.join()
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert story.join().received == b""
 
 
@@ -198,18 +204,18 @@ def test_who_comes_back_gets_what_it_missed_and_nothing_twice() -> None:
     """What comes while nobody is there is kept again; without monitor or publisher nothing is."""
     story = monitored()
     first = story.join()
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     story.topic.leave(first)
     story.now += 2
-    story.topic.received(batch(b"3"))
+    story.receive(batch(b"3"))
     second = story.join()
     assert second.received == bytes(batch(b"3").view)
     story.topic.leave(second)
-    story.topic.received(batch(b"4"))
+    story.receive(batch(b"4"))
     story.topic.upstream_closed()
     assert story.budget.used == 0
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"5"))
+    story.receive(batch(b"5"))
     story.topic.monitor(None, wanted=False)
     assert story.budget.used == 0
 
@@ -219,8 +225,8 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
-    story.topic.received(batch(b"1"))
-    story.topic.received(batch(b"12"))
+    story.receive(batch(b"1"))
+    story.receive(batch(b"12"))
     assert story.budget.used == len(batch(b"12").view)
     story.topic.upstream_closed()
     assert story.join().received == b""
@@ -235,7 +241,7 @@ def test_subscribers_survive_the_loss_of_the_publisher() -> None:
     story.topic.upstream_closed()
     assert member.was_cut == ""
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert member.received == bytes(batch(b"1").view)
 
 
@@ -268,7 +274,7 @@ def test_a_subscriber_of_another_type_is_not_served() -> None:
     member = RecordedMember(fits=False)
     story.topic.join(member)
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert member.received == b""
 
 
@@ -278,10 +284,10 @@ def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
     slow, quick = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
     slow.behind_since = 100.0
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert (slow.trimmed, quick.trimmed) == (1, 0)
     quick.behind_since = 100.01
-    story.topic.received(batch(b"2"))
+    story.receive(batch(b"2"))
     assert story.upstream.asked[-1] == "pause 0.06"
     story.topic.relieve()
     assert story.upstream.asked[-1] == "resume"
@@ -294,10 +300,10 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
     story.topic.upstream_opened(HEADER)
     story.topic.traffic()
     member.behind_since, story.now = 99.0, 100.0
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     assert member.trimmed == 1
     assert "pause" not in "".join(story.upstream.asked)
-    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1, [1] + [0] * 10, 0.0)
 
 
 def test_traffic_is_reported_once() -> None:
@@ -306,8 +312,8 @@ def test_traffic_is_reported_once() -> None:
     assert story.topic.traffic() is None
     story.join()
     story.topic.upstream_opened(HEADER)
-    story.topic.received(batch(b"1", b"22"))
-    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1)
+    story.receive(batch(b"1", b"22"))
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1, [2] + [0] * 10, 0.0)
     assert story.topic.traffic() is None
 
 
@@ -335,3 +341,28 @@ def test_the_upstream_hears_who_is_served() -> None:
     assert upstream.announced == (["/one", "/other"], "actionlib/TestActionGoal")
     topic.leave(one)
     assert upstream.announced == (["/other"], "actionlib/TestActionGoal")
+
+
+def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
+    """From receiving a batch to handing it over, for each message that goes on; nobody served, nothing delayed."""
+    story = Story()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"), late=0.003)
+    before = story.topic.traffic()
+    assert before is not None
+    assert before.delays == []
+    story.join()
+    story.topic.monitor(lambda frames: Batch(frames.view[:5], 1, 0), wanted=True)
+    story.receive(batch(b"1", b"2"), late=0.003)
+    story.topic.monitor(None, wanted=False)
+    story.receive(batch(b"1", b"2"), late=9.0)
+    row = story.topic.traffic()
+    assert row is not None
+    assert len(row.delays) == len(DELAY_BOUNDS) + 1
+    assert {
+        bound: count for bound, count in zip([*DELAY_BOUNDS, None], row.delays, strict=True) if count
+    } == {
+        0.005: 1,
+        None: 2,
+    }
+    assert row.delay_seconds == pytest.approx(18.003)
