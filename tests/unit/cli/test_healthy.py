@@ -44,7 +44,8 @@ def test_an_appliance_that_serves_is_healthy() -> None:
     [
         ({"probe": "ROSMaster can be reached"}, "not hidden: ROSMaster can be reached"),
         ({"audit": {"failed": "disk full"}}, "the audit log cannot be written: disk full"),
-        ({"relay": "absent"}, "no relay process"),
+        ({"relay": "away"}, "no relay process"),
+        ({"relay": "1 of 2 are away"}, "of the relay processes 1 of 2 are away"),
         ({"rosmaster": "away"}, "the ROS Master is being rebuilt"),
     ],
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.master.places import Places
+from appliance.master.places import NoPortError, Places
 from appliance.master.registry import Incarnation
 from appliance.ros.uris import parse_node_uri
 
@@ -29,16 +29,21 @@ def first() -> Iterator[int]:
     pytest.fail("no eight free ports in a row")
 
 
-def places(first: int) -> Places:
+def places(first: int, relays: int = 1) -> Places:
     """Nobody keeps the sockets."""
-    return Places("127.0.0.1", range(first, first + 8), keep=lambda *_: None, drop=lambda _: None)
+    ports = range(first, first + 8)
+    return Places("127.0.0.1", ports, keep=lambda *_: None, drop=lambda _: None, relays=relays)
 
 
-def incarnation(ports: tuple[int, int]) -> Incarnation:
+def incarnation(ports: tuple[int, ...]) -> Incarnation:
     """Somebody with these ports."""
     uri = "http://127.0.0.1:4000/"
     host = ipaddress.ip_address("127.0.0.1")
-    return Incarnation("key", "/node", host, parse_node_uri(uri), uri, "127.0.0.1", *ports)
+    outer, relay, *more = ports
+    api = parse_node_uri(uri)
+    return Incarnation(
+        "key", "/node", host, api, uri, "127.0.0.1", outer, relay, more_relay_ports=tuple(more)
+    )
 
 
 def test_closed_ports_come_last(first: int) -> None:
@@ -64,3 +69,31 @@ def test_after_a_restart_too(first: int) -> None:
     assert after.open() == (first + 4, first + 5)
     before.close_unclaimed(set())
     after.close_unclaimed(set())
+
+
+def test_a_port_for_every_relay(first: int) -> None:
+    """And the words that say so when there is none left."""
+    here = places(first, relays=3)
+    opened = [here.open(), here.open()]
+    assert [len(ports) for ports in opened] == [4, 4]
+    here.close(incarnation(opened[0]))
+    assert here.open() == opened[0]
+    with pytest.raises(NoPortError, match="4 per node"):
+        here.open()
+    here.close_unclaimed(set())
+
+
+def test_other_relays_after_a_restart_of_the_appliance(first: int) -> None:
+    """A node has as many ports as there are relays now; those it had and needs are the same."""
+    before = places(first, relays=2)
+    node = incarnation(before.open())
+    had = node.ports
+    before.close_unclaimed(set())
+    more = places(first, relays=3)
+    assert more.reopen(node)
+    assert (node.ports[:3], len(set(node.ports))) == (had, 4)
+    more.close_unclaimed(set())
+    fewer = places(first, relays=1)
+    assert fewer.reopen(node)
+    assert node.ports == had[:2]
+    fewer.close_unclaimed(set())

@@ -1,0 +1,199 @@
+"""The relays take specifications all together or not at all, and nothing goes past its monitors on the way."""
+
+import asyncio
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.channel import messages
+from appliance.master.allocation import TOPIC, Allocation, Move, Resource
+from appliance.master.recorder import Recorder
+from appliance.master.specifications import Sources, SpecificationsRefusedError, check
+from appliance.master.stating import Revision, Stating
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The loop that control runs on."""
+    return "asyncio"
+
+
+def spec(name: str, *topics: str) -> str:
+    """A specification with an event on each topic."""
+    events = "".join(
+        f"event e{number}() {topic} std_msgs/String '{{}}' {{ }}" for number, topic in enumerate(topics)
+    )
+    return f"hold {name}() {{ {events} }}"
+
+
+def revision(number: int, **files: str) -> Revision:
+    """A revision with files of these names."""
+    sources = Sources({f"{name}.rv": text for name, text in files.items()})
+    return Revision(number, sources, check(sources))
+
+
+class Fleet:
+    """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
+
+    def __init__(self, stating: Stating) -> None:
+        self.stating = stating
+        self.story: list[tuple[Any, ...]] = []
+        self.carried: set[Resource] = set()
+        self.away: set[int] = set()
+        self.answer: Callable[[int, messages.SpecificationsStated], messages.Message | None] = (
+            lambda _relay, statement: messages.SpecificationsTaken(statement.revision, [], [])
+        )
+
+    def send(self, message: messages.Message, relay: int) -> bool:
+        """As `Relays`; the relay answers in the next turn of the loop."""
+        if relay in self.away:
+            return False
+        assert isinstance(message, messages.SpecificationsStated)
+        self.story.append(
+            ("stated", relay, message.revision, [name for name, _ in message.files], message.moved)
+        )
+        answer = self.answer(relay, message)
+        if answer is not None:
+            asyncio.get_running_loop().call_soon(self.stating.received, answer, relay)
+        return True
+
+    def carried_now(self) -> set[Resource]:
+        """As `Relays`."""
+        return self.carried
+
+    def withdraw(self, moves: Sequence[Move]) -> None:
+        """As `Relays`."""
+        self.story += [
+            ("withdrawn", move.name, self.stating.allocation.of(move.kind, move.name)) for move in moves
+        ]
+
+    def place(self, moves: Sequence[Move]) -> None:
+        """As `Relays`."""
+        self.story += [
+            ("placed", move.name, self.stating.allocation.of(move.kind, move.name)) for move in moves
+        ]
+
+
+class World:
+    """Two relays with the monitors `a` and `b`, one on each, and their topics carried."""
+
+    def __init__(self, home: Path) -> None:
+        self.log = AuditLog(home / "audit.db")
+        recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.records: list[tuple[str, str]] = []
+        happened = recorder.happened
+
+        def noted(event: str, reason: str, **fields: Any) -> str:
+            self.records.append((event, reason))
+            return happened(event, reason, **fields)
+
+        recorder.happened = noted  # type: ignore[method-assign]
+        self.stating = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+        self.fleet = Fleet(self.stating)
+        self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
+        self.stating.start(revision(1, **self.files), restarted=False, kept="")
+        self.stating.relays = self.fleet
+        self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    """As it says."""
+    world = World(tmp_path)
+    yield world
+    world.log.close()
+
+
+async def test_each_relay_is_told_its_own(world: World) -> None:
+    """And of a change, before anything comes into force."""
+    assert [name for name, _ in world.stating.statement(0).files] == ["a.rv"]
+    assert [name for name, _ in world.stating.statement(1).files] == ["b.rv"]
+    assert await world.stating.take(revision(2, **world.files, c=spec("c", "/b"))) == []
+    assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
+
+
+async def test_what_one_refuses_none_has(world: World) -> None:
+    """The other, which had taken it, is told what is in force again."""
+
+    def answer(relay: int, statement: messages.SpecificationsStated) -> messages.Message:
+        if relay == 1 and statement.revision == 2:
+            return messages.SpecificationsRefused(2, ["c.rv:1:1: error: no"])
+        return messages.SpecificationsTaken(statement.revision, [], [])
+
+    world.fleet.answer = answer
+    with pytest.raises(SpecificationsRefusedError, match="no"):
+        await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+    assert [one[:3] for one in world.fleet.story] == [
+        ("stated", 0, 2), ("stated", 1, 2), ("stated", 0, 1), ("stated", 1, 1)
+    ]  # fmt: skip
+    assert world.stating.relay_of("b") == 1
+
+
+async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
+    """One that is away is told when it comes, and does not keep the others from it."""
+    world.fleet.answer = lambda relay, statement: (
+        None if relay == 1 else messages.SpecificationsTaken(statement.revision, [], [])
+    )
+    taking = asyncio.ensure_future(world.stating.take(revision(2, **world.files, c=spec("c", "/b"))))
+    while len(world.fleet.story) < 2:
+        await asyncio.sleep(0)
+    world.stating.lost(1)
+    with pytest.raises(SpecificationsRefusedError, match="try again"):
+        await taking
+    world.fleet.away = {1}
+    await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+    assert [name for name, _ in world.stating.statement(1).files] == ["b.rv", "c.rv"]
+
+
+async def test_a_topic_moves_only_between_monitors(world: World) -> None:
+    """The new relay has them before, the old one until the topic is withdrawn; what began anew holds and is told."""
+    moved = await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    assert moved == ["b"]
+    assert world.fleet.story == [
+        ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
+        ("withdrawn", "/b", 1),
+        ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ()),
+        ("stated", 1, 2, [], ()),
+        ("placed", "/b", 0),
+    ]
+    assert [reason for event, reason in world.records if event == "topics moved"] == [
+        "/b is carried by another relay process; b began in the initial state there"
+    ]
+
+
+async def test_held_monitors_and_rows_of_both(world: World) -> None:
+    """A row of a monitor that has moved counts only where it is now."""
+    stating = world.stating
+
+    def row(name: str, events: int) -> messages.MonitorRow:
+        return messages.MonitorRow(name, f"{name}.rv", True, False, False, events, 0, 0, 0, 0)
+
+    stating.received(messages.SpecificationsTaken(1, ["a"], ["a"]), 0)
+    stating.received(messages.SpecificationsTaken(1, ["b"], ["b"]), 1)
+    stating.received(messages.MonitorsCounted([row("a", 1), row("b", 9)]), 0)
+    stating.received(messages.MonitorsCounted([row("b", 2)]), 1)
+    assert stating.held == {"a", "b"}
+    assert {name: one.events for name, one in stating.rows.items()} == {"a": 1, "b": 2}
+    stating.resumed("b")
+    assert stating.held == {"a"}
+
+
+async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
+    """The next one has the allocation that was kept; a relay's first answer to it is no restart."""
+    kept: list[str] = []
+    allocation = Allocation(2, kept.append)
+    files = {"b": spec("b", "/b"), "z": spec("z", "/z")}
+    allocation.adopt(allocation.plan(revision(1, **files).checked))
+    here = {name: allocation.of_file(f"{name}.rv") for name in files}
+    log = AuditLog(tmp_path / "other.db")
+    recorder = Recorder(log, strict=False, deny_when_failed=False)
+    after = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+    after.start(revision(1, **files), restarted=True, kept=kept[-1])
+    assert {name: after.relay_of(name) for name in files} == here
+    assert after.statement(0).restarted is True
+    log.close()
