@@ -1,6 +1,7 @@
 """Policies over REST: tried, refused, loaded, explained, taken back, kept over a restart."""
 
 import json
+import re
 import time
 import xmlrpc.client
 from collections.abc import Iterator
@@ -228,4 +229,6 @@ def test_the_graph_shows_who_talks_to_whom(appliance: Appliance, tmp_path: Path)
     assert 1 < topic["publishers"][0]["messages_per_second"] < 50
     metrics = rest.get("/metrics").body.decode()
     assert 'rosrv_relay_messages_total{resource="/chatter"}' in metrics
+    assert re.search(r'rosrv_relay_delay_seconds_count\{resource="/chatter"\} [1-9]', metrics)
+    assert 0 < topic["publishers"][0]["delay_seconds"] < 1
     assert 'rosrv_decisions_total{category="publish",outcome="allow"}' in metrics
