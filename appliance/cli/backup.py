@@ -1,0 +1,50 @@
+"""`rosrv backup` and `rosrv restore`: the state directory in one file, and back."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from appliance.audit.output import printable
+from appliance.cli.running import DEFAULT_STATE, State
+from appliance.supervisor.backup import BackupError, back_up
+from appliance.supervisor.backup import restore as put_back
+
+
+def backup(
+    file: Annotated[Path, typer.Argument(help="Where to; must not exist. It has keys in it: keep it as one")],
+    state: State = DEFAULT_STATE,
+) -> None:
+    """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.
+
+    Configuration, policy and specifications are your own files and not in it.
+
+    Example: rosrv backup /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
+    """
+    try:
+        names = back_up(state, file)
+    except BackupError as error:
+        _fail(str(error))
+    sys.stdout.write(f"{printable(str(file))}: {len(names)} files, {file.stat().st_size} bytes\n")
+
+
+def restore(
+    file: Annotated[Path, typer.Argument(help="What `rosrv backup` wrote")],
+    state: State = DEFAULT_STATE,
+) -> None:
+    """Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.
+
+    Example: rosrv restore /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
+    """
+    try:
+        names = put_back(file, state)
+    except BackupError as error:
+        _fail(str(error))
+    place = printable(str(state))
+    sys.stdout.write(f"{place}: {len(names)} files; prove the log: rosrv audit verify --state {place}\n")
+
+
+def _fail(text: str) -> NoReturn:
+    sys.stderr.write(f"rosrv: {printable(text)}\n")
+    raise typer.Exit(1)

@@ -1,0 +1,179 @@
+"""The state directory in one file, taken while the appliance runs or not, and put back in another place.
+
+Invariants:
+
+1. A database is copied by SQLite itself, as of one moment; nothing of a running appliance is waited for or stopped.
+2. What the signer remembers is taken back to the checkpoints that the copy of the log has, so that a restored log can
+   be signed on. (It is taken after the log, so it has all of them.)
+3. The file has keys in it: only its owner may read it. Nothing is written over: neither the file nor a state directory
+   that is in use.
+4. A file that is put back is only what `back_up` makes: regular files of the parts of a state directory.
+"""
+
+import os
+import sqlite3
+import tarfile
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import roles_of
+from appliance.supervisor.users import account_of
+
+_HEADER, _HASH = 8, 32
+_LOG = "control/audit.db"
+# Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
+_PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid")
+_LOGS_OF_ROS = ("rosmaster",)
+
+
+class BackupError(Exception):
+    """A backup cannot be made or put back; the text says what is in the way, and what to do."""
+
+
+def back_up(state: Path, file: Path) -> list[str]:
+    """Write the state directory to `file` (a tar archive, mode 0600); the names of what is in it.
+
+    Raises `BackupError`.
+    """
+    if not (state / _LOG).exists():
+        raise BackupError(f"{state} has no audit log: it is no state directory of an appliance (--state)")
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        raise BackupError(f"{file} is there already: choose another name") from None
+    except OSError as error:
+        raise BackupError(f"{file}: {error.strerror}") from error
+    try:
+        with os.fdopen(descriptor, "wb") as raw, tarfile.open(fileobj=raw, mode="w:gz") as archive:
+            names = _write(state, archive, file.absolute().parent)
+            archive.close()
+            raw.flush()
+            os.fsync(raw.fileno())
+    except (OSError, sqlite3.Error) as error:
+        file.unlink()
+        raise BackupError(f"the backup was not made: {error}; run this as root") from error
+    return names
+
+
+def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
+    names = []
+    with TemporaryDirectory(prefix=".rosrv-backup-", dir=beside) as folder:
+        copy = Path(folder) / "copy.db"
+        last: dict[str, int] = {}
+        for path in _files(state):
+            name = path.relative_to(state).as_posix()
+            if path.suffix == ".db":
+                _copy_database(path, copy)
+                if name == _LOG:
+                    last = _last_checkpoint(copy)
+            else:
+                data = path.read_bytes()
+                copy.write_bytes(_as_far_as(data, last.get(path.stem)) if path.suffix == ".signed" else data)
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mtime = copy.stat().st_size, int(time.time())
+            entry.mode = path.stat().st_mode & 0o777
+            with copy.open("rb") as content:
+                archive.addfile(entry, content)
+            copy.unlink()
+            names.append(name)
+    return names
+
+
+def _files(state: Path) -> Iterator[Path]:
+    """What is kept: the log first, for the signer's memory is cut to it."""
+    parts = {role.part for role in roles_of(syslog=True)} - set(_LOGS_OF_ROS)
+    yield state / _LOG
+    for part in sorted(parts):
+        for path in sorted((state / part).rglob("*")):
+            kept = path.is_file() and not path.is_symlink() and not path.name.endswith(_PASSING)
+            if kept and path != state / _LOG:
+                yield path
+
+
+def _copy_database(path: Path, copy: Path) -> None:
+    with (
+        closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=30)) as source,
+        closing(sqlite3.connect(copy)) as target,
+    ):
+        source.backup(target)
+
+
+def _last_checkpoint(log: Path) -> dict[str, int]:
+    with closing(sqlite3.connect(log)) as connection:
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
+        (number,) = connection.execute("SELECT coalesce(max(number), 0) FROM checkpoint").fetchone()
+    return {str(log_id): int(number)}
+
+
+def _as_far_as(memory: bytes, number: int | None) -> bytes:
+    """The signer's memory of a log without what it signed since; all of it for a log that is not the copied one."""
+    if number is None or len(memory) < _HEADER:
+        return memory
+    first = int.from_bytes(memory[:_HEADER], "big")
+    return memory[: _HEADER + max(0, number - first + 1) * _HASH]
+
+
+def restore(file: Path, state: Path) -> list[str]:
+    """Make the state directory `state` of a backup, for `rosrv up --state` there; the names of what is in it.
+
+    As root each part is given to its user. Raises `BackupError`.
+    """
+    if state.exists() and any(state.iterdir()):
+        raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
+    try:
+        with tarfile.open(file, mode="r:gz") as archive:
+            entries = archive.getmembers()
+            for entry in entries:
+                _check(file, entry)
+            if _LOG not in {entry.name for entry in entries}:
+                raise BackupError(f"{file} has no audit log: it is no backup of an appliance")
+            state.mkdir(mode=0o711, parents=True, exist_ok=True)
+            state.chmod(0o711)
+            for entry in entries:
+                _extract(archive, entry, state)
+    except (OSError, tarfile.TarError, EOFError) as error:
+        raise BackupError(f"{file} cannot be put back: {error}") from error
+    if os.geteuid() == 0:
+        _hand_over(state)
+    return [entry.name for entry in entries]
+
+
+def _check(file: Path, entry: tarfile.TarInfo) -> None:
+    path = PurePosixPath(entry.name)
+    parts = {role.part for role in roles_of(syslog=True)}
+    inside = (
+        not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1 and path.parts[0] in parts
+    )
+    if not entry.isreg() or not inside:
+        raise BackupError(f"{file} has {entry.name!r} in it, which no backup has: nothing is put back")
+
+
+def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> None:
+    target = state / entry.name
+    for folder in reversed(target.relative_to(state).parents[:-1]):
+        (state / folder).mkdir(mode=0o700, exist_ok=True)
+    source = archive.extractfile(entry)
+    assert source is not None  # noqa: S101  `_check` let regular files pass only
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    with source, os.fdopen(descriptor, "wb") as written:
+        while piece := source.read(1 << 20):
+            written.write(piece)
+        os.fchmod(descriptor, entry.mode & 0o755)
+
+
+def _hand_over(state: Path) -> None:
+    """Give each part to its role's user; the files in it that others may read, to the group that may."""
+    try:
+        roles = roles_of(syslog=True)
+    except StartError as error:
+        raise BackupError(f"{state}: everything is there, but: {error}") from error
+    for role in roles:
+        account = account_of(role.user)
+        group = account.gid if role.readable_by is None else account_of(role.readable_by).gid
+        part = state / role.part
+        for path in (part, *part.rglob("*")) if part.exists() else ():
+            os.chown(path, account.uid, account.gid if path.is_dir() else group, follow_symlinks=False)

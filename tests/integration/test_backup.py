@@ -1,0 +1,80 @@
+"""A backup of the running appliance, put back in another place, where the appliance goes on from it."""
+
+import contextlib
+import json
+import subprocess
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.syslog import eventually
+
+LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
+
+
+@contextlib.contextmanager
+def busy(uri: str) -> Iterator[None]:
+    """A node that sets parameters all the time."""
+    ending = threading.Event()
+
+    def work() -> None:
+        with xmlrpc.client.ServerProxy(uri) as master:
+            number = 0
+            while not ending.is_set():
+                number += 1
+                assert master.setParam("/busy", "/counter", number)[0] == 1
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+
+
+def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
+    """Taken under load; elsewhere the log proves itself and is signed on; policy, parameters and tokens are there.
+
+    The appliance it was taken of notices nothing, and its own log stays whole.
+    """
+    config = tmp_path / "appliance.yaml"
+    config.write_text(json.dumps({"audit": {"checkpoint_records": 20, "checkpoint_seconds": 1}}))
+    file = tmp_path / "backup.tar.gz"
+    with Appliance(options=("--config", str(config))) as old:
+        with xmlrpc.client.ServerProxy(old.master_uri) as master:
+            assert master.setParam("/robot", "/arm", {"joints": [1.5, -2.0], "name": "left"})[0] == 1
+        old.reload(LOADED)
+        token = old.ready["token"]
+        with busy(old.master_uri):
+            eventually(lambda: old.audit(event="checkpoint"))
+            old.rosrv("backup", str(file))
+        assert "complete and unchanged" in old.rosrv("audit", "verify").stdout
+
+    new = Appliance(policy=LOADED, options=("--config", str(config)))
+    try:
+        done = subprocess.run(
+            [ROSRV, "restore", str(file), "--state", str(new.state)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        before = json.loads(new.rosrv("audit", "verify", "--json").stdout)
+        assert before["ok"], before
+        new.start()
+        with xmlrpc.client.ServerProxy(new.master_uri) as master:
+            assert master.getParam("/robot", "/arm")[2] == {"joints": [1.5, -2.0], "name": "left"}
+            assert master.getParam("/robot", "/counter")[2] > 0
+        assert new.status()["policy"]["revision"] == 2
+        assert new.rest(token).get("/v1/status").status == 200
+        eventually(
+            lambda: (
+                json.loads(new.rosrv("audit", "verify", "--json").stdout)["signed_through"] > before["last"]
+            )
+        )
+        assert new.audit(event="signature refused") == []
+    finally:
+        new.close()

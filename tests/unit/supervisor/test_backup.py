@@ -1,0 +1,120 @@
+"""Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
+
+import io
+import sqlite3
+import stat
+import tarfile
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.log import AuditLog
+from appliance.audit.verify import verify
+from appliance.ipsec.checkpoints import SignedCheckpoints
+from appliance.supervisor.backup import BackupError, back_up, restore
+from tests.support.audit import decision, settle
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """A state directory with a log of some signed checkpoints, whose signer has signed one more since."""
+    state = tmp_path / "state"
+    for part in ("control", "signer", "api", "run", "rosmaster/log"):
+        (state / part).mkdir(parents=True)
+    key = Ed25519PrivateKey.generate()
+    memory = SignedCheckpoints(state / "signer")
+
+    def sign(number: int, text: bytes) -> None:
+        memory.approve(text)
+        logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
+
+    logs: list[AuditLog] = []
+    logs.append(AuditLog(state / "control" / "audit.db", checkpoint_every=5, signer=sign))
+    for number in range(30):
+        logs[0].record(decision(logs[0], number))
+        assert settle(logs[0]) is None
+    logs[0].close()
+    (signed,) = (state / "signer").glob("*.signed")
+    with signed.open("ab") as file:
+        file.write(b"\x01" * 32)  # signed after the copy of the log was taken
+    with closing(sqlite3.connect(state / "control" / "state.db")) as connection:
+        connection.execute("CREATE TABLE thing (value TEXT)")
+        connection.execute("INSERT INTO thing VALUES ('kept')")
+        connection.commit()
+    for name, text in (("signer/audit.key", "secret"), ("run/config.json", "{}"), ("rosmaster/log/x.log", "x"),
+                       ("control/state.ahead", "x"), ("control/audit.db.lock", "")):  # fmt: skip
+        (state / name).write_text(text)
+    (state / "signer" / "audit.key").chmod(0o600)
+    return state
+
+
+def test_there_and_back(state: Path, tmp_path: Path) -> None:
+    """What must survive is put back as it was; what belongs to a running appliance is not; the log proves itself."""
+    file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
+    assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
+    names = back_up(state, file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert sorted(names) == sorted(restore(file, other))
+    assert {"control/audit.db", "control/audit.pub", "control/state.db", "signer/audit.key"} <= set(names)
+    assert not any(
+        name.startswith(("run/", "rosmaster/")) or name.endswith((".ahead", ".lock")) for name in names
+    )
+    assert stat.S_IMODE((other / "signer" / "audit.key").stat().st_mode) == 0o600
+    result = verify(other / "control" / "audit.db", signer=other / "signer")
+    assert result.ok, result.findings
+    assert result.signed_checkpoints >= 5
+    with closing(sqlite3.connect(other / "control" / "state.db")) as connection:
+        assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",)]
+    assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".rosrv-backup")] == []
+
+
+def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
+    """An existing file, and a state directory that has something in it, stay as they are."""
+    file = tmp_path / "backup.tar.gz"
+    file.write_text("mine")
+    with pytest.raises(BackupError, match="is there already"):
+        back_up(state, file)
+    assert file.read_text() == "mine"
+    file.unlink()
+    back_up(state, file)
+    with pytest.raises(BackupError, match="is not empty"):
+        restore(file, state)
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "/etc/evil", "control/../../evil", "evil", "elsewhere/evil", "run/config.json"]
+)
+def test_a_file_that_is_no_backup(tmp_path: Path, name: str) -> None:
+    """An archive with a name that no backup has is refused whole, before anything is written."""
+    file = tmp_path / "evil.tar.gz"
+    with tarfile.open(file, "w:gz") as archive:
+        for one in ("control/audit.db", name):
+            archive.addfile(tarfile.TarInfo(one), io.BytesIO())
+    with pytest.raises(BackupError, match="nothing is put back"):
+        restore(file, tmp_path / "state")
+    assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
+def test_only_files(tmp_path: Path, kind: bytes) -> None:
+    """Links, devices and folders are in no backup."""
+    file = tmp_path / "evil.tar.gz"
+    with tarfile.open(file, "w:gz") as archive:
+        entry = tarfile.TarInfo("control/audit.db")
+        entry.type, entry.linkname = kind, "/etc/passwd"
+        archive.addfile(entry)
+    with pytest.raises(BackupError, match="nothing is put back"):
+        restore(file, tmp_path / "state")
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    """No state directory, no archive, one that was cut: an error that names it."""
+    with pytest.raises(BackupError, match="no state directory of an appliance"):
+        back_up(tmp_path, tmp_path / "x.tar.gz")
+    (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
+    with pytest.raises(BackupError, match="rubbish cannot be put back"):
+        restore(tmp_path / "rubbish", tmp_path / "state")
+    with pytest.raises(BackupError, match="nowhere cannot be put back"):
+        restore(tmp_path / "nowhere", tmp_path / "state")
