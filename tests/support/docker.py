@@ -196,7 +196,7 @@ class Compose:
         self.directory = directory
         self.project = project
         self.environment = environment
-        self._options = ["--project-name", project, "--no-ansi"]
+        self._options = ["--project-name", project, "--ansi", "never"]
         for file in files:
             self._options += ["--file", file]
 

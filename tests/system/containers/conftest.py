@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 
 from appliance.network.lab import Host, Lab
 from tests.support.docker import Compose, Engine, images, project
@@ -18,6 +19,10 @@ class Site:
     engine: Engine
     machine: Host
     laptop: Host
+
+    def story(self) -> str:
+        """What the engine said, for the message of a failure."""
+        return self.engine.story()
 
 
 @pytest.fixture(scope="session")
@@ -51,3 +56,13 @@ def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
         yield compose
     finally:
         compose("down", "--volumes", "--timeout", "5")
+
+
+def without(alone: Compose, right: str) -> None:
+    """Start it again with all rights but one."""
+    text = yaml.safe_load((alone.directory / "compose.yaml").read_text())
+    text["services"]["appliance"]["cap_add"].remove(right)
+    text["services"]["appliance"]["restart"] = "no"
+    (alone.directory / "compose.yaml").write_text(yaml.safe_dump(text))
+    alone("down", "--volumes", "--timeout", "5")
+    alone("up", "--detach", "--no-build")

@@ -1,0 +1,224 @@
+"""Tests of `docker compose --profile demo up`: real nodes in containers, and what can be reached from where."""
+
+import json
+import re
+import socket
+from typing import Any
+
+import pytest
+
+from appliance.network.namespaces import Namespace
+from appliance.network.scan import scan
+from tests.support.docker import ROOT, Compose, namespace_of
+from tests.system.containers.conftest import Site
+
+MACHINE = "10.79.0.1"
+ROBOT_SIDE, OPERATOR_SIDE, OUTSIDE = "172.29.77.2", "172.29.78.2", "172.29.76.2"
+LANDSHARK, OCU, TABLET = "172.29.77.10", "172.29.78.20", "172.29.78.66"
+NODE_PORTS = range(19001, 21001)
+PAGE = ROOT / "docs" / "next-to-your-robot.md"
+LAST_ATTACK = "stop the master"
+
+
+@pytest.fixture(scope="module")
+def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
+    """What the visitor tried, once he has tried everything and the operator has driven, aimed and fired."""
+    demo.wait_for_log("ocu", '"fired"', timeout=120)
+    demo.wait_for_log("visitor", LAST_ATTACK, timeout=180)
+    lines = demo("logs", "--no-color", "visitor").stdout.splitlines()
+    said = [json.loads(line[line.index("{") :]) for line in lines if '"attacked"' in line]
+    return {one["attack"]: one for one in said}
+
+
+def ports_open(where: Namespace, address: str, ports: range) -> tuple[int, ...]:
+    """Which of the ports take a connection from there."""
+    return where.run(lambda: scan(address, ports, seconds=0.5)).open
+
+
+def reaches(where: Namespace, address: str, port: int, family: int = socket.AF_INET) -> str:
+    """What a connection from there comes to."""
+
+    def attempt() -> str:
+        with socket.socket(family, socket.SOCK_STREAM) as client:
+            client.settimeout(2)
+            try:
+                client.connect((address, port))
+            except OSError as error:
+                return type(error).__name__
+            return "reached"
+
+    return where.run(attempt)
+
+
+def test_unmodified_nodes_work_through_the_appliance(demo: Compose) -> None:
+    """The operator in its container connects, drives, aims and fires; five rospy nodes and a roscpp node obey."""
+    for event in ('"connected"', '"drove"', '"aimed"', '"fired"'):
+        demo.wait_for_log("ocu", event, timeout=120)
+    status = demo.status()
+    assert (status["nodes"] >= 7, status["probe"], status["isolation"]) == (True, "passed", "container")
+    nodes = {record["caller_id"] for record in demo.audit("--event", "registered")}
+    assert {"/ocu", "/landshark_base", "/landshark_radar"} <= nodes
+
+
+def test_all_that_nodes_are_told_is_the_master(demo: Compose) -> None:
+    """Of the appliance a node's container knows ROS_MASTER_URI, nothing else."""
+    for service in ("landshark", "ocu"):
+        told = demo.engine.inspect(demo.container(service))["Config"]["Env"]
+        assert [one for one in told if one.startswith(("ROS_", "ROSRV"))] == [
+            "ROS_MASTER_URI=http://appliance:11311",
+            "ROS_HOME=/tmp/ros",
+        ]
+
+
+def test_a_visitor_is_refused_by_name_of_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
+    """Of all that he tries nothing succeeds but what the policy grants; each refusal is recorded with its rule."""
+    succeeded = {name for name, one in attacks.items() if one["succeeded"]}
+    assert succeeded <= {"watch the battery"}
+    assert len(attacks) >= 12
+    denied = demo.audit("--deny", "--host", TABLET)
+    assert {"getSystemState", "shutdownMaster", "/landshark/gps"} <= {record["resource"] for record in denied}
+    files = {record["rule"]["file"] for record in denied if record["rule"] is not None}
+    assert files == {"/etc/rosrv/policies/containers.ini"}
+
+
+def test_the_appliance_sees_who_really_speaks(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
+    """Source addresses are preserved: every record has the address of the container that spoke."""
+    assert attacks
+    decided = demo.audit("--event", "decision")
+    hosts = {record["caller_id"]: record["host"] for record in decided if record["caller_id"]}
+    assert hosts["/ocu"] == OCU
+    assert hosts["/landshark_turret"] == LANDSHARK
+    assert hosts["/tablet"] == TABLET
+    assert {host for name, host in hosts.items() if name.startswith("/landshark")} == {LANDSHARK}
+
+
+def test_only_what_is_named_is_published(site: Site, demo: Compose) -> None:
+    """The engine publishes IKE and, on this machine, the console; for the robot's containers nothing."""
+    published = {}
+    for service in ("appliance", "landshark", "ocu"):
+        ports = demo.engine.inspect(demo.container(service))["NetworkSettings"]["Ports"]
+        published[service] = {
+            (binding["HostIp"], binding["HostPort"], port)
+            for port, bindings in ports.items()
+            for binding in bindings or []
+        }
+    everywhere = {(ip, port, f"{port}/udp") for ip in ("0.0.0.0", "::") for port in ("500", "4500")}
+    assert published["appliance"] == {*everywhere, ("127.0.0.1", "8443", "8443/tcp")}
+    assert published["landshark"] == published["ocu"] == set()
+    assert ports_open(site.laptop.namespace, MACHINE, range(1, 65536)) == ()
+
+
+def test_this_machine_reaches_the_console_and_the_laptop_does_not(site: Site, demo: Compose) -> None:
+    """127.0.0.1:8443 answers over TLS on the machine; from its network nobody gets there, by no way."""
+    assert reaches(site.machine.namespace, "127.0.0.1", 8443) == "reached"
+    assert reaches(site.laptop.namespace, MACHINE, 8443) == "ConnectionRefusedError"
+    assert demo.engine.inspect("demo_robot")["Internal"]
+
+
+def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
+    """From the operators' network: RVMaster and the nodes' stand-ins; no console, no ROS Master, no robot."""
+    assert attacks
+    here = namespace_of(demo.engine, demo.container("ocu"))
+    found = ports_open(here, OPERATOR_SIDE, range(1, 65536))
+    assert 11311 in found
+    assert all(port == 11311 or port in NODE_PORTS for port in found), found
+    for address in (ROBOT_SIDE, OUTSIDE, LANDSHARK):
+        assert ports_open(here, address, range(1, 65536, 97)) == ()
+        assert (
+            reaches(here, address, 11311) == reaches(here, address, 8443) == "OSError"
+        )  # there is no way to it
+    assert attacks["go past the master"]["answer"][1].startswith("0 of ")
+
+
+def test_a_stranger_on_the_outer_network_gets_nothing(demo: Compose) -> None:
+    """A container that somebody starts beside the appliance reaches neither REST nor the ROS Master."""
+    name = demo.engine.docker(
+        "run", "--detach", "--rm", "--network", "demo_outside", "--entrypoint", "sleep", "rosrv/demo", "300"
+    ).stdout.strip()
+    try:
+        here = namespace_of(demo.engine, name)
+        assert ports_open(here, OUTSIDE, range(1, 11311)) == ()
+        assert reaches(here, OUTSIDE, 12311) == "ConnectionRefusedError"
+        assert ports_open(here, OUTSIDE, range(21001, 65536)) == ()
+        assert reaches(here, LANDSHARK, 22) != "reached"
+    finally:
+        demo.engine.docker("kill", name)
+
+
+def test_nothing_listens_on_ipv6(demo: Compose) -> None:
+    """The networks have no IPv6, and no socket of the appliance is on an IPv6 address that could be reached."""
+    listening = demo.exec("appliance", "ss", "-Htln6").stdout
+    assert listening == ""
+
+
+def documented_rights() -> dict[str, tuple[str, frozenset[str]]]:
+    """The table of processes in the documentation: user and capabilities of each."""
+    rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", PAGE.read_text(), re.MULTILINE)
+    return {name: (user, frozenset(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
+
+
+def test_every_process_has_the_rights_that_are_documented(demo: Compose) -> None:
+    """User and capabilities of each process are those of the table, and there is no other process."""
+    numbers = {"NET_ADMIN": 12, "NET_BIND_SERVICE": 10, "SETUID": 7, "SETGID": 6, "KILL": 5, "CHOWN": 0}
+    documented = documented_rights()
+    seen = {row["role"]: row["pid"] for row in demo.status()["processes"]}
+    assert set(seen) <= set(documented)
+    for role, pid in seen.items():
+        text = demo.exec("appliance", "cat", f"/proc/{pid}/status").stdout
+        fields = dict(line.split(":\t", 1) for line in text.splitlines() if ":\t" in line)
+        user, rights = documented[role]
+        uid = demo.exec("appliance", "id", "-u", user).stdout.strip()
+        assert set(fields["Uid"].split()) == {uid}, role
+        mask = sum(1 << numbers[name] for name in rights)
+        assert int(fields["CapPrm"], 16) == mask, role
+        assert int(fields["CapEff"], 16) == mask, role
+        assert fields["NoNewPrivs"] == "1", role
+    running = demo.exec("appliance", "sh", "-c", "cat /proc/[0-9]*/comm").stdout.splitlines()
+    assert len(running) <= len(seen) + 4  # tini, the shell, cat
+
+
+def test_the_root_file_system_is_read_only(demo: Compose) -> None:
+    """Of the file systems only the volume, /tmp and /run can be written, and from the latter two nothing runs."""
+    mounts = demo.exec("appliance", "cat", "/proc/mounts").stdout.splitlines()
+    kinds = {line.split()[1]: line.split()[2:4] for line in mounts}
+    assert "ro" in kinds["/"][1].split(",")
+    writable = {
+        place
+        for place, (kind, options) in kinds.items()
+        if "rw" in options.split(",") and kind not in ("proc", "devpts", "mqueue", "cgroup", "cgroup2")
+    }
+    system = {"/dev", "/dev/shm", "/proc/keys", "/proc/timer_list", "/proc/kcore", "/etc/resolv.conf"}
+    system |= {"/etc/hostname", "/etc/hosts", "/sys/fs/cgroup"}
+    assert writable - system == {"/var/lib/rosrv", "/tmp", "/run"}
+    for place in ("/tmp", "/run"):
+        assert {"noexec", "nosuid", "nodev"} <= set(kinds[place][1].split(","))
+    for folder in ("policies", "monitors", "ipsec"):
+        assert "ro" in kinds[f"/etc/rosrv/{folder}"][1].split(",")
+
+
+def test_packets_do_not_pass_from_one_network_to_the_other(demo: Compose) -> None:
+    """The appliance does not forward: an operator's packet that is sent to it for the robot ends there."""
+    assert demo.exec("appliance", "cat", "/proc/sys/net/ipv4/ip_forward").stdout.strip() == "0"
+
+
+def test_a_policy_is_changed_while_the_robot_runs(demo: Compose) -> None:
+    """Edit policies/ on the machine, reload through `docker compose exec`: what is no longer granted is taken back."""
+    file = demo.directory / "policies" / "containers.ini"
+    before = file.read_text()
+    file.write_text(
+        before.replace("/landshark/gps     = ocu ", "/landshark/odom    = vehicle\n/landshark/gps     = ocu ")
+    )
+    try:
+        assert "revision 2" in demo.exec("appliance", "rosrv", "policy", "reload").stdout
+        taken = demo.audit("--event", "revoked", caller_id="/ocu")
+        assert "/landshark/odom" in {record["resource"] for record in taken}
+    finally:
+        file.write_text(before)
+        demo.exec("appliance", "rosrv", "policy", "reload")
+    moment = demo.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
+    demo.wait_for_log("ocu", '"position"', since=moment)
+    broken = demo.directory / "policies" / "broken.ini"
+    broken.write_text("[Publishers\n")
+    assert (
+        demo.exec("appliance", "rosrv", "policy", "check", "policies/broken.ini", check=False).returncode == 1
+    )

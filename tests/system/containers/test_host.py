@@ -1,0 +1,81 @@
+"""Tests of compose.host.yaml: the nodes run on the machine itself, the appliance in its container beside them."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.scan import scan
+from tests.support.docker import Compose, project
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.system.containers.conftest import Site
+
+APPLIANCE, MACHINE = "172.29.76.2", "172.29.76.1"
+LOCAL_PORTS = range(32768, 61000)
+
+
+class MachineInside:
+    """The machine, by the address at which the appliance sees it."""
+
+    address = MACHINE
+
+    def __init__(self, site: Site) -> None:
+        self.popen = site.machine.popen
+
+
+@pytest.fixture
+def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
+    """`docker compose -f compose.yaml -f compose.host.yaml up`."""
+    compose = site.engine.compose(project(tmp_path), "host", "compose.yaml", "compose.host.yaml")
+    try:
+        compose("up", "--detach", "--no-build")
+        compose.wait_healthy()
+        yield compose
+    finally:
+        compose("down", "--volumes", "--timeout", "5")
+
+
+def test_nodes_of_the_machine_work_and_its_ports_are_closed(
+    site: Site, beside: Compose, tmp_path: Path
+) -> None:
+    """By the three commands of the file's head: nodes talk, the appliance sees the machine, strangers see no port."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    rules = beside.exec("appliance", "rosrv", "protect", "--appliance", APPLIANCE).stdout
+
+    def nft(*arguments: str, text: str = "") -> None:
+        subprocess.run(["nft", *arguments], input=text, text=True, check=True, capture_output=True)
+
+    with RosSession(f"http://{APPLIANCE}:11311", tmp_path / "ros", MachineInside(site)) as ros:
+        listener = ros.listener("rospy", "/chatter", name="listener")
+        ros.talker("roscpp", "/chatter", name="talker")
+        listener.wait_for(event="received")
+        hosts = {
+            record["host"]
+            for record in beside.audit("--event", "registered")
+            if record["caller_id"] == "/talker"
+        }
+        assert hosts == {MACHINE}
+
+        def open_ports() -> tuple[int, ...]:
+            return site.laptop.run(lambda: scan("10.79.0.1", LOCAL_PORTS, seconds=0.3)).open
+
+        assert open_ports(), "without protection a scanner finds the nodes"
+        site.machine.run(lambda: nft("-f", "-", text=rules))
+        try:
+            assert open_ports() == ()
+            second = ros.listener("roscpp", "/chatter", name="second")
+            second.wait_for(event="received")
+        finally:
+            site.machine.run(lambda: nft("delete", "table", "inet", "rosrv_protect"))
+
+
+def test_without_the_machines_own_grant_nobody_is_let_in(site: Site, beside: Compose) -> None:
+    """The policy of this topology names the machine only: the operator's network of compose.yaml has no rights."""
+    assert beside.status()["policy"]["file"] == "/etc/rosrv/policies/default.ini"
+    said = beside.exec(
+        "appliance", "rosrv", "policy", "explain", "policies/default.ini", "--robot", MACHINE,
+        "--host", "172.29.78.20", "--node", "/ocu", "--publish", "/cmd_vel", check=False,
+    ).stdout  # fmt: skip
+    assert "deny" in said.lower() or "not among" in said

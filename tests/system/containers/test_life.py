@@ -1,0 +1,167 @@
+"""Tests of the life of the container: started, stopped, killed, started again, removed, and what each right is for."""
+
+import json
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.support.docker import APPLIANCE, Compose, project
+from tests.system.containers.conftest import Site, without
+
+STOP_SECONDS = 5.0
+
+
+@pytest.fixture
+def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
+    """The robot and its operator beside the appliance, and both have connected."""
+    compose = site.engine.compose(project(tmp_path), "life")
+    try:
+        compose("--profile", "demo", "up", "--detach", "--no-build", "landshark", "ocu")
+        compose.wait_for_log("ocu", '"fired"', timeout=120)
+        yield compose
+    finally:
+        compose("--profile", "demo", "down", "--volumes", "--timeout", "5")
+
+
+def drives_on(compose: Compose) -> None:
+    """The operator, never started again, hears where the robot is, from now on."""
+    moment = compose.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
+    compose.wait_for_log("ocu", '"position"', since=moment, timeout=90)
+    assert compose.engine.inspect(compose.container("ocu"))["RestartCount"] == 0
+
+
+def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
+    """`docker stop` ends it in order within five seconds."""
+    container = alone.container("appliance")
+    begun = time.monotonic()
+    alone("stop")
+    took = time.monotonic() - begun
+    state = alone.engine.inspect(container)["State"]
+    assert state["ExitCode"] == 0, alone.story()
+    assert took < STOP_SECONDS + 2  # what compose itself takes
+    assert "did not end" not in alone.story()
+
+
+def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
+    """Stopped and started, killed and restarted by its engine: nodes that still run go on."""
+    container = talking.container("appliance")
+    talking("stop", "appliance")
+    talking("start", "appliance")
+    talking.wait_healthy()
+    drives_on(talking)
+    talking.engine.docker("kill", "--signal", "KILL", container)
+    talking("start", "appliance")
+    talking.wait_healthy()
+    drives_on(talking)
+    verified = talking.exec("appliance", "rosrv", "audit", "verify", check=False)
+    assert verified.returncode == 0, verified.stdout + verified.stderr
+
+
+def test_the_robot_may_come_and_go(talking: Compose) -> None:
+    """The robot's container is killed and started again while the appliance runs: the operator hears it again."""
+    talking("kill", "landshark")
+    talking("--profile", "demo", "up", "--detach", "--no-build", "landshark")
+    drives_on(talking)
+    talking("kill", "appliance", "landshark")
+    talking("--profile", "demo", "up", "--detach", "--no-build", "landshark")
+    talking.wait_healthy()
+    drives_on(talking)
+
+
+def test_a_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
+    """After `down --volumes`, from a running appliance or a killed one, the machine is as it was."""
+    compose = site.engine.compose(project(tmp_path), "gone")
+
+    def machine() -> str:
+        def look() -> str:
+            commands = ("ip -brief link", "ip route", "iptables-save -t filter", "iptables-save -t nat")
+            said = [_said(*command.split()) for command in commands]
+            lines = [line.partition(" [")[0] for one in said for line in one.splitlines()]
+            return "\n".join(line for line in lines if not line.startswith("#"))
+
+        return site.machine.run(look) + site.engine.docker("volume", "ls", "--quiet").stdout
+
+    before = machine()
+    for end in ("running", "killed"):
+        compose("up", "--detach", "--no-build")
+        assert machine() != before
+        if end == "killed":
+            compose("kill")
+        compose("down", "--volumes", "--timeout", "5")
+        assert machine() == before
+
+
+def _said(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def rights(compose: Compose) -> list[str]:
+    """The capabilities in compose.yaml."""
+    text = yaml.safe_load((compose.directory / "compose.yaml").read_text())
+    granted: list[str] = text["services"]["appliance"]["cap_add"]
+    return granted
+
+
+@pytest.mark.parametrize("right", ["NET_ADMIN", "SETUID", "SETGID", "CHOWN"])
+def test_it_does_not_start_without(right: str, site: Site) -> None:
+    """Each of the rights that a start needs is needed: without it there is no start, and a reason is given."""
+    given = [f"--cap-add={one}" for one in ("NET_ADMIN", "SETUID", "SETGID", "CHOWN", "KILL") if one != right]
+    done = site.engine.docker(
+        "run",
+        "--rm",
+        "--cap-drop",
+        "ALL",
+        *given,
+        "--env",
+        "ROSRV_API=off",
+        APPLIANCE,
+        check=False,
+        timeout=90,
+    )
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("rosrv: ")
+
+
+def hung_relay_ends(compose: Compose, seconds: float) -> bool:
+    """Stop the relay process as a hanging one stops; whether the supervisor ends it in time."""
+    pid = next(row["pid"] for row in compose.status()["processes"] if row["role"] == "relay")
+    compose(
+        "exec", "-T", "--user", "rosrv-relay", "appliance", "python", "-c", f"import os; os.kill({pid}, 19)"
+    )
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        rows = [row for row in compose.status()["processes"] if row["role"] == "relay"]
+        if any(row["pid"] != pid for row in rows):
+            return True
+    return False
+
+
+def test_a_hanging_process_is_ended_by_the_right_to_kill(alone: Compose) -> None:
+    """KILL is for processes of other users: with it a hanging relay is replaced, without it it hangs on."""
+    assert hung_relay_ends(alone, 30)
+    without(alone, "KILL")
+    alone.wait_healthy()
+    assert not hung_relay_ends(alone, 15)
+
+
+def test_no_other_right_is_given(alone: Compose) -> None:
+    """The list in compose.yaml is exactly what these tests prove to be needed, and the engine gives no more."""
+    proven = {
+        "NET_ADMIN",
+        "SETUID",
+        "SETGID",
+        "CHOWN",
+        "KILL",
+        "NET_BIND_SERVICE",
+    }  # the last: test_tunnel.py
+    assert set(rights(alone)) == proven
+    settings = alone.engine.inspect(alone.container("appliance"))["HostConfig"]
+    assert settings["CapDrop"] == ["ALL"]
+    assert {one.removeprefix("CAP_") for one in settings["CapAdd"]} == proven
+    assert settings["ReadonlyRootfs"]
+    assert not settings["Privileged"]
+    assert json.dumps(settings["SecurityOpt"]) == '["no-new-privileges:true"]'

@@ -1,0 +1,57 @@
+"""Tests of a host behind a tunnel to the appliance in its container: enrolled, heard, revoked."""
+
+import base64
+from pathlib import Path
+
+from tests.support.docker import Compose
+from tests.support.nodes import RosSession
+from tests.support.tunnels import JoinedHost, need_strongswan
+from tests.system.containers.conftest import Site, without
+
+MACHINE = "10.79.0.1"
+POLICY = """\
+[Groups]
+laptop = host:laptop
+[Nodes]
+default = laptop
+[Publishers]
+default = laptop
+[Subscribers]
+default = laptop
+[Commands]
+default = laptop
+"""
+ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--out", "/tmp/laptop.tar.gz")
+
+
+def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp_path: Path) -> None:
+    """By its kit a laptop on the machine's network has a tunnel through the published ports, until it is revoked."""
+    need_strongswan()
+    alone.exec("appliance", *ENROL)
+    kit = tmp_path / "laptop.tar.gz"
+    kit.write_bytes(base64.b64decode(alone.exec("appliance", "base64", "/tmp/laptop.tar.gz").stdout))
+    (alone.directory / "policies" / "containers.ini").write_text(POLICY)
+    (alone.directory / "policies" / "containers.ini.tests.yaml").unlink()
+    alone.exec("appliance", "rosrv", "policy", "reload")
+    with JoinedHost(site.laptop, kit, tmp_path / "laptop") as laptop:
+        laptop.wait_until_up()
+        with RosSession(laptop.master, tmp_path / "ros", laptop) as ros:
+            ros.listener("rospy", "/chatter", name="listener")
+            ros.talker("rospy", "/chatter", name="talker")
+            ros.processes[0].wait_for(event="received")
+            hosts = {record["host"] for record in alone.audit("--event", "registered", "--caller", "/talker")}
+            assert hosts == {laptop.address}
+            assert "up" in alone.exec("appliance", "rosrv", "host", "list").stdout
+            alone.exec("appliance", "rosrv", "host", "revoke", "laptop")
+            assert alone.audit("--event", "host revoked")
+            assert "revoked" in alone.exec("appliance", "rosrv", "host", "list").stdout
+
+
+def test_low_ports_are_for_who_has_the_right(alone: Compose) -> None:
+    """Without NET_BIND_SERVICE charon cannot have port 500: a host cannot be enrolled, and that is said."""
+    without(alone, "NET_BIND_SERVICE")
+    alone.wait_healthy()
+    done = alone.exec("appliance", *ENROL, check=False)
+    seen = alone.status()
+    assert done.returncode != 0 or "charon" not in {row["role"] for row in seen["processes"]}
+    assert done.stderr or seen["ipsec"]["troubles"]
