@@ -294,7 +294,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
     reconciler = wires.reconciler()
     revocation = Revocation(master, put_back=reconciler.put_back)
     base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
-    base.hosts.machines = lambda: Counter(
+    base.hosts.ports.machines = lambda: Counter(
         str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own
     )
 

@@ -31,11 +31,11 @@ async def _itself(
 ) -> dict[str, Any]:
     match request:
         case admin.HostEnrol(token, text, peer):
-            return await hosts.enrol(token, text, peer)
+            return await hosts.itself.enrol(token, text, peer)
         case admin.HostRenewItself(name, text, proof, peer):
-            return await hosts.renew_itself(name, text, proof, peer)
+            return await hosts.itself.renew(name, text, proof, peer)
         case admin.HostRenewed(name, peer):
-            return await hosts.renewed(name, peer)
+            return await hosts.itself.renewed(name, peer)
 
 
 _Change = (
@@ -63,6 +63,6 @@ async def _change(hosts: Hosts, request: _Change, who: str) -> dict[str, Any]:
         case admin.HostRevoke(name, expected):
             return await hosts.revoke(name, who, expected)
         case admin.HostPorts(name, state, opened, checked, expected):
-            return await hosts.tell_ports(name, state, opened, checked=checked, who=who, expected=expected)
+            return await hosts.ports.tell(name, state, opened, checked=checked, who=who, expected=expected)
         case admin.HostsReload(expected):
             return await hosts.reload(who, expected)

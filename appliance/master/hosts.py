@@ -1,85 +1,54 @@
-"""The hosts that come through tunnels: enrolled, renewed, revoked here.
+"""The hosts that come through tunnels, as operators deal with them: enrolled, awaited, given kits, revoked.
 
 Invariants:
 
 1. `addresses` (what `host:NAME` means in the policy) is empty until the supervisor has said that these addresses
    are taken through IPsec only: where clear text is not kept out, they stand for nobody.
-2. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited. Whatever is
-   under way for its name (an enrolment, a renewal) is refused when it comes to its end.
-3. Who renews himself is at the virtual address of the name he says, and has its present key.
-4. No answer but the one to `token` has a token in it, and no answer has a private key.
+2. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
+3. No answer but the one to `token` has a token in it, and no answer has a private key.
 """
 
-import asyncio
-import contextlib
-import hashlib
 import ipaddress
-import ssl
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.channel.messages import CertificateMade
-from appliance.master.authority import Authority, AuthorityError
-from appliance.master.awaited import LONGEST_SECONDS, MOST, Awaited, BadEnrolmentTokenError
+from appliance.master.awaited import LONGEST_SECONDS, MOST
+from appliance.master.certification import Certification, fingerprint
+from appliance.master.checked_ports import CheckedPorts
 from appliance.master.declared import DeclaredHostsError
-from appliance.master.host_table import HostForbiddenError, HostRefusedError, HostTable
-from appliance.master.host_view import HostView, soon
-from appliance.master.recorder import Recorder
-from appliance.master.rest_place import RestPlace
-from appliance.master.tunnels import Tunnels
+from appliance.master.host_table import HostRefusedError
+from appliance.master.host_view import HostView
+from appliance.master.self_service import SelfService
 from appliance.policy.model import Address
-from appliance.store.hosts import AwaitedRow, HostRow, PortsRow
-from appliance.store.state import StateStore
+from appliance.store.hosts import AwaitedRow
 
 _log = structlog.get_logger()
-_ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
-_SERVED_SECONDS = 10.0
-_RENEWALS_SECONDS = 3600.0
-_CLOCKS_DIFFER = 86_400.0
 
 
 class Hosts:
-    """All hosts.
+    """All hosts; `itself` is what they do themselves.
 
     `changed()` is called when `addresses` has changed, `expel(address, reason)` takes back what a host has; both
-    say how much that was. `machines()` is the number of nodes by address.
+    say how much that was.
     """
 
-    def __init__(
-        self,
-        store: StateStore,
-        recorder: Recorder,
-        authority: Authority,
-        table: HostTable,
-        tunnels: Tunnels,
-        *,
-        master_port: int,
-        rest: RestPlace,
-    ) -> None:
-        self._store = store
-        self._recorder = recorder
-        self._authority = authority
-        self._table = table
-        self._tunnels = tunnels
-        self._master_port = master_port
-        self._rest = rest
-        self._awaited = Awaited(store.hosts)
-        self._view = HostView(table, self._awaited, tunnels)
-        self._changing = asyncio.Lock()
-        self._revocations: Counter[str] = Counter()  # of each name, in this life
-        self._renewals: dict[str, float] = {}
-        self._warned: set[str] = set()  # serials
-        self._pin = ""
-        self._served = asyncio.Event()
+    def __init__(self, certification: Certification) -> None:
+        self._certification = certification
+        self._store = certification.store
+        self._recorder = certification.recorder
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._awaited = certification.awaited
+        self._view = HostView(self._table, self._awaited, self._tunnels)
+        self.itself = SelfService(certification)
+        self.revocations = certification.revocations
+        self.ports = CheckedPorts(certification, self._view)
         self.changed: Callable[[], int] = lambda: 0
         self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
-        self.machines: Callable[[], dict[str, int]] = dict
-        tunnels.each_hour = self._each_hour
+        certification.changed = lambda: self.changed()  # noqa: PLW0108  it is set later
 
     # --- what others ask ---
 
@@ -92,7 +61,7 @@ class Hosts:
 
     def overview(self) -> dict[str, Any]:
         """Every host and machine, and how the tunnels stand."""
-        machines = self._machines()
+        machines = self.ports.in_clear_text()
         status = self._view.status(machines)
         return {
             "revision": self._table.revision,
@@ -103,16 +72,11 @@ class Hosts:
 
     def status(self) -> dict[str, Any]:
         """For `rosrv status`."""
-        return self._view.status(self._machines())
+        return self._view.status(self.ports.in_clear_text())
 
     def rows(self) -> list[dict[str, Any]]:
         """Every host, enrolled, awaited or declared."""
         return self._view.rows()
-
-    def served_by(self, pin: str) -> None:
-        """The api says by what hosts recognise it."""
-        self._pin = pin
-        self._served.set()
 
     async def start(self) -> None:
         """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
@@ -136,30 +100,30 @@ class Hosts:
         expected: int | None = None,
     ) -> dict[str, Any]:
         """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
-        async with self._changing:
+        async with self._certification.changing:
             self._table.require(expected)
             self._require_not_enrolled(name)
             self._table.require_name(name)
             wanted = self._table.address_for(name, address, self._awaited.addresses())
             await self._tunnels.open()
-            with self._unless_revoked(name):
-                made = await self._issue(name, request, days)
-            self._enrolled(name, wanted, made, who)
-            return await self._finish(name)
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(name, request, days)
+            self._certification.enrolled(name, wanted, made, who)
+            return await self._certification.finish(name)
 
     async def renew(
         self, name: str, request: str, *, days: float, who: str, expected: int | None = None
     ) -> dict[str, Any]:
         """A new certificate for a host, the one before revoked. Raises as `add`."""
-        async with self._changing:
+        async with self._certification.changing:
             self._table.require(expected)
             row = self._table.enrolled_row(name)
             await self._tunnels.open()
-            with self._unless_revoked(name):
-                made = await self._issue(name, request, days)
-            self._keep(name, row.address, made)
-            self._renewed(name, row.serial, made.serial, made.expires, who)
-            return await self._finish(name)
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(name, request, days)
+            self._certification.keep(name, row.address, made)
+            self._certification.renewed(name, row.serial, made.serial, made.expires, who)
+            return await self._certification.finish(name)
 
     async def token(
         self,
@@ -174,7 +138,7 @@ class Hosts:
         expected: int | None = None,
     ) -> dict[str, Any]:
         """A one-time token for a host. Raises as `add`."""
-        async with self._changing:
+        async with self._certification.changing:
             self._table.require(expected)
             self._table.require_name(name)
             if new:
@@ -183,15 +147,15 @@ class Hosts:
                 raise HostRefusedError(
                     f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
                 )
-            if self._rest.port is None:
-                raise HostRefusedError(self._rest.trouble)
-            if not await self._until_served():
+            if self._certification.rest.port is None:
+                raise HostRefusedError(self._certification.rest.trouble)
+            if not await self._certification.until_served():
                 raise HostRefusedError("REST is not there: `rosrv status` and the log say why", ours=True)
             if len(self._awaited.rows()) >= MOST:
                 raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
             promised = self._table.address_for(name, address, self._awaited.addresses())
             await self._tunnels.open()
-            authority = await self._certificate_of_authority()
+            authority = await self._certification.authority_certificate()
             row, text = self._awaited.add(
                 name, seconds=seconds, address=promised, days=days, kit=kit, who=who
             )
@@ -208,19 +172,19 @@ class Hosts:
             )
             await self._store.settled()
             return {
-                **self._places(),
+                **self._certification.places(),
                 "revision": self._table.revision,
                 "name": name,
                 "address": promised,
                 "token": text,
                 "token_expires": row.expires,
-                "authority_fingerprint": _fingerprint(authority),
+                "authority_fingerprint": fingerprint(authority),
             }
 
     async def revoke(self, name: str, who: str, expected: int | None = None) -> dict[str, Any]:
         """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
         self._table.require(expected)
-        self._revocations[name] += 1
+        self._certification.revoked(name)
         awaited = self._awaited.rows().get(name)
         self._awaited.forget(name)
         if awaited is not None and (
@@ -290,110 +254,7 @@ class Hosts:
     async def kit(self, name: str) -> dict[str, Any]:
         """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
         self._table.enrolled_row(name)
-        return await self._kit(name, None)
-
-    async def tell_ports(
-        self,
-        name: str,
-        state: str,
-        opened: list[int],
-        *,
-        checked: float,
-        who: str,
-        expected: int | None = None,
-    ) -> dict[str, Any]:
-        """What somebody saw of a machine's ports from outside. Raises as `add`."""
-        self._table.require(expected)
-        key = self._known_machine(name)
-        now = time.time()
-        if checked > now + _CLOCKS_DIFFER:
-            raise HostRefusedError("the moment of the check is more than a day ahead")
-        row = PortsRow(key, state, sorted(set(opened))[:100], min(checked, now), who)
-        self._table.keep_ports(row)
-        self._recorder.happened(
-            "ports checked",
-            f"the ROS ports of {key} are {state}" + (f": {row.open}" if row.open else ""),
-            severity=Severity.WARNING if state == "open" else Severity.NOTICE,
-            name=key,
-            state=state,
-            open=row.open,
-            checked=row.checked,
-            who=who,
-        )
-        await self._store.settled()
-        return {"revision": self._table.revision, "name": key, "ports": self._view.ports(key)}
-
-    async def revocations(self) -> dict[str, Any]:
-        """The authority's certificate and its list of revoked certificates, in PEM."""
-        try:
-            authority = await self._authority.certificate()
-            listed = await self._authority.revocations(list(self._table.revoked))
-        except AuthorityError as error:
-            raise HostRefusedError(str(error), ours=True) from error
-        return {"authority": authority.decode(), "revocations": listed.decode()}
-
-    # --- what hosts do ---
-
-    async def enrol(self, token: str, request: str, peer: str) -> dict[str, Any]:
-        """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
-        async with self._changing:
-            try:
-                awaited = self._awaited.take(token)
-            except BadEnrolmentTokenError as error:
-                self._recorder.happened(
-                    "enrolment refused", str(error), severity=Severity.WARNING, decision="deny", host=peer
-                )
-                raise HostForbiddenError(str(error)) from error
-            name = awaited.name
-            try:
-                await self._tunnels.open()
-                with self._unless_revoked(name):
-                    made = await self._issue(name, request, awaited.days)
-            except HostForbiddenError:
-                raise
-            except HostRefusedError:
-                self._awaited.give_back(awaited)
-                raise
-            self._enrolled(name, awaited.address, made, awaited.who, token=awaited.id, peer=peer)
-            return {**await self._finish(name), "kit": awaited.kit}
-
-    async def renew_itself(self, name: str, request: str, proof: bytes, peer: str) -> dict[str, Any]:
-        """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
-        async with self._changing:
-            row = self._in_its_tunnel(name, peer)
-            certificate = self._table.certificates.get(name)
-            if certificate is None or not certificate.certificate:
-                raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
-            life = row.expires - certificate.made
-            self._require_patience(name, life)
-            with self._unless_revoked(name):
-                made = await self._issue(
-                    name, request, life / 86_400, proof=proof, former=certificate.certificate.encode()
-                )
-            self._table.keep_next(name, made)
-            self._renewals[name] = time.monotonic()
-            await self._store.settled()
-            authority = await self._certificate_of_authority()
-            return {
-                "name": name,
-                "serial": made.serial,
-                "expires": made.expires,
-                "certificate": made.certificate.decode(),
-                "authority": authority.decode(),
-            }
-
-    async def renewed(self, name: str, peer: str) -> dict[str, Any]:
-        """A host has put its next certificate in place. Raises `HostRefusedError`."""
-        before = self._in_its_tunnel(name, peer).serial
-        row = self._table.take_next(name)
-        if row is None:
-            raise HostRefusedError(f"{name} was given no certificate that is to follow: renew first")
-        self._renewed(name, before, row.serial, row.expires, name)
-        await self._store.settled()
-        asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
-        return {"name": name}
-
-    # --- inside ---
+        return await self._certification.kit(name, None)
 
     def _require_not_enrolled(self, name: str) -> None:
         row = self._table.rows.get(name)
@@ -401,70 +262,6 @@ class Hosts:
             raise HostRefusedError(
                 f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
             )
-
-    def _in_its_tunnel(self, name: str, peer: str) -> HostRow:
-        address = ipaddress.ip_address(peer)
-        mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
-        row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
-        if row is None or row.name != name or not self._table.declared.wants(name):
-            self._recorder.happened(
-                "renewal refused",
-                f"not in the tunnel of {name[:80]}",
-                severity=Severity.WARNING,
-                decision="deny",
-                host=peer,
-            )
-            raise HostForbiddenError(f"{peer} is not the address of {name} in its tunnel")
-        return row
-
-    def _require_patience(self, name: str, life: float) -> None:
-        wait = min(_RENEWALS_SECONDS, life / 10)
-        since = time.monotonic() - self._renewals.get(name, -wait)
-        if since < wait:
-            raise HostRefusedError(f"{name} renewed {since:.0f} s ago: again in {wait - since:.0f} s")
-
-    @contextlib.contextmanager
-    def _unless_revoked(self, name: str) -> Iterator[None]:
-        """What a block awaits comes to nothing when the name is revoked meanwhile."""
-        before = self._revocations[name]
-        yield
-        if self._revocations[name] != before:
-            raise HostForbiddenError(f"{name} was revoked meanwhile")
-
-    async def _issue(
-        self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
-    ) -> CertificateMade:
-        try:
-            return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
-        except AuthorityError as error:
-            raise HostRefusedError(str(error), ours=not error.refused) from error
-
-    def _enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        self._awaited.forget(name)
-        self._keep(name, address, made)
-        self._recorder.happened(
-            "host enrolled",
-            f"{name} may come through its tunnel as {address}",
-            severity=Severity.NOTICE,
-            name=name,
-            address=address,
-            serial=made.serial,
-            expires=made.expires,
-            who=who,
-            **more,
-        )
-
-    def _renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
-        self._recorder.happened(
-            "host renewed",
-            f"{name} has a new certificate; its tunnel comes back with it",
-            severity=Severity.NOTICE,
-            name=name,
-            serial=serial,
-            replaced=before,
-            expires=expires,
-            who=who,
-        )
 
     async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> dict[str, Any]:
         self._table.changed()
@@ -485,105 +282,5 @@ class Hosts:
             "taken_back": 0,
         }
 
-    def _keep(self, name: str, address: str, made: CertificateMade) -> None:
-        self._table.keep(name, address, made)
-        self._tunnels.state_anew()
-        self.changed()
-
-    async def _finish(self, name: str) -> dict[str, Any]:
-        await self._store.settled()
-        taken = await self._tunnels.until_taken()
-        return await self._kit(
-            name, None if taken else "charon does not know it yet; `rosrv status` and the log say why"
-        )
-
-    async def _kit(self, name: str, warning: str | None) -> dict[str, Any]:
-        if self._rest.inner_port is not None and not await self._until_served():
-            warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
-        authority = await self._certificate_of_authority()
-        row, certificate = self._table.rows[name], self._table.certificates.get(name)
-        if certificate is None or not certificate.certificate:
-            raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
-        return {
-            **self._places(),
-            "revision": self._table.revision,
-            "name": name,
-            "address": row.address,
-            "warning": warning,
-            "serial": row.serial,
-            "expires": row.expires,
-            "certificate": certificate.certificate,
-            "authority": authority.decode(),
-            "authority_fingerprint": _fingerprint(authority),
-        }
-
-    async def _until_served(self) -> bool:
-        """Wait until the api, which starts after control, is there; False when it does not come in time."""
-        try:
-            await asyncio.wait_for(self._served.wait(), _SERVED_SECONDS)
-        except TimeoutError:
-            return False
-        return True
-
-    def _places(self) -> dict[str, Any]:
-        own, rest = self._table.own_address, self._rest
-        return {
-            "appliance": own,
-            "master": f"http://{own}:{self._master_port}",
-            "rest_port": rest.port,
-            "rest_trouble": rest.trouble,
-            "rest_url": f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
-            "pin": self._pin,
-        }
-
-    async def _certificate_of_authority(self) -> bytes:
-        try:
-            return await self._authority.certificate()
-        except AuthorityError as error:
-            raise HostRefusedError(str(error), ours=True) from error
-
-    def _known_machine(self, name: str) -> str:
-        if name in self._table.rows or name in self._table.declared.hosts:
-            return name
-        try:
-            address = str(ipaddress.ip_address(name))
-        except ValueError:
-            self._table.enrolled_row(name)  # says which there are
-            raise
-        behind = [one.name for one in self._tunnels.seen.values() if one.remote == address]
-        row = self._table.at(address)
-        return row.name if row is not None else behind[0] if len(behind) == 1 else address
-
-    def _machines(self) -> dict[str, int]:
-        pool = self._table.pool
-        return {
-            address: nodes
-            for address, nodes in self.machines().items()
-            if not (one := ipaddress.ip_address(address)).is_loopback and one not in pool
-        }
-
-    def _each_hour(self) -> None:
-        """Certificates that follow ended ones count; those that end soon are recorded, once each."""
-        now = time.time()
-        for row in self._table.enrolled():
-            if row.expires <= now:
-                self._table.take_next(row.name)
-        for row in self._table.enrolled():
-            if soon(self._table, row, now) and row.serial not in self._warned:
-                self._warned.add(row.serial)
-                self._recorder.happened(
-                    "certificate ends soon" if row.expires > now else "certificate ended",
-                    f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
-                    severity=Severity.WARNING,
-                    name=row.name,
-                    serial=row.serial,
-                    expires=row.expires,
-                )
-
 
 _OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")
-
-
-def _fingerprint(certificate: bytes) -> str:
-    """SHA-256 of a certificate (PEM), in hexadecimal."""
-    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()

@@ -24,6 +24,7 @@ from appliance.master.allocation import TOPIC, Allocation
 from appliance.master.assembly import INNER, RVMASTER, Foundation, Parts, assemble
 from appliance.master.authority import Authority
 from appliance.master.calls import MASTER_CALLS
+from appliance.master.certification import Certification
 from appliance.master.declared import Declared
 from appliance.master.doors import Doors
 from appliance.master.forwarded import Forwarded
@@ -149,7 +150,7 @@ class _Control:
         table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
         listen = self._settings.listen_address
         self._tunnels = Tunnels(table, recorder, self._authority, listen=listen, say=self._lifeline.say)
-        hosts = Hosts(
+        certification = Certification(
             store,
             recorder,
             self._authority,
@@ -158,6 +159,8 @@ class _Control:
             master_port=listen[1],
             rest=rest_place(self._settings),
         )
+        self._served = certification.served_by
+        hosts = Hosts(certification)
         self._lifeline.tunnels_enclosed = self._tunnels.answered
         await hosts.start()
         return hosts
@@ -202,7 +205,7 @@ class _Control:
             forwarded=self._forwarded.status,
         )
         self._rest = RestLink(administration, self._tokens, base.recorder)
-        self._rest.served = base.hosts.served_by
+        self._rest.served = self._served
         if _ADMIN in sockets:
             self._admin = AdminServer(administration)
             await self._admin.start(sockets[_ADMIN].dup())

@@ -17,6 +17,7 @@ from appliance.ipsec import authority as ipsec
 from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.master.authority import Authority, AuthorityError
+from appliance.master.certification import Certification
 from appliance.master.declared import Declared
 from appliance.master.host_table import (
     HostForbiddenError,
@@ -79,7 +80,7 @@ class Bench:
         recorder.happened = noted  # type: ignore[method-assign]  # beside what it does
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
         self.tunnels = Tunnels(self.table, recorder, self.authority, listen=(listen, 11311), say=self._said)
-        self.hosts = Hosts(
+        certification = Certification(
             self.store,
             recorder,
             self.authority,
@@ -88,7 +89,8 @@ class Bench:
             master_port=11311,
             rest=RestPlace(8443, "", 8443),
         )
-        self.hosts.served_by("sha256//pin")
+        certification.served_by("sha256//pin")
+        self.hosts = Hosts(certification)
         self.hosts.changed = self._changed
         self.hosts.expel = self._expel
 
@@ -302,13 +304,13 @@ def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
         second = await token(bench, "a")
         for text in (first["token"], "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
             with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
-                await bench.hosts.enrol(text, request_of("a"), "10.9.9.9")
+                await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
         assert bench.hosts.rows()[0]["state"] == "awaited"
-        body = await bench.hosts.enrol(second["token"], request_of("a"), "10.9.9.9")
+        body = await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
         assert body["address"] == second["address"]
         assert body["kit"]["endpoint"] == "10.0.0.1"
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.enrol(second["token"], request_of("a"), "10.9.9.9")
+            await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
         secret = second["token"].rpartition("_")[2].encode()
         for file in tmp_path.rglob("*"):
             if file.is_file():
@@ -323,8 +325,8 @@ def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> No
     async def work(bench: Bench) -> None:
         text = (await token(bench, "a"))["token"]
         both = await asyncio.gather(
-            bench.hosts.enrol(text, request_of("a"), "10.9.9.8"),
-            bench.hosts.enrol(text, request_of("a"), "10.9.9.9"),
+            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.8"),
+            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9"),
             return_exceptions=True,
         )
         assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
@@ -338,16 +340,16 @@ def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         text = (await token(bench, "a"))["token"]
         with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.enrol(text, "rubbish", "10.9.9.9")
-        await bench.hosts.enrol(text, request_of("a"), "10.9.9.9")
+            await bench.hosts.itself.enrol(text, "rubbish", "10.9.9.9")
+        await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
         short = (await token(bench, "b", seconds=0.05))["token"]
         await asyncio.sleep(0.06)
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.enrol(short, request_of("b"), "10.9.9.9")
+            await bench.hosts.itself.enrol(short, request_of("b"), "10.9.9.9")
         taken_back = (await token(bench, "c"))["token"]
         assert (await bench.hosts.revoke("c", "tester"))["serial"] == ""
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.enrol(taken_back, request_of("c"), "10.9.9.9")
+            await bench.hosts.itself.enrol(taken_back, request_of("c"), "10.9.9.9")
 
     run(tmp_path, work)
 
@@ -360,7 +362,7 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
         texts.append((await token(bench, "a"))["token"])
 
     async def after(bench: Bench) -> None:
-        assert (await bench.hosts.enrol(texts[0], request_of("a"), "10.9.9.9"))["name"] == "a"
+        assert (await bench.hosts.itself.enrol(texts[0], request_of("a"), "10.9.9.9"))["name"] == "a"
 
     run(tmp_path, before)
     run(tmp_path, after)
@@ -386,9 +388,9 @@ def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
             if how == "kit":
                 await bench.hosts.renew("a", request, days=90, who="tester")
             elif how == "token":
-                await bench.hosts.enrol(text, request, "10.9.9.9")
+                await bench.hosts.itself.enrol(text, request, "10.9.9.9")
             else:
-                await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+                await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
         await asyncio.gather(*tasks)
         assert bench.hosts.rows()[0]["state"] == "revoked"
         assert bench.hosts.addresses == {}
@@ -403,17 +405,17 @@ def test_a_host_renews_itself(tmp_path: Path) -> None:
         key = make_key()
         first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
         request = request_of("a")
-        made = await bench.hosts.renew_itself("a", request, sign(key, request), "::ffff:10.113.11.2")
+        made = await bench.hosts.itself.renew("a", request, sign(key, request), "::ffff:10.113.11.2")
         assert made["serial"] != first["serial"]
         assert bench.hosts.rows()[0]["renewing"]
         assert bench.store.hosts.revoked() == []
-        await bench.hosts.renewed("a", "10.113.11.2")
+        await bench.hosts.itself.renewed("a", "10.113.11.2")
         assert [serial for serial, _moment in bench.store.hosts.revoked()] == [first["serial"]]
         assert bench.hosts.rows()[0]["serial"] == made["serial"]
         with pytest.raises(HostRefusedError, match="renew first"):
-            await bench.hosts.renewed("a", "10.113.11.2")
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
         with pytest.raises(HostRefusedError, match="again in"):
-            await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+            await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
 
     run(tmp_path, work)
 
@@ -434,15 +436,15 @@ def test_nobody_renews_for_another(tmp_path: Path) -> None:
             ("b", "10.113.11.2"),
         ):
             with pytest.raises(HostForbiddenError):
-                await bench.hosts.renew_itself(name, request, good, peer)
+                await bench.hosts.itself.renew(name, request, good, peer)
             with pytest.raises(HostForbiddenError):
-                await bench.hosts.renewed(name, peer)
+                await bench.hosts.itself.renewed(name, peer)
         with pytest.raises(HostRefusedError, match="not signed by the key"):
-            await bench.hosts.renew_itself("a", request, sign(other, request), "10.113.11.2")
+            await bench.hosts.itself.renew("a", request, sign(other, request), "10.113.11.2")
         assert len(recorded(bench, "renewal refused")) == 8
         bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.renew_itself("a", request, good, "10.113.11.2")
+            await bench.hosts.itself.renew("a", request, good, "10.113.11.2")
 
     run(tmp_path, work)
 
@@ -454,14 +456,14 @@ def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> No
         key = make_key()
         first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
         request = request_of("a")
-        made = await bench.hosts.renew_itself("a", request, sign(key, request), "10.113.11.2")
+        made = await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
         await bench.hosts.revoke("a", "tester")
         assert {serial for serial, _moment in bench.store.hosts.revoked()} == {
             first["serial"],
             made["serial"],
         }
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.renewed("a", "10.113.11.2")
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
         again = await add(bench, "a")
         assert again["address"] == first["address"]
         assert again["serial"] not in {first["serial"], made["serial"]}
@@ -478,7 +480,7 @@ def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
         for late in (
             bench.hosts.revoke("a", "tester", seen),
             bench.hosts.renew("a", request_of("a"), days=90, who="tester", expected=seen),
-            bench.hosts.tell_ports("a", "closed", [], checked=1.0, who="tester", expected=seen),
+            bench.hosts.ports.tell("a", "closed", [], checked=1.0, who="tester", expected=seen),
             bench.hosts.reload("tester", seen),
         ):
             with pytest.raises(HostsChangedError):
@@ -576,15 +578,15 @@ def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         await add(bench, "a")
-        bench.hosts.machines = lambda: {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
-        assert (await bench.hosts.tell_ports("10.113.11.2", "open", [40001], checked=5.0, who="eve"))[
+        bench.hosts.ports.machines = lambda: {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
+        assert (await bench.hosts.ports.tell("10.113.11.2", "open", [40001], checked=5.0, who="eve"))[
             "name"
         ] == "a"
-        await bench.hosts.tell_ports("10.0.0.7", "closed", [], checked=6.0, who="eve")
+        await bench.hosts.ports.tell("10.0.0.7", "closed", [], checked=6.0, who="eve")
         with pytest.raises(HostRefusedError, match="enrolled are: a"):
-            await bench.hosts.tell_ports("nobody", "open", [], checked=5.0, who="eve")
+            await bench.hosts.ports.tell("nobody", "open", [], checked=5.0, who="eve")
         with pytest.raises(HostRefusedError, match="a day ahead"):
-            await bench.hosts.tell_ports("a", "closed", [], checked=4e9, who="eve")
+            await bench.hosts.ports.tell("a", "closed", [], checked=4e9, who="eve")
         overview = bench.hosts.overview()
         assert overview["hosts"][0]["ports"] == {
             "state": "open",
