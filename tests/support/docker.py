@@ -207,13 +207,15 @@ class Compose:
 
     def container(self, service: str) -> str:
         """The id of a service's container."""
-        found = self("ps", "--quiet", service).stdout.split()
+        labels = (f"com.docker.compose.project={self.project}", f"com.docker.compose.service={service}")
+        filters = [part for label in labels for part in ("--filter", f"label={label}")]
+        found = self.engine.docker("ps", "--all", "--quiet", "--no-trunc", *filters).stdout.split()
         assert len(found) == 1, f"{service} has {len(found)} containers\n{self.story()}"
         return found[0]
 
     def exec(self, service: str, *command: str, check: bool = True, timeout: float = 60) -> Output:
-        """Run a command in a service's container, as `docker compose exec` does."""
-        return self("exec", "-T", service, *command, check=check, timeout=timeout)
+        """Run a command in a service's container."""
+        return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
         """Until the service's health check has passed."""
