@@ -112,6 +112,8 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
             lines += (
                 f"\nNodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}"
             )
+        if settings.monitors is not None:
+            lines += f"\nMonitors: {settings.monitors} (rosrv monitor list)"
         if rest is not None:
             lines += f"\nREST: {rest}"
         if said.token is not None:
