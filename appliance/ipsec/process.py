@@ -18,6 +18,7 @@ import os
 import socket
 import sys
 import time
+from collections import Counter
 from collections.abc import Awaitable
 from pathlib import Path
 from typing import Any
@@ -47,12 +48,13 @@ from appliance.channel.messages import (
 from appliance.ipsec.charon import PROGRAM, CharonError, Material, Vici
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 from appliance.ipsec.leftovers import clear_leftovers
-from appliance.ipsec.refusals import Refusals
+from appliance.ipsec.refusals import Refusal, Refusals
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.ipsec.strongswan import Tunnel, configuration
 
 KEY_FILE = "appliance.key"
 REFUSALS_PER_SECOND = 20
+REFUSED_SOURCES = 20  # of packets, in one report
 REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
@@ -76,6 +78,7 @@ class TunnelProcess:
         self._vici: Vici | None = None
         self._version = ""
         self._refusals = Refusals()
+        self._packets: Counter[Refusal] = Counter()  # that ESP dropped since the last report
         self._second = (0, 0)  # of the last refusals, and how many they were
         self._tasks: set[asyncio.Future[Any]] = set()
         self.failed = False
@@ -201,10 +204,21 @@ class TunnelProcess:
         async for raw in charon.stderr:
             last = raw.decode("utf-8", "replace").rstrip() or last
             refusal = self._refusals.read(last)
-            if refusal is not None and self._may_tell():
+            if refusal is not None and refusal.packet:
+                self._count_packet(refusal)
+            elif refusal is not None and self._may_tell():
                 self._tell(TunnelRefused(refusal.remote, refusal.reason))
         status = await charon.wait()
         raise CharonError(f"charon ended (status {status}), last it said: {last}")
+
+    def _count_packet(self, refusal: Refusal) -> None:
+        if refusal in self._packets or len(self._packets) < REFUSED_SOURCES:
+            self._packets[refusal] += 1
+
+    def _tell_packets(self) -> None:
+        for refusal, count in self._packets.items():
+            self._tell(TunnelRefused(refusal.remote, refusal.reason, count))
+        self._packets.clear()
 
     def _may_tell(self) -> bool:
         second, count = int(time.monotonic()), self._second[1]
@@ -214,6 +228,7 @@ class TunnelProcess:
     async def _report(self) -> None:
         while True:
             await asyncio.sleep(REPORT_SECONDS)
+            self._tell_packets()
             if self._vici is not None and not self._changed.is_set():
                 await self._say_how_it_stands(self._vici)
 

@@ -1,7 +1,8 @@
 """From charon's log: whom it refused, and why. No I/O.
 
 charon tells of tunnels that stand in events, of those that it refused only in its log. A worker thread handles one
-packet from its arrival to its answer, so the lines of one thread between the two belong together.
+packet from its arrival to its answer, so the lines of one thread between the two belong together. Packets of tunnels
+are in the log, too, where ESP runs in charon: those sent again, and those under an address that the tunnel is not for.
 """
 
 import re
@@ -11,6 +12,10 @@ _LINE = re.compile(r"(\d\d)\[[A-Z]{3}\] (.*)")
 _ARRIVED = re.compile(r"received packet: from (\S+)\[\d+\] to ")
 _REFUSED = re.compile(
     r"generating IKE_\S+ response \d+ \[ (?:.* )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
+)
+_SENT_AGAIN = re.compile(r"  src (\S+), dst \S+, SPI [0-9a-f]{8}")
+_UNDER_ANOTHERS = re.compile(
+    r"discarding inbound IP packet ([0-9a-fA-F.:]+)(?:\[\d+\])? == \S+ .*due to policy"
 )
 _REASONS = (
     "revoked",
@@ -38,10 +43,11 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A host that was refused: its real address, and charon's reasons."""
+    """A host that was refused: its address, and charon's reasons. `packet`: a packet of a tunnel, not a request."""
 
     remote: str
     reason: str
+    packet: bool = False
 
 
 @dataclass
@@ -62,6 +68,8 @@ class Refusals:
         if found is None:
             return None
         thread, text = found[1], found[2]
+        if line[2:7] == "[ESP]":
+            return _packet(text)
         arrived = _ARRIVED.match(text)
         if arrived is not None:
             self._packets[thread] = _Packet(arrived[1])
@@ -77,3 +85,16 @@ class Refusals:
         del self._packets[thread]
         reasons = "; ".join([_WORDS[refused[1]], *packet.reasons])
         return Refusal(packet.remote, reasons[:_LONGEST])
+
+
+def _packet(text: str) -> Refusal | None:
+    """A packet that ESP dropped, by the line that has its addresses."""
+    again = _SENT_AGAIN.match(text)
+    if again is not None:
+        return Refusal(again[1], "a packet of a tunnel was sent again", packet=True)
+    anothers = _UNDER_ANOTHERS.match(text)
+    if anothers is not None:
+        return Refusal(
+            anothers[1], "a packet under this address came through a tunnel that is not for it", packet=True
+        )
+    return None

@@ -5,7 +5,7 @@ Invariants:
 1. `open` first has the supervisor take the pool's addresses through IPsec only; before that, `enclosed` is False
    and no address of a host counts.
 2. What charon is to have is stated whole each time, in the order in which it came about.
-3. Every tunnel that comes up, moves, goes down or is refused is recorded.
+3. Every tunnel that comes up, moves, goes down or is refused is recorded; packets that charon dropped are counted.
 4. A certificate's end is the end of its tunnel.
 """
 
@@ -198,6 +198,15 @@ class Tunnels:
                 self.charon = message
             case TunnelChanged(name, up, remote):
                 self._changed(name, up, remote)
+            case TunnelRefused(remote, reason, packets) if packets:
+                self._recorder.happened(
+                    "packets refused",
+                    reason,
+                    severity=Severity.WARNING,
+                    decision="deny",
+                    host=remote,
+                    packets=packets,
+                )
             case TunnelRefused(remote, reason):
                 self._recorder.happened(
                     "tunnel refused", reason, severity=Severity.WARNING, decision="deny", host=remote

@@ -68,10 +68,14 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """Somebody at this real address asked for a tunnel and was refused."""
+    """Somebody at this real address asked for a tunnel and was refused; with `packets`, that many packets were.
+
+    What a packet of a tunnel claims to come from is no more than a claim.
+    """
 
     remote: str
     reason: str
+    packets: int = 0
 
 
 class TunnelSeen(msgspec.Struct, frozen=True):

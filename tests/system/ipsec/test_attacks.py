@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
 from appliance.network.lab import INTERFACE, Host, Lab
 from tests.support.esp_packets import initiators_keys
@@ -103,6 +104,11 @@ def lab_host(site: TunnelSite) -> Host:
     return site.appliance.host
 
 
+def esp_is_charons(site: TunnelSite) -> bool:
+    """Whether ESP runs in user space, where charon sees what is dropped."""
+    return USER_SPACE_INTERFACE in links.links(lab_host(site).namespace)
+
+
 @contextlib.contextmanager
 def deaf(host: Host) -> Iterator[None]:
     """Nothing of ESP in UDP reaches the host's programs; what arrives is seen on the wire all the same."""
@@ -120,7 +126,9 @@ def _nft(host: Host, command: str) -> None:
 
 
 def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Datagrams) -> None:
-    """A packet of a tunnel that is sent again, or changed, from anywhere, does not arrive a second time."""
+    """A packet of a tunnel that is sent again, or changed, from anywhere, does not arrive a second time; the log
+    has how many were sent again, where charon sees them."""
+    before = site.mark
     with site.joined(kit) as joined, Capture(lab_host(site).namespace) as wire:
         send(joined, datagrams.port, b"first")
         assert datagrams.next() == (b"first", joined.address)
@@ -142,6 +150,8 @@ def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Da
         assert datagrams.next() == (b"third", joined.address)
         send(joined, datagrams.port, b"fourth")
         assert datagrams.next() == (b"fourth", joined.address)
+        if esp_is_charons(site):
+            assert site.recorded(before, event="packets refused", host=OCU)["detail"]["packets"] > 0
 
 
 def test_the_wire_shows_ike_and_esp_only(site: TunnelSite, kit: Path) -> None:
@@ -171,6 +181,7 @@ def test_a_host_in_a_tunnel_cannot_send_as_another(
     with site.joined(kit) as trusted, site.joined(others_kit, other, log="chd = 4") as dishonest:
         assert dishonest.charon is not None
         keys = initiators_keys(dishonest.charon)
+        mark = site.mark
 
         def forge(number: int, source: str, data: bytes) -> None:
             inner = udp_packet((source, 4000), (OWN, datagrams.port), data)
@@ -186,6 +197,8 @@ def test_a_host_in_a_tunnel_cannot_send_as_another(
         assert datagrams.next() == (b"as myself again", dishonest.address)
         send(trusted, datagrams.port, b"the real one")
         assert datagrams.next() == (b"the real one", trusted.address)
+        if esp_is_charons(site):
+            assert site.recorded(mark, event="packets refused", host=trusted.address)["decision"] == "deny"
 
 
 def test_a_host_cannot_ask_for_anothers_address(

@@ -50,3 +50,21 @@ def test_a_name_chosen_by_a_stranger_makes_no_long_reason() -> None:
 def test_what_is_no_line_of_the_log_is_passed_over() -> None:
     """Rubbish and lines of threads that have no packet are nothing."""
     assert refusals("\n\nrubbish\n09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]\n") == []
+
+
+def test_packets_that_esp_dropped() -> None:
+    """A packet that was sent again, and one under an address that its tunnel is not for; each by its address."""
+    found = refusals("""\
+16[ESP] ESP sequence number verification failed:
+16[ESP]   src 10.88.0.20, dst 10.88.0.2, SPI 7ce6406b [seq 2]
+16[ESP] ESP decryption or ICV verification failed
+16[ESP] discarding inbound IP packet 10.113.11.2[4000] == 10.113.11.1[49312] [17] due to policy
+16[ESP] discarding inbound IP packet 10.113.11.3 == 10.113.11.1 [1] due to policy
+""")
+    assert [(one.remote, one.packet) for one in found] == [
+        ("10.88.0.20", True),
+        ("10.113.11.2", True),
+        ("10.113.11.3", True),
+    ]
+    assert "sent again" in found[0].reason
+    assert "not for it" in found[1].reason
