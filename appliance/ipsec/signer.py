@@ -25,7 +25,8 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.channel import Channel
+from appliance.channel.child import Child
 from appliance.channel.messages import (
     AuthorityStated,
     AuthorityWanted,
@@ -34,10 +35,7 @@ from appliance.channel.messages import (
     CertificateWanted,
     Failed,
     Lifeline,
-    LinkOpened,
     Message,
-    Ping,
-    Pong,
     Ready,
     RevocationsMade,
     RevocationsWanted,
@@ -45,7 +43,6 @@ from appliance.channel.messages import (
     SignatureRefused,
     SignatureWanted,
     SignerLink,
-    Stop,
 )
 from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
@@ -93,57 +90,22 @@ class Signer:
     def __init__(
         self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority
     ) -> None:
-        self._lifeline = lifeline
+        self._child = Child(lifeline, SignerLink, said=self._control_said)
         self._authority = authority
         self._signed = SignedCheckpoints(directory)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
-        self._control: Channel | None = None
-        self._stopped = asyncio.Event()
 
     async def run(self) -> None:
         """Serve until `Stop` arrives or the supervisor is gone."""
-        self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self._stopped.set)
-        self._lifeline.send(Ready(detail={"public_key": self._public_key.hex()}))
-        await self._stopped.wait()
-        if self._control is not None:
-            self._control.close()
+        self._child.attach(Ready(detail={"public_key": self._public_key.hex()}))
+        await self._child.ended.wait()
+        self._child.close()
 
-    def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        match message:
-            case Ping(number):
-                self._lifeline.send(Pong(number))
-            case Stop():
-                self._stopped.set()
-            case LinkOpened(role="control"):
-                self._open_link(descriptors[0])
-            case _:
-                for descriptor in descriptors:
-                    os.close(descriptor)
-
-    def _open_link(self, descriptor: int) -> None:
-        if self._control is not None:
-            self._control.close()
-        link = Channel(socket.socket(fileno=descriptor), SignerLink)
-        self._control = link
-        link.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._control_said(link, message),
-            lambda: self._link_closed(link),
-        )
-
-    def _link_closed(self, link: Channel) -> None:
-        if self._control is link:
-            self._control = None
-
-    def _control_said(self, link: Channel, message: Any) -> None:
+    def _control_said(self, message: Any) -> None:
         answer = self._answer(message)
-        if answer is None:
-            return
-        try:
-            link.send(answer)
-        except ChannelClosedError:
-            self._link_closed(link)  # control asks again over its next link
+        if answer is not None:
+            self._child.tell(answer)
 
     def _answer(self, message: Any) -> Message | None:
         match message:

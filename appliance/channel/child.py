@@ -1,0 +1,80 @@
+"""What every child of the supervisor that serves control has in common: its lifeline, and its link to control.
+
+It answers the supervisor's pings, takes each new link in the place of the one before, closes descriptors it was not
+meant to have, and ends when it is told to or when the supervisor is gone.
+"""
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+from typing import Any
+
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, Stop
+
+
+class Child:
+    """The two channels; `said(message)` hears control, `linked()` that there is a new link to it."""
+
+    def __init__(
+        self,
+        lifeline: Channel,
+        link: Any,
+        *,
+        said: Callable[[Any], None],
+        linked: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`link` is the union of the messages of the link to control."""
+        self._lifeline = lifeline
+        self._link = link
+        self._said = said
+        self._linked = linked
+        self._control: Channel | None = None
+        self.ended = asyncio.Event()
+
+    def attach(self, ready: Ready) -> None:
+        """Begin to listen, and say that this process is in service."""
+        self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
+        self._lifeline.send(ready)
+
+    def tell(self, message: Message) -> None:
+        """Tell control something; nothing happens while there is none: it asks again over its next link."""
+        if self._control is None:
+            return
+        try:
+            self._control.send(message)
+        except ChannelClosedError:
+            self._control = None
+
+    def close(self) -> None:
+        """Close the link to control."""
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+
+    def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case Ping(number):
+                self._lifeline.send(Pong(number))
+            case Stop():
+                self.ended.set()
+            case LinkOpened(role="control"):
+                self._open(descriptors[0])
+            case _:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+
+    def _open(self, descriptor: int) -> None:
+        self.close()
+        link = self._control = Channel(socket.socket(fileno=descriptor), self._link)
+        link.attach(
+            asyncio.get_running_loop(),
+            lambda message, _descriptors: self._said(message),
+            lambda: self._closed(link),
+        )
+        self._linked()
+
+    def _closed(self, link: Channel) -> None:
+        if self._control is link:
+            self._control = None
