@@ -3,6 +3,8 @@
 import json
 import re
 import socket
+import ssl
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from appliance.network.namespaces import Namespace
 from appliance.network.scan import scan
 from tests.support.docker import ROOT, Compose, namespace_of
+from tests.support.rest import Rest
 from tests.system.containers.conftest import Site
 
 MACHINE = "10.79.0.1"
@@ -108,9 +111,18 @@ def test_only_what_is_named_is_published(site: Site, demo: Compose) -> None:
     assert ports_open(site.laptop.namespace, MACHINE, range(1, 65536)) == ()
 
 
-def test_this_machine_reaches_the_console_and_the_laptop_does_not(site: Site, demo: Compose) -> None:
-    """127.0.0.1:8443 answers over TLS on the machine; from its network nobody gets there, by no way."""
-    assert reaches(site.machine.namespace, "127.0.0.1", 8443) == "reached"
+def test_this_machine_reaches_the_console_and_the_laptop_does_not(
+    site: Site, demo: Compose, tmp_path: Path
+) -> None:
+    """127.0.0.1:8443 answers over TLS on the machine, by the first token; from its network nobody gets there."""
+    token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
+    certificate = tmp_path / "certificate.pem"
+
+    def ask() -> int:
+        certificate.write_text(ssl.get_server_certificate(("127.0.0.1", 8443), timeout=10))
+        return Rest("https://127.0.0.1:8443", token, certificate).get("/v1/status").status
+
+    assert site.machine.run(ask) == 200
     assert reaches(site.laptop.namespace, MACHINE, 8443) == "ConnectionRefusedError"
     assert demo.engine.inspect("demo_robot")["Internal"]
 

@@ -95,6 +95,38 @@ def test_a_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
         assert machine() == before
 
 
+def test_the_state_is_copied_and_taken_back(alone: Compose, tmp_path: Path) -> None:
+    """By the commands in docs/next-to-your-robot.md: an appliance with the copy is the one that was copied."""
+
+    def tar(what: str) -> None:
+        volumes = ("--volume", "alone_state:/state", "--volume", f"{tmp_path}:/copy")
+        alone.engine.docker(
+            "run",
+            "--rm",
+            *volumes,
+            "--entrypoint",
+            "tar",
+            APPLIANCE,
+            "-C",
+            "/state",
+            what,
+            "/copy/state.tar",
+            ".",
+        )
+
+    before = alone.audit("--oldest-first")[0]["id"]
+    alone("stop")
+    tar("-cf")
+    alone("down", "--volumes")
+    alone("up", "--no-start", "--no-build")
+    tar("-xf")
+    alone("start")
+    alone.wait_healthy()
+    assert alone.audit("--oldest-first")[0]["id"] == before
+    verified = alone.exec("appliance", "rosrv", "audit", "verify", check=False)
+    assert verified.returncode == 0, verified.stdout + verified.stderr
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
