@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_program
@@ -36,20 +36,30 @@ CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 500,
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    """Chromium of the machine, for all tests."""
-    chromium = need_program("chromium", "chromium")
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium)
-        yield browser
-        browser.close()
+def chromium() -> str:
+    """The browser's program."""
+    return need_program("chromium", "chromium")
 
 
-def launch(playwright: Any, chromium: str) -> Browser:
+@pytest.fixture(scope="session")
+def playwright() -> Iterator[Playwright]:
+    """What drives browsers: one for all tests."""
+    with sync_playwright() as driver:
+        yield driver
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
+    """A browser of this machine, for all tests."""
+    started = launch(playwright, chromium)
+    yield started
+    started.close()
+
+
+def launch(playwright: Playwright, program: str) -> Browser:
     """A browser without a window; as root it cannot have a sandbox of its own."""
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-    started: Browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
-    return started
+    return playwright.chromium.launch(executable_path=program, args=arguments)
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect, sync_playwright
+from playwright.sync_api import Browser, Playwright, expect
 
-from appliance.network.lab import Lab
+from appliance.network.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.requirements import need_program, need_root
+from tests.support.requirements import need_root
 from tests.support.tunnels import need_strongswan
 from tests.system.console.conftest import POLICY, launch
 from tests.system.console.reader import Reader
@@ -22,7 +22,7 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"
-    config.write_text("api: 127.0.0.1:8443\n")
+    config.write_text("api: 0.0.0.0:8443\n")
     with Lab("rosrv-console") as lab:
         host = lab.host("machine", "10.84.0.2/24")
         with Appliance(
@@ -32,23 +32,23 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
 
 
 @pytest.fixture
-def browser(appliance: Appliance) -> Iterator[Browser]:
+def inside(appliance: Appliance, playwright: Playwright, chromium: str, tmp_path: Path) -> Iterator[Browser]:
     """A browser on that host: the console is served on its loopback only."""
-    chromium = need_program("chromium", "chromium")
-    with appliance.host.entered():  # type: ignore[union-attr]  # a host of the lab
-        manager = sync_playwright()
-        playwright = manager.start()
-        browser = launch(playwright, chromium)
-    yield browser
-    browser.close()
-    playwright.stop()
+    host = appliance.host
+    assert isinstance(host, Host)
+    program = tmp_path / "chromium"
+    program.write_text(f'#!/bin/sh\nexec ip netns exec {host.namespace.name} {chromium} "$@"\n')
+    program.chmod(0o755)
+    started = launch(playwright, str(program))
+    yield started
+    started.close()
 
 
-def test_a_host_is_enrolled_and_revoked(appliance: Appliance, browser: Browser) -> None:
+def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -> None:
     """A kit is saved and has a key in it; the host is in the list; revoking asks for its name and ends it. A token is
     shown once, with the script that uses it.
     """
-    with Reader(browser, str(appliance.ready["api"]), str(appliance.ready["token"])) as reader:
+    with Reader(inside, "https://127.0.0.1:8443", str(appliance.ready["token"])) as reader:
         page = reader.go("hosts")
         expect(page.get_by_text("No host is enrolled")).to_be_visible()
         page.get_by_role("button", name="Enrol a host").click()
@@ -65,6 +65,7 @@ def test_a_host_is_enrolled_and_revoked(appliance: Appliance, browser: Browser) 
 
         page.get_by_role("button", name="Enrol a host").click()
         dialog.get_by_label("Name").fill("ocu-2")
+        dialog.get_by_label("Address of the appliance").fill("10.84.0.2")
         dialog.get_by_role("button", name="Make the token").click()
         made = page.get_by_role("dialog", name="ocu-2 may enrol itself")
         expect(made.locator("[data-token]").last).to_contain_text("rosrv-enrol_")

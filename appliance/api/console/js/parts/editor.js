@@ -75,7 +75,7 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
         keymap.of([{ key: "Mod-s", run: dry, preventDefault: true }, ...mirror.searchKeymap, ...mirror.historyKeymap, ...mirror.defaultKeymap]),
         mirror.StreamLanguage.define(language === "policy" ? policyLanguage : rvLanguage),
         mirror.syntaxHighlighting(colours(mirror)), look(EditorView, height),
-        EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable) }),
+        EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable), tabindex: "0" }),
         EditorView.domEventHandlers({ beforeinput: typedOver }),
         EditorView.updateListener.of((/** @type {any} */ update) => update.docChanged && newest.current.change?.(update.state.doc.toString())),
       ],
