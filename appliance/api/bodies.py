@@ -36,3 +36,5 @@ def read_body(content_type: str, body: bytes, model: type[_Model], what: str) ->
         ]
         detail = "; ".join(f"{one.where}: {one.text}" for one in found[:5])
         raise ProblemError(422, "bad-input", detail, errors=found) from None
+    except ValueError:  # of json: a number with thousands of digits
+        raise ProblemError(422, "not-json", "the body has a number that is too long") from None

@@ -1,0 +1,306 @@
+"""What somebody tries who reaches REST and wants in, or wants it gone; beside the floods of `test_robustness.py`."""
+
+import gzip
+import http.client
+import json
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.rest import Rest
+
+CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 100000, burst: 1000000}\n"
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """REST in clear text, which does not slow an attacker of this module down."""
+    appliance = Appliance()
+    config = appliance.directory / "appliance.yaml"
+    config.write_text(CONFIG)
+    appliance.options = ("--config", str(config))
+    with appliance as running:
+        yield running
+
+
+@pytest.fixture
+def rest(appliance: Appliance) -> Iterator[Rest]:
+    """REST; after each attack it serves as before, by the same process, which has not grown much."""
+    rest = appliance.rest()
+    pid = api_of(rest)
+    before = resident(pid)
+    yield rest
+    assert api_of(rest) == pid
+    assert resident(pid) < before + (64 << 20)
+
+
+def api_of(rest: Rest) -> int:
+    """The process that serves REST."""
+    answer = rest.get("/v1/status")
+    assert answer.status == 200
+    return next(int(row["pid"]) for row in answer.json["processes"] if row["role"] == "api")
+
+
+def resident(pid: int) -> int:
+    """The memory of a process, in bytes."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    found = re.search(r"VmRSS:\s+(\d+) kB", text)
+    assert found is not None
+    return int(found[1]) << 10
+
+
+def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
+    """Send bytes as they are; the status of each answer, until the connection ends or nothing came for a while."""
+    assert rest.url.hostname is not None
+    got = bytearray()
+    with socket.create_connection((rest.url.hostname, rest.url.port), 10) as sock:
+        try:
+            sock.sendall(data)
+            sock.settimeout(idle)
+            while piece := sock.recv(65_536):
+                got += piece
+        except (TimeoutError, ConnectionError):
+            pass
+    return [int(one) for one in re.findall(rb"HTTP/1\.1 (\d{3}) ", bytes(got))]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/healthz/../v1/status", "/v1/../v1/status", "//v1/status", "/v1//status", "/v1/status/", "/V1/STATUS",
+        "/%2e%2e/v1/status", "/v1/%73tatus", "/v1/status%00", "/v1/status;x", "/v1/status%2f",
+        "/healthz%2f..%2fv1/status", "/healthz?/v1/status", "/healthz#/v1/status", "/v1/openapi.json/../status", "*", "http://127.0.0.1/v1/status",
+        "/v1/audit/export?x=/healthz", "/\\v1\\status", "/v1/status\t", "/.well-known/../v1/status",
+    ],
+)  # fmt: skip
+def test_no_spelling_of_a_path_goes_around_the_token(rest: Rest, path: str) -> None:
+    """Whatever a path looks like, without a token it shows nothing: only the probes and the contract answer 200."""
+    request = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode()
+    found = statuses(rest, request)
+    assert found in ([400], [401], [421], [200]), found
+    if found == [200]:
+        assert path.startswith("/healthz")
+        assert not path.startswith("/healthz/")
+
+
+HIDDEN = b"GET /v1/policy HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        (b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Transfer-Encoding: chunked\r\nContent-Length: 5\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Content-Length: 0\r\nContent-Length: %d\r\n" % len(HIDDEN), HIDDEN),
+        (b"Content-Length: %d\r\nContent-Length: 0\r\n" % len(HIDDEN), HIDDEN),
+        (b"Transfer-Encoding: xchunked\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Transfer-Encoding : chunked\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Transfer-Encoding: chunked, identity\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Transfer-Encoding:\x0bchunked\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"X: y\r\n Transfer-Encoding: chunked\r\n", b"0\r\n\r\n" + HIDDEN),
+        (b"Content-Length: +0\r\n", HIDDEN), (b"Content-Length: 0x0\r\n", HIDDEN), (b"Content-Length: -1\r\n", HIDDEN),
+        (b"Content-Length: 99999999999999999999\r\n", HIDDEN),
+        (b"Transfer-Encoding: chunked\r\n", b"fffffffffffffffff\r\n" + HIDDEN),
+        (b"Transfer-Encoding: chunked\r\n", b"0;" + b"x" * 100_000 + b"\r\n\r\n" + HIDDEN),
+        (b"Transfer-Encoding: chunked\r\n", b"0\r\nAuthorization: Bearer TOKEN\r\n\r\n" + HIDDEN),
+    ],
+)  # fmt: skip
+def test_a_request_inside_another_is_nobodys(rest: Rest, head: bytes, body: bytes) -> None:
+    """Lengths that contradict each other: a hidden request is not served by the token of the outer one."""
+    token = f"Authorization: Bearer {rest.token}\r\n".encode()
+    outer = b"POST /v1/policy/explain HTTP/1.1\r\nHost: 127.0.0.1\r\n" + token + head + b"\r\n"
+    data = outer + body.replace(b"TOKEN", (rest.token or "").encode())
+    found = statuses(rest, data)
+    assert found, "the outer request is answered"
+    assert 200 not in found, found
+    assert len(found) <= 2
+
+
+def test_pipelined_requests_are_each_asked_for_their_token(rest: Rest) -> None:
+    """On one connection: with, without, with a token: 200, 401, 200, in order."""
+    token = f"Authorization: Bearer {rest.token}\r\n"
+    parts = [
+        f"GET /v1/whoami HTTP/1.1\r\nHost: 127.0.0.1\r\n{one}\r\n"
+        for one in (token, "", f"{token}Connection: close\r\n")
+    ]
+    assert statuses(rest, "".join(parts).encode()) == [200, 401, 200]
+
+
+def test_two_tokens_are_none(rest: Rest) -> None:
+    """Two Authorization headers, one of them right: what is taken is one of them, and never both roles' sum."""
+    wrong = "Authorization: Bearer rosrv_000000000000_" + "A" * 43 + "\r\n"
+    right = f"Authorization: Bearer {rest.token}\r\n"
+    for headers in (wrong + right, right + wrong):
+        data = f"GET /v1/whoami HTTP/1.1\r\nHost: 127.0.0.1\r\n{headers}Connection: close\r\n\r\n"
+        assert statuses(rest, data.encode()) in ([200], [401], [400])
+
+
+def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
+    """A bomb that would be 1 GB: nobody unpacks it; it is not JSON."""
+    bomb = gzip.compress(b"\0" * (1 << 26), 9) * 16
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip", "If-Match": "*"}
+    began = time.monotonic()
+    answer = rest.request("POST", "/v1/monitors", bomb[: 1 << 19], headers)
+    assert answer.status == 422
+    assert time.monotonic() - began < 10
+
+
+@pytest.mark.parametrize("path", ["/v1/monitors", "/v1/policy", "/v1/policy/explain", "/v1/policy/rollback"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"[" * 500_000, b'{"a":' * 100_000, b'{"files":{' + b'"x":{' * 50_000,
+        b'{"files":{"a.rv":"' + b"\\u0000" * 80_000 + b'"}}', b'{"text":' + b"9" * 300_000 + b"}",
+        b"1e" + b"9" * 100_000, b'{"a":1,' * 90_000, b'"\\ud800"', b"\xef\xbb\xbf{}",
+        b'{"files":{' + b",".join(b'"f%d.rv":""' % one for one in range(50_000)) + b"}}",
+    ],
+    ids=[
+        "deep", "deep objects", "deep files", "nul", "long number", "huge exponent", "no end", "surrogate", "bom",
+        "many files",
+    ],
+)  # fmt: skip
+def test_json_that_is_meant_to_hurt_is_refused(rest: Rest, path: str, body: bytes) -> None:
+    """Deep, long, endless, invalid: a problem, within seconds."""
+    began = time.monotonic()
+    answer = rest.request("POST", path, body, {"Content-Type": "application/json", "If-Match": "*"})
+    assert answer.status in (413, 415, 422), answer.body[:300]
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert time.monotonic() - began < 10
+
+
+def test_specifications_that_are_meant_to_hurt_are_refused_or_compiled_in_time(rest: Rest) -> None:
+    """Formulas that explode, blocks without end: an answer in time; meanwhile others are answered."""
+    events = "\n".join(f"event e{one}() /a std_msgs/Bool '{{}}' {{ }}" for one in range(14))
+    eventually = " and ".join(f"<>(e{one} and <>e{one + 1})" for one in range(12))
+    bombs = [
+        f"s() {{ {events} ere: (e0|e1)* e0 {'(e0|e1) ' * 40} @match {{ }} }}",
+        f"s() {{ {events} ltl: {eventually} @validation {{ }} }}",
+        f"s() {{ {events} ere: {'(' * 5000}e0{')' * 5000} @match {{ }} }}",
+        f"s() {{ {events} ere: e0^100000000 @match {{ }} }}",
+        f"s() {{ event e() /a std_msgs/Bool '{{}}' {{ {'if (true) {' * 5000} {'}' * 5000} }} }}",
+        f"s() {{ int x = {'(' * 100_000}1; event e() /a std_msgs/Bool '{{}}' {{ }} }}",
+        "s() { event e() /a std_msgs/Bool '{}' { " + "int x; " * 100_000 + " } }",
+    ]
+    others: list[float] = []
+    stop = threading.Event()
+
+    def look() -> None:
+        while not stop.is_set():
+            began = time.monotonic()
+            rest.get("/healthz")
+            others.append(time.monotonic() - began)
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        for bomb in bombs:
+            began = time.monotonic()
+            data = json.dumps({"files": {"s.rv": bomb}}).encode()
+            answer = rest.request(
+                "POST", "/v1/monitors?dry_run=1", data, {"Content-Type": "application/json"}
+            )
+            assert answer.status in (200, 422), (bomb[:80], answer.body[:300])
+            assert time.monotonic() - began < 30, bomb[:80]
+    finally:
+        stop.set()
+        looking.join()
+    assert max(others) < 5, max(others)
+
+
+def test_names_in_paths_are_names(rest: Rest) -> None:
+    """What is no name of a monitor, token, host or record is 404 or 422, and is answered as text, not as a page."""
+    for name in (
+        "..%2f..%2fetc%2fpasswd",
+        "%00",
+        "a" * 300,
+        "%3Cscript%3E",
+        "' OR 1=1 --",
+        "%ff%fe",
+        "{}",
+        "%0d%0aX: y",
+    ):
+        quoted = name.replace(" ", "%20")
+        for path in (
+            "monitors/{}",
+            "monitors/{}/picture",
+            "monitors/{}/history",
+            "audit/{}",
+            "hosts/{}",
+            "tokens/{}",
+        ):
+            method = "DELETE" if path.startswith("tokens") else "GET"
+            answer = rest.request(method, f"/v1/{path.format(quoted)}")
+            assert answer.status in (200, 404, 422), (path, name, answer.status)
+            assert "html" not in answer.headers.get("content-type", "")
+            assert "x" not in answer.headers
+            if answer.status == 200:
+                assert answer.json["happened"] == []
+
+
+def test_guessing_tokens_is_slowed_down_and_recorded(appliance: Appliance, rest: Rest) -> None:
+    """After some wrong tokens their sender waits; the holder of a good one, on the same machine, does not."""
+    guesses = [
+        rest.with_token(f"rosrv_{number:012x}_{'A' * 43}").get("/v1/status").status for number in range(60)
+    ]
+    assert set(guesses) == {401, 429}
+    assert guesses[-1] == 429
+    assert rest.get("/v1/status").status == 200
+    denied = appliance.audit("--deny", "--category", "rest")
+    assert any(one["detail"].get("status") == 429 for one in denied)
+
+
+def test_a_hundred_thousand_headers_are_cut_off(rest: Rest) -> None:
+    """Headers without end, and one that is 10 MB long: the connection is cut, quickly."""
+    began = time.monotonic()
+    many = b"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"".join(
+        b"H%d: x\r\n" % one for one in range(100_000)
+    )
+    assert statuses(rest, many + b"\r\n") in ([], [400], [401], [431])
+    long = b"GET /" + b"x" * 10_000_000 + b" HTTP/1.1\r\n\r\n"
+    assert statuses(rest, long) in ([], [400], [414])
+    assert time.monotonic() - began < 20
+
+
+def test_methods_that_are_none_are_refused(rest: Rest) -> None:
+    """TRACE does not echo, CONNECT opens nothing, an invented method is refused."""
+    for method in ("TRACE", "CONNECT", "PROPFIND", "OPTIONS", "INVENTED"):
+        data = (
+            f"{method} /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Secret: echo\r\nConnection: close\r\n\r\n"
+        )
+        found = statuses(rest, data.encode())
+        assert not {200, 101, 204} & set(found), (method, found)
+
+
+def test_an_upgrade_is_no_way_around(rest: Rest) -> None:
+    """WebSocket, h2c: answered as plain HTTP, by the rules of plain HTTP."""
+    for kind in ("websocket", "h2c"):
+        data = (
+            f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade, HTTP2-Settings\r\nUpgrade: {kind}\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            "HTTP2-Settings: AAMAAABk\r\n\r\n"
+        )
+        found = statuses(rest, data.encode(), 5)
+        assert not {101, 200} & set(found), (kind, found)
+
+
+def test_a_client_that_reads_nothing_is_not_waited_for(rest: Rest) -> None:
+    """Twenty clients ask for a long answer and do not read it: others are served meanwhile."""
+    idle = []
+    try:
+        for _ in range(20):
+            connection = rest.connect()
+            connection.request("GET", "/v1/openapi.json")
+            assert isinstance(connection, http.client.HTTPConnection)
+            idle.append(connection)
+        began = time.monotonic()
+        assert rest.get("/v1/status").status == 200
+        assert time.monotonic() - began < 5
+    finally:
+        for connection in idle:
+            connection.close()
