@@ -8,6 +8,7 @@ from collections.abc import Callable
 import structlog
 
 from appliance.config import Settings
+from appliance.network.firewall.iptables import load_modules
 from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free
@@ -43,6 +44,8 @@ def run_appliance(
         raise StartError(
             f"isolation {settings.isolation} needs root (or use --isolation none, without a firewall)"
         )
+    elif settings.firewall.backend == "iptables":
+        load_modules()
     keep_supervisors()
     state = StateDirectory(settings.state)
     try:

@@ -11,6 +11,7 @@ the standard output of the whole process through a pipe for a moment to check th
 import contextlib
 import fcntl
 import os
+import subprocess
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ from appliance.network.namespaces import Namespace
 LOCK = Path("/run/xtables.lock")  # the one of the `iptables-legacy` programs
 _ONE_AT_A_TIME = threading.Lock()  # guards state of the library, which is global
 _EXPIRE_MILLISECONDS = 10_000
+_MODPROBE_SECONDS = 20.0
 _MATCH_HEADER = 32  # bytes of struct xt_entry_match before its content
 
 Extension = tuple[str, tuple[tuple[str, str | tuple[str, ...]], ...]]
@@ -79,6 +81,16 @@ class IptablesBackend:
                         work(table)
 
         self._namespace.run(inside)
+
+
+def load_modules() -> None:
+    """Have the kernel load legacy xtables, while this process may still load modules; whether it did, `install` says.
+
+    Unlike those of nftables and the extensions, the kernel does not load these by itself.
+    """
+    command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no such program
+        subprocess.run(command, capture_output=True, timeout=_MODPROBE_SECONDS, check=False)
 
 
 def render_rule(rule: Rule) -> list[RenderedRule]:

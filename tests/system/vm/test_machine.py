@@ -15,7 +15,7 @@ HERE = "tests/system/vm"
 PLUGINS = ("env", "PYTEST_DISABLE_PLUGIN_AUTOLOAD=1")
 SECONDS = 600.0
 
-pytestmark = pytest.mark.timeout(900)  # the first one makes the machine's disk
+pytestmark = pytest.mark.timeout(1200)  # the first one makes the machine's disk
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def passes(machine: Machine, *what: str) -> None:
     """These tests pass in the machine, all of them: none is skipped."""
     done = machine.run(
         *(*PLUGINS, f"{ROOT}/.venv/bin/pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--quiet"),
-        *("--durations=5", *what),
+        *("--durations=5", "-o", f"timeout={SECONDS:.0f}", *what),
         seconds=SECONDS,
         check=False,
     )
