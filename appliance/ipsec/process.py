@@ -25,19 +25,16 @@ from typing import Any
 
 import structlog
 
-from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.channel import Channel
+from appliance.channel.child import Child
 from appliance.channel.messages import (
     APPLIANCE_NAME,
     CertificateNeeded,
     CharonStarted,
     Failed,
     Lifeline,
-    LinkOpened,
     Message,
-    Ping,
-    Pong,
     Ready,
-    Stop,
     TunnelChanged,
     TunnelLink,
     TunnelRefused,
@@ -66,11 +63,10 @@ class TunnelProcess:
     """Serves one lifeline and the link to control until it is told to stop or charon has died."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
-        self._lifeline = lifeline
+        self._child = Child(lifeline, TunnelLink, said=self._control_said, linked=self._linked)
         self._directory = directory
         self._key = key
-        self._control: Channel | None = None
-        self._ended = asyncio.Event()
+        self._ended = self._child.ended
         self._wanted: TunnelsStated | None = None
         self._changed = asyncio.Event()
         self._taken = 0
@@ -86,8 +82,7 @@ class TunnelProcess:
     async def run(self) -> None:
         """Serve until the end; `failed` says that it was no orderly one."""
         self._loop = asyncio.get_running_loop()
-        self._lifeline.attach(self._loop, self._supervisor_said, self._ended.set)
-        self._lifeline.send(Ready())
+        self._child.attach(Ready())
         self._spawn(self._provision())
         self._spawn(self._report())
         self._spawn(self._renew())
@@ -100,32 +95,12 @@ class TunnelProcess:
 
     # --- what this process is told ---
 
-    def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        match message:
-            case Ping(number):
-                self._lifeline.send(Pong(number))
-            case Stop():
-                self._ended.set()
-            case LinkOpened(role="control"):
-                self._open_link(descriptors[0])
-            case _:
-                for descriptor in descriptors:
-                    os.close(descriptor)
-
-    def _open_link(self, descriptor: int) -> None:
-        if self._control is not None:
-            self._control.close()
-        link = self._control = Channel(socket.socket(fileno=descriptor), TunnelLink)
-        link.attach(self._loop, self._control_said, lambda: self._link_closed(link))
+    def _linked(self) -> None:
         self._ask()
         if self._vici is not None:
             self._say_what_it_is(self._vici)
 
-    def _link_closed(self, link: Channel) -> None:
-        if self._control is link:
-            self._control = None
-
-    def _control_said(self, message: Any, _descriptors: tuple[int, ...]) -> None:
+    def _control_said(self, message: Any) -> None:
         if isinstance(message, TunnelsStated):
             self._wanted = message
             self._changed.set()
@@ -134,12 +109,7 @@ class TunnelProcess:
         self._tell(CertificateNeeded(signing_request(self._key, APPLIANCE_NAME)))
 
     def _tell(self, message: Message) -> None:
-        if self._control is None:
-            return
-        try:
-            self._control.send(message)
-        except ChannelClosedError:
-            self._control = None
+        self._child.tell(message)
 
     # --- charon ---
 

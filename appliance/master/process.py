@@ -28,7 +28,7 @@ from appliance.master.certification import Certification
 from appliance.master.declared import Declared
 from appliance.master.doors import Doors
 from appliance.master.forwarded import Forwarded
-from appliance.master.host_table import HostTable
+from appliance.master.host_table import HostRefusedError, HostTable
 from appliance.master.hosts import Hosts
 from appliance.master.http import listen
 from appliance.master.journal import restore
@@ -285,6 +285,13 @@ class _Control:
             self._base.policies.reload()
         except PolicyRefusedError as error:
             _log.error("the policy was refused, the last good one stays in force", findings=error.findings)
+        self._reloading = asyncio.get_running_loop().create_task(self._reload_hosts())  # held until it is done
+
+    async def _reload_hosts(self) -> None:
+        try:
+            await self._base.hosts.reload("disk")
+        except HostRefusedError as error:
+            _log.error("hosts.yaml was refused", reason=str(error))
 
     def _relay_link(self, index: int, descriptor: int) -> None:
         relay = self._parts.master.relay
