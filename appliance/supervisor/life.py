@@ -26,9 +26,8 @@ from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullEr
 from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping
 from appliance.supervisor.child import Plan
 
-FIRST_ANSWER_SECONDS = (
-    60.0  # starting is mostly loading: killed too early on a slow machine, it would begin anew
-)
+# Starting is mostly loading: killed too early on a slow machine, it would begin anew.
+FIRST_ANSWER_SECONDS = 60.0
 ANSWER_SECONDS = 5.0
 _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
