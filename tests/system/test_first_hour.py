@@ -1,0 +1,93 @@
+"""docs/first-hour.md, followed command by command on three machines: what it shows is what happens."""
+
+import os
+import re
+import shutil
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Host, Lab
+from tests.support.appliance import ROSRV
+from tests.support.processes import Process
+from tests.support.requirements import need_root
+
+PAGE = Path(__file__).parents[2] / "docs" / "first-hour.md"
+_STEP = re.compile(
+    r"<!-- on: (?P<host>\w+)(?:, (?P<how>\w+))? -->\n```sh\n(?P<script>.*?)```\n(?:```text\n(?P<shown>.*?)```\n)?",
+    re.S,
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One block of commands: where, whether it fails or stays, and what it shows."""
+
+    host: str
+    how: str | None
+    script: str
+    shown: tuple[str, ...]
+
+
+def steps() -> list[Step]:
+    """The blocks of the page, in order."""
+    found = [
+        Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))
+        for one in _STEP.finditer(PAGE.read_text())
+    ]
+    assert PAGE.read_text().count("```sh") == len(found)
+    return found
+
+
+@pytest.fixture
+def hosts() -> Iterator[dict[str, Host]]:
+    """The three machines of the page."""
+    need_root()
+    with Lab("rosrv-hour") as lab:
+        yield {
+            "machine": lab.host("machine", "10.84.0.2/24"),
+            "robot": lab.host("robot", "10.84.0.10/24"),
+            "visitor": lab.host("visitor", "10.84.0.66/24"),
+        }
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A working directory that the appliance's users may pass through."""
+    folder = Path(f"/tmp/rosrv-hour-{os.getpid()}")
+    folder.mkdir(mode=0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def test_the_page_is_true(hosts: dict[str, Host], folder: Path) -> None:
+    """Every block ends as it says, and prints what it says."""
+    staying: list[Process] = []
+    environment = {
+        "PATH": f"{Path(ROSRV).parent}:{os.environ['PATH']}",
+        "HOME": str(folder),
+        "PYTHONUNBUFFERED": "1",
+        "COLUMNS": "200",
+    }
+    try:
+        for step in steps():
+            script = f"exec 2>&1\ncd {folder}\n" + step.script.replace("/var/lib/rosrv", f"{folder}/state")
+            command = ["bash", "-euo", "pipefail", "-c", script]
+            label = f"{step.host}: {step.script.splitlines()[-1]}"
+            process = Process(hosts[step.host], command, env=environment, label=label)
+            shown = [line.replace("/var/lib/rosrv", f"{folder}/state") for line in step.shown]
+            if step.how == "stays":
+                staying.append(process)
+            else:
+                code = process.wait(timeout=90)
+                assert (code != 0) == (step.how == "fails"), process.story()
+                process.stop()
+            for line in shown:
+                process.wait_for_text(line)
+    finally:
+        for process in reversed(staying):
+            os.killpg(process.pid, signal.SIGTERM)
+            process.stop(timeout=20)
