@@ -44,7 +44,16 @@ class StateDirectory:
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Iterable[Role]) -> None:
-        """Give each role its part. Raises `StartError` where a part is somebody else's."""
+        """Give each role its part. Raises `StartError` where a part is somebody else's, or cannot be given away."""
+        try:
+            self._give_parts(roles)
+        except PermissionError as error:
+            raise StartError(
+                f"the parts of the state directory {self.path} cannot be given to the users of the processes: {error}; "
+                "a container needs CAP_CHOWN for that (cap_add in compose.yaml)"
+            ) from error
+
+    def _give_parts(self, roles: Iterable[Role]) -> None:
         self._folder("run", os.geteuid(), os.getegid(), 0o755)
         for role in roles:
             account = account_of(role.user)
