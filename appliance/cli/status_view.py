@@ -1,0 +1,65 @@
+"""How `rosrv status` lays out what takes the most room: the processes, side by side where the window is wide enough."""
+
+import datetime
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+_YELLOW = "yellow"
+_COLUMN = 38  # columns that one process takes
+
+
+def processes_table(rows: Sequence[Mapping[str, Any]], width: int, now: float | None = None) -> Table:
+    """The processes in as many columns as fit, read downwards; processes of one role are numbered from 0."""
+    across = max(1, min(3, width // _COLUMN))
+    high = -(-len(rows) // across)
+    table = Table(
+        *["process", "pid", "for", "restarts"] * across, box=None, padding=(0, 2, 0, 0), header_style="dim"
+    )
+    shown = [_cells(row, name, now) for row, name in zip(rows, _names(rows), strict=True)]
+    for line in range(high):
+        cells: list[Text] = []
+        for place in range(line, len(shown), high):
+            cells += shown[place]
+        table.add_row(*cells)
+    return table
+
+
+def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    roles = [str(row["role"]) for row in rows]
+    seen: dict[str, int] = {}
+    names = []
+    for role in roles:
+        number = seen.get(role, 0)
+        seen[role] = number + 1
+        names.append(f"{role} {number}" if roles.count(role) > 1 else role)
+    return names
+
+
+def _cells(row: Mapping[str, Any], name: str, now: float | None) -> list[Text]:
+    since = datetime.datetime.fromisoformat(row["since"]).timestamp()
+    restarts = Text(str(row["restarts"]), style=_YELLOW if row["restarts"] else "")
+    return [Text(name), Text(str(row["pid"])), Text(age(since, now)), restarts]
+
+
+def age(since: float, now: float | None = None) -> str:
+    """How long ago a moment (seconds since the epoch) was, in at most two units."""
+    seconds = max(0, int((time.time() if now is None else now) - since))
+    days, rest = divmod(seconds, 86_400)
+    hours, rest = divmod(rest, 3_600)
+    minutes, left = divmod(rest, 60)
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"
+
+
+def shortened(lines: Sequence[str], most: int) -> list[str]:
+    """The first lines; that there are more is said in the last."""
+    if len(lines) <= most:
+        return list(lines)
+    return [*lines[: most - 1], f"and {len(lines) - most + 1} more: rosrv status --json"]
