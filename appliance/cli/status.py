@@ -1,6 +1,5 @@
 """`rosrv status`: the running appliance on one screen."""
 
-import datetime
 import json
 import sys
 import time
@@ -15,7 +14,11 @@ from appliance.channel.admin import StatusWanted
 from appliance.cli.healthy import no_relay
 from appliance.cli.policy_output import counted
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.status_view import age, processes_table, shortened
 
+_PORT_STATES = ("closed", "open", "unknown")
+_MOST_NAMED = 8
+_MOST_TROUBLES = 5
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
@@ -75,10 +78,10 @@ def troubles_of(body: dict[str, Any]) -> list[str]:
 def _show(body: dict[str, Any], troubles: list[str]) -> None:
     console = Console(highlight=False)
     policy, audit = body["policy"], body["audit"]
-    for trouble in troubles:
+    for trouble in shortened(troubles, _MOST_TROUBLES):
         console.print(Text(f"! {trouble}", style=_RED))
     grid = Table.grid(padding=(0, 2))
-    grid.add_row("appliance", f"{body['version']}, in service for {_age(body['since'])}")
+    grid.add_row("appliance", f"{body['version']} at {body['master']}, for {age(body['since'])}")
     isolation = Text(_isolation(body), style=_YELLOW if body["isolation"] == "none" else _GREEN)
     grid.add_row("isolation", isolation)
     differs = ""
@@ -108,40 +111,39 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}",
     )
     grid.add_row("tunnels", _tunnels(body["ipsec"]))
+    grid.add_row("hosts' ports", _ports(body["ipsec"]["ports"]))
     forwarding = audit["forwarding"]
     forwarded = (
         "" if forwarding is None else f", {forwarding['behind']} to be forwarded to {forwarding['to']}"
     )
     grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written{forwarded}")
     console.print(grid)
-    table = Table("process", "pid", "for", "restarts", box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for process in body["processes"]:
-        restarts = Text(str(process["restarts"]), style=_YELLOW if process["restarts"] else "")
-        since = datetime.datetime.fromisoformat(process["since"]).timestamp()
-        table.add_row(process["role"], str(process["pid"]), _age(since), restarts)
+    table = processes_table(body["processes"], console.width)
     console.print(table)
 
 
 def _tunnels(ipsec: dict[str, Any]) -> str:
     if ipsec["esp"] is None:
         return f"{counted(ipsec['enrolled'], 'host')} enrolled"
-    return f"{ipsec['up']} of {counted(ipsec['enrolled'], 'enrolled host')} up, ESP in {ipsec['esp']}"
+    text = f"{ipsec['up']} of {counted(ipsec['enrolled'], 'enrolled host')} up, ESP in {ipsec['esp']}"
+    if ipsec["key_exchange"]:
+        text += f", key exchange {', '.join(ipsec['key_exchange'])}"
+    return text
+
+
+def _ports(known: dict[str, dict[str, Any]]) -> str:
+    """Whether machines on which nodes run are known to be closed to all but the appliance."""
+    by_state = {
+        state: [name for name, one in known.items() if one["state"] == state] for state in _PORT_STATES
+    }
+    if not known:
+        return "no other machine has nodes"
+    words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]
+    return "; ".join(words) + (" (rosrv protect --check)" if by_state["unknown"] else "")
 
 
 def _isolation(body: dict[str, Any]) -> str:
     if body["isolation"] == "none":
-        return "none: NO FIREWALL, every user of this machine reaches the real ROS Master"
+        return "none: NO FIREWALL, every user of this machine reaches the ROS Master"
     back_end = body["firewall"].get("backend", "no back end reported")
     return f"{body['isolation']}, firewall {back_end}, probe {body['probe'] or 'not run yet'}"
-
-
-def _age(since: float) -> str:
-    seconds = max(0, int(time.time() - since))
-    days, rest = divmod(seconds, 86_400)
-    hours, rest = divmod(rest, 3_600)
-    minutes, left = divmod(rest, 60)
-    if days:
-        return f"{days} d {hours} h"
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {left} s" if minutes else f"{left} s"

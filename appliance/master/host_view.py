@@ -100,7 +100,7 @@ class HostView:
             "enrolled": len(self._table.enrolled()),
             "awaited": len(self._awaited.rows()),
             "up": len(self._tunnels.seen),
-            "troubles": self._troubles(),
+            "troubles": [*self._troubles(), *self._open_ports()],
             "ports": self._known_ports(machines),
         }
 
@@ -115,6 +115,13 @@ class HostView:
     def _known_ports(self, machines: Mapping[str, int]) -> dict[str, dict[str, Any]]:
         """Of every host that may have nodes, by name or address."""
         return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
+
+    def _open_ports(self) -> list[str]:
+        return [
+            f"ROS ports of {name} are open to others than the appliance (seen by {row.who}): rosrv protect there"
+            for name, row in self._table.ports.items()
+            if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
+        ]
 
     def _state(self, name: str, row: HostRow | None, now: float) -> str:
         if row is None:
