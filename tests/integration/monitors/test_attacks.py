@@ -185,8 +185,12 @@ def test_a_relay_that_is_killed_while_specifications_are_loaded(
             assert "try again" in answers[0].error + " ".join(answers[0].findings)
         wait_until(lambda: len(relays(appliance)) == 2, "both relays run")
         before = counted(listener)["last"]
-        wait_until(lambda before=before: counted(listener)["last"] > before + 5, "messages go on")  # type: ignore[misc]  # the loop variable is bound
-        assert versions(counted(listener))[-1] == in_force
+
+        def settled(before: int = before, version: int = in_force) -> bool:
+            count = counted(listener)
+            return int(count["last"]) > before + 50 and versions(count)[-1] == version
+
+        wait_until(settled, f"messages go on, through version {in_force}")
     load(appliance, tag=tag(9))
     wait_until(lambda: versions(counted(listener))[-1] == 9, "the next load is in force")
     assert ask(appliance, MonitorsWanted())["refused"] == []
