@@ -47,7 +47,7 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     def nft(*arguments: str, text: str = "") -> None:
         subprocess.run(["nft", *arguments], input=text, text=True, check=True, capture_output=True)
 
-    with RosSession(f"http://{APPLIANCE}:11311", tmp_path / "ros", MachineInside(site)) as ros:
+    with RosSession(f"http://{APPLIANCE}:11311", tmp_path, MachineInside(site)) as ros:
         listener = ros.listener("rospy", "/chatter", name="listener")
         ros.talker("roscpp", "/chatter", name="talker")
         listener.wait_for(event="received")

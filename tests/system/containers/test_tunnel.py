@@ -35,7 +35,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
     alone.exec("appliance", "rosrv", "policy", "reload")
     with JoinedHost(site.laptop, kit, tmp_path / "laptop") as laptop:
         laptop.wait_until_up()
-        with RosSession(laptop.master, tmp_path / "ros", laptop) as ros:
+        with RosSession(laptop.master, tmp_path, laptop) as ros:
             ros.listener("rospy", "/chatter", name="listener")
             ros.talker("rospy", "/chatter", name="talker")
             ros.processes[0].wait_for(event="received")
