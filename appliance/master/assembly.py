@@ -156,6 +156,8 @@ def assemble(base: Foundation) -> Parts:
         base.parameters_dirty.set,
         bytes_limit=int(base.settings.limits.parameter_bytes),
         depth_limit=base.settings.limits.nesting,
+        note=base.store.note_parameter,
+        since=base.store.parameter_changes(),
     )
     reconciler = wires.reconciler.fill(
         Reconciler(

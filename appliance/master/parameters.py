@@ -3,7 +3,7 @@
 The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
@@ -31,6 +31,7 @@ class ParameterMirror:
 
     `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
     tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
+    `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`.
     """
 
     def __init__(
@@ -40,10 +41,19 @@ class ParameterMirror:
         *,
         bytes_limit: int = 64 << 20,
         depth_limit: int = 100,
+        note: Callable[[str, Value], None] = lambda _key, _value: None,
+        since: Iterable[tuple[str, Value]] = (),
     ) -> None:
         self.tree = tree
         self.weight = measure(tree)[0]
         self._changed = changed
+        self._note: Callable[[str, Value], None] = lambda _key, _value: None
+        for key, value in since:
+            if value is None:
+                self.delete(key)
+            else:
+                self.set(key, value)
+        self._note = note
         self._bytes_limit = bytes_limit
         self._depth_limit = depth_limit
 
@@ -90,6 +100,7 @@ class ParameterMirror:
                 self._put(node, part, below)
             node = below
         self._put(node, parts[-1], value)
+        self._note(key, value)
         self._changed()
 
     def delete(self, key: str) -> None:
@@ -102,6 +113,7 @@ class ParameterMirror:
             node = node.get(part)
         if parts and isinstance(node, dict) and parts[-1] in node:
             self.weight -= _member(parts[-1], node.pop(parts[-1]))
+            self._note(key, None)
             self._changed()
 
     def _put(self, node: Tree, name: str, value: Value) -> None:

@@ -29,6 +29,7 @@ CREATE TABLE IF NOT EXISTS permission (
     PRIMARY KEY (key, kind, resource, host, caller_id)
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS parameters (id INTEGER PRIMARY KEY CHECK (id = 1), tree BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS parameter_change (number INTEGER PRIMARY KEY, key TEXT NOT NULL, value BLOB);
 CREATE TABLE IF NOT EXISTS policy_revision (
     revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
@@ -42,6 +43,9 @@ CREATE TABLE IF NOT EXISTS token (
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
+
+
+LARGEST_CHANGE = 64 << 10  # bytes of one parameter that is kept at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +119,7 @@ class StateStore:
     def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
         self._database = Database(directory / "state.db", _SCHEMA + hosts.SCHEMA, failed=failed)
         self.hosts = hosts.HostTables(self._database)
+        self._parameter_changes = 0  # the number of the last one
 
     async def settled(self) -> None:
         """Wait until everything saved so far is in the file."""
@@ -201,10 +206,34 @@ class StateStore:
     # --- parameters ---
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
-        """Keep the whole parameter tree."""
+        """Keep the whole parameter tree, in the place of the changes before it."""
         self._database.submit(
             "INSERT OR REPLACE INTO parameters VALUES (1, ?)", (msgspec.msgpack.encode(tree),), ahead=False
         )
+        # Changes that stay though the tree has them (after a crash) are made once more, in order: the tree is the same.
+        self._database.submit(
+            "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
+        )
+
+    def note_parameter(self, key: str, value: Any) -> None:
+        """Keep one change until the tree is kept: a parameter has this value, or None: it is gone.
+
+        When this returns the change outlasts the process. A large value does not: it is kept with the tree.
+        """
+        data = None if value is None else msgspec.msgpack.encode(value)
+        if data is not None and len(data) > LARGEST_CHANGE:
+            return
+        self._parameter_changes += 1
+        self._database.submit(
+            "INSERT OR REPLACE INTO parameter_change VALUES (?, ?, ?)", (self._parameter_changes, key, data)
+        )
+
+    def parameter_changes(self) -> list[tuple[str, Any]]:
+        """The changes since the tree was kept, in order; None for a parameter that is gone."""
+        query = "SELECT number, key, value FROM parameter_change ORDER BY number"
+        rows = self._database.query(query)
+        self._parameter_changes = rows[-1][0] if rows else 0
+        return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
     def load_parameters(self) -> dict[str, Any]:
         """The kept parameter tree; empty when there is none."""

@@ -79,7 +79,7 @@ class Burst:
             thread.join(LIMIT)
             assert not thread.is_alive()
 
-    def all_there(self, *, parameters: bool = True) -> None:
+    def all_there(self) -> None:
         """Every node that was told that it is registered is registered, with its parameter; none was refused."""
         assert not self.failed, self.failed[:3]
         assert len(self.registered) == self._count
@@ -87,8 +87,6 @@ class Burst:
         publishers = dict(map(tuple, state[0]))
         missing = [name for name in self.registered if publishers.get(f"/b{name}") != [name]]
         assert not missing
-        if not parameters:
-            return
         values = self._field.call(self._field.robot, "getParam", "/looker", "/burst")[2]
         assert {f"/{key}" for key in values} >= set(self.registered)
 
@@ -120,7 +118,7 @@ def test_both_killed_at_once(working: Field) -> None:
         for pid in pids:
             os.kill(pid, signal.SIGKILL)
         burst.finish()
-        burst.all_there(parameters=False)  # the last second of those is not on disk
+        burst.all_there()
 
 
 def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:

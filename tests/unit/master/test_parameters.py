@@ -193,3 +193,27 @@ def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
     answers = ordered(server, ("setParam", "/b", 1), ("deleteParam", "/a"))
     assert [type(one) for one in answers] == [CallFailedError, CallFailedError]
     assert server.parameters.tree == {"a": 1}
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(STEP, max_size=14), st.data())
+def test_changes_made_once_more_leave_the_same_tree(
+    steps: list[tuple[str, str, Any]], data: st.DataObject
+) -> None:
+    """A tree kept at any moment, with the changes from then or from any moment before it on, is the last tree."""
+    noted: list[tuple[str, Any]] = []
+    mirror = ParameterMirror(
+        {}, lambda: None, note=lambda key, value: noted.append((key, copy.deepcopy(value)))
+    )
+    kept = []
+    for do, key, value in [("", "", None), *steps]:
+        if do == "set":
+            mirror.set(key, copy.deepcopy(value))
+        elif do == "delete":
+            mirror.delete(key)
+        kept.append((len(noted), copy.deepcopy(mirror.tree)))
+    count, tree = data.draw(st.sampled_from(kept))
+    first = data.draw(st.integers(0, count))
+    again = ParameterMirror(tree, lambda: None, since=noted[first:])
+    assert again.tree == mirror.tree
+    assert again.weight == mirror.weight

@@ -4,7 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.store.state import IncarnationRow, PermissionRow, RegistrationRow, RevisionRow, StateStore
+from appliance.store.state import (
+    LARGEST_CHANGE,
+    IncarnationRow,
+    PermissionRow,
+    RegistrationRow,
+    RevisionRow,
+    StateStore,
+)
 
 
 def incarnation(key: str) -> IncarnationRow:
@@ -71,4 +78,40 @@ def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
     store.close()
     again = reopened(tmp_path)
     assert again.revisions() == rows[::-1]
+    again.close()
+
+
+def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> None:
+    """Changes are there for the next control, in order, though the tree was not kept since and nothing was closed."""
+    killed = reopened(tmp_path)
+    killed.save_parameters({"a": 1})
+    killed.note_parameter("/b", [1.5, {"c": b"x"}])
+    killed.note_parameter("/a", None)
+    again = reopened(tmp_path)
+    assert again.parameter_changes() == [("/b", [1.5, {"c": b"x"}]), ("/a", None)]
+    again.note_parameter("/d", 3)
+    assert reopened(tmp_path).parameter_changes()[-1] == ("/d", 3)
+    for one in (killed, again):
+        one.close()
+
+
+def test_the_whole_tree_takes_the_place_of_its_changes(tmp_path: Path) -> None:
+    """Once the tree is kept the changes before it are gone; those after it stay."""
+    store = reopened(tmp_path)
+    store.note_parameter("/a", 1)
+    store.save_parameters({"a": 1})
+    store.note_parameter("/b", 2)
+    store.close()
+    again = reopened(tmp_path)
+    assert (again.load_parameters(), again.parameter_changes()) == ({"a": 1}, [("/b", 2)])
+    again.close()
+
+
+def test_a_large_value_is_kept_with_the_tree(tmp_path: Path) -> None:
+    """A value that would take long to write is no change of its own."""
+    store = reopened(tmp_path)
+    store.note_parameter("/map", "x" * LARGEST_CHANGE)
+    store.close()
+    again = reopened(tmp_path)
+    assert again.parameter_changes() == []
     again.close()
