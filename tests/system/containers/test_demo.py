@@ -15,6 +15,8 @@ from tests.support.docker import ROOT, Compose, namespace_of
 from tests.support.rest import Rest
 from tests.system.containers.conftest import Site
 
+pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+
 MACHINE = "10.79.0.1"
 ROBOT_SIDE, OPERATOR_SIDE, OUTSIDE = "172.29.77.2", "172.29.78.2", "172.29.76.2"
 LANDSHARK, OCU, TABLET = "172.29.77.10", "172.29.78.20", "172.29.78.66"
@@ -118,11 +120,12 @@ def test_this_machine_reaches_the_console_and_the_laptop_does_not(
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
     certificate = tmp_path / "certificate.pem"
 
-    def ask() -> int:
+    def ask() -> list[int]:
         certificate.write_text(ssl.get_server_certificate(("127.0.0.1", 8443), timeout=10))
-        return Rest("https://127.0.0.1:8443", token, certificate).get("/v1/status").status
+        rest = Rest("https://127.0.0.1:8443", token, certificate)
+        return [rest.get(path).status for path in ("/v1/status", "/")]
 
-    assert site.machine.run(ask) == 200
+    assert site.machine.run(ask) == [200, 200]
     assert reaches(site.laptop.namespace, MACHINE, 8443) == "ConnectionRefusedError"
     assert demo.engine.inspect("demo_robot")["Internal"]
 

@@ -12,6 +12,8 @@ from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.system.containers.conftest import Site
 
+pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+
 APPLIANCE, MACHINE = "172.29.76.2", "172.29.76.1"
 LOCAL_PORTS = range(32768, 61000)
 

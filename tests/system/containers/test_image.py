@@ -14,6 +14,8 @@ from appliance.supervisor.users import NUMERIC_IDS
 from tests.support.docker import APPLIANCE, BASE, DEMO, ROOT
 from tests.system.containers.conftest import Site
 
+pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 TOOLS = re.compile(
     r"/(gcc|cc|c\+\+|g\+\+|ld|make|pip3?|git|curl|wget|nc|telnet|gdb|strace|tcpdump)(-[0-9.]+)?$"

@@ -12,6 +12,8 @@ import yaml
 from tests.support.docker import APPLIANCE, Compose, project
 from tests.system.containers.conftest import Site, without
 
+pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+
 STOP_SECONDS = 5.0
 
 

@@ -3,10 +3,14 @@
 import base64
 from pathlib import Path
 
+import pytest
+
 from tests.support.docker import Compose
 from tests.support.nodes import RosSession
 from tests.support.tunnels import JoinedHost, need_strongswan
 from tests.system.containers.conftest import Site, without
+
+pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
 
 MACHINE = "10.79.0.1"
 POLICY = """\
