@@ -22,7 +22,7 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"
-    config.write_text("api: 0.0.0.0:8443\n")
+    config.write_text("api: 0.0.0.0:8443\napi_networks: [10.84.0.0/24]\n")
     with Lab("rosrv-console") as lab:
         host = lab.host("machine", "10.84.0.2/24")
         with Appliance(

@@ -1,0 +1,218 @@
+"""Tests of `appliance.api.console`, and of the files it serves."""
+
+import asyncio
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+import appliance.api
+from appliance.api.console import VIEWS, is_console, routes
+from appliance.api.problems import ProblemError
+
+FILES = Path(appliance.api.__file__).parent / "console"
+VENDOR = FILES / "vendor"
+SOURCES = sorted(path for path in (FILES / "js").rglob("*.js"))
+IMPORT = re.compile(r"""(?:from|import)\s+"([^"]+)"|import\("([^"]+)"\)""")
+# Names of XML's vocabularies, not places that anything is fetched from.
+NAMESPACES = re.compile(
+    r"http://www\.w3\.org/(2000/svg|1999/xhtml|1998/Math/MathML|1999/xlink|2000/xmlns/|XML/1998/namespace)"
+)
+
+
+class Client:
+    """Asks the console's routes alone."""
+
+    def __init__(self) -> None:
+        app = FastAPI(exception_handlers={ProblemError: lambda _request, error: error.response()})
+        app.include_router(routes())
+        self._transport = httpx.ASGITransport(app)
+
+    def get(self, path: str, headers: dict[str, str] | None = None) -> httpx.Response:
+        """One request."""
+
+        async def ask() -> httpx.Response:
+            async with httpx.AsyncClient(transport=self._transport, base_url="http://console") as client:
+                return await client.get(path, headers=headers)
+
+        return asyncio.run(ask())
+
+
+@pytest.fixture
+def client() -> Client:
+    """A client."""
+    return Client()
+
+
+def test_the_page_is_served_at_every_view(client: Client) -> None:
+    """`/`, `/console` and each view, deeper addresses too, are the page; what is no view is nothing."""
+    paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
+    assert {client.get(path).text for path in paths} == {(FILES / "index.html").read_text()}
+    assert client.get("/console/elsewhere").status_code == 404
+
+
+def test_the_headers_close_the_page(client: Client) -> None:
+    """It may load, run and connect to nothing but this origin, is framed by nobody, and no text becomes script."""
+    for path in ("/", "/console/static/js/main.js"):
+        headers = client.get(path).headers
+        policy = dict(
+            part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";")
+        )
+        assert policy == {
+            "default-src": "'none'",
+            "script-src": "'self'",
+            "style-src": "'self'",
+            "img-src": "'self' data:",
+            "connect-src": "'self'",
+            "font-src": "'self'",
+            "base-uri": "'none'",
+            "form-action": "'none'",
+            "frame-ancestors": "'none'",
+            "require-trusted-types-for": "'script'",
+            "trusted-types": "'none'",
+        }
+        assert headers["cross-origin-opener-policy"] == "same-origin"
+        assert headers["x-frame-options"] == "DENY"
+
+
+def test_a_file_that_is_known_is_not_sent_again(client: Client) -> None:
+    """A file has an ETag by its content, is asked for again each time, and then answered with 304 and no body."""
+    first = client.get("/console/static/js/main.js")
+    assert first.headers["content-type"].startswith("text/javascript")
+    assert first.headers["cache-control"] == "no-cache"
+    again = client.get("/console/static/js/main.js", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert client.get("/console/static/css/base.css").headers["etag"] != first.headers["etag"]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../console.py",
+        "..%2Fconsole.py",
+        "%2e%2e/console.py",
+        "js/../../console.py",
+        "/etc/passwd",
+        "js",
+        "",
+        "JS/main.js",
+    ],
+)
+def test_no_path_leads_out(client: Client, path: str) -> None:
+    """Only exact names of the console's files are served."""
+    assert client.get(f"/console/static/{path}").status_code == 404
+
+
+@pytest.mark.parametrize("path", ["/consolex", "/v1/console", "/console.py", "//console/now"])
+def test_only_the_console_needs_no_token(path: str) -> None:
+    """What is served without a token begins with the console's own address."""
+    assert not is_console(path)
+
+
+def test_vendored_files_are_those_of_the_manifest() -> None:
+    """Every file of other people is in the manifest, with its hash and its packages, their versions and licences."""
+    manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
+    assert set(manifest) == {path.name for path in VENDOR.iterdir()} - {"manifest.json"}
+    licences = (VENDOR / "LICENCES.txt").read_text()
+    for name, entry in manifest.items():
+        assert hashlib.sha256((VENDOR / name).read_bytes()).hexdigest() == entry["sha256"], name
+        for package in entry["packages"]:
+            assert package["licence"] in ("MIT", "Apache-2.0", "OFL-1.1"), package
+            assert f"{package['name']} {package['version']}" in licences, package
+
+
+def test_vendored_versions_are_those_of_the_lock() -> None:
+    """What is vendored is what `console/package-lock.json` names: nothing was put there by hand."""
+    lock = json.loads((FILES.parents[2] / "console" / "package-lock.json").read_text())["packages"]
+    manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
+    for entry in manifest.values():
+        for package in entry["packages"]:
+            assert lock[f"node_modules/{package['name']}"]["version"] == package["version"]
+
+
+@pytest.mark.parametrize(
+    "path", sorted(p for p in FILES.rglob("*") if p.suffix in (".js", ".css", ".html", ".svg")), ids=str
+)
+def test_no_file_names_another_host(path: Path) -> None:
+    """No file has an address of another host in it that could be fetched."""
+    text = NAMESPACES.sub("", path.read_text())
+    assert re.findall(r"(?:https?:|wss?:)?//[a-z0-9-]+\.[a-z]{2,}[^\s\"'`]*", text) == []
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(FILES)))
+def test_sources_import_what_is_there_and_make_no_markup(path: Path) -> None:
+    """Every import is a file that is served; no source writes markup from text, evaluates text, or sets a cookie."""
+    text = path.read_text()
+    for relative, dynamic in IMPORT.findall(text):
+        name = relative or dynamic
+        target = FILES / name.removeprefix("/console/static/") if name.startswith("/") else path.parent / name
+        assert target.resolve().is_file(), name
+    for word in (
+        "innerHTML",
+        "outerHTML",
+        "insertAdjacentHTML",
+        "document.write",
+        "eval(",
+        "new Function",
+        "document.cookie",
+    ):
+        assert word not in text, word
+    assert len(text.splitlines()) <= 400
+
+
+def test_the_page_has_nothing_inline() -> None:
+    """No script, style or handler stands in the page itself, and all it names is there."""
+    page = (FILES / "index.html").read_text()
+    assert re.findall(r"<script(?![^>]*\bsrc=)|<style|\son\w+=|\sstyle=", page) == []
+    for name in re.findall(r'(?:src|href)="/console/static/([^"]+)"', page):
+        assert (FILES / name).is_file(), name
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_colours_can_be_read(theme: str) -> None:
+    """Every colour of text has a contrast of 4.5:1 on every surface it stands on, in both themes."""
+    css = (FILES / "css" / "tokens.css").read_text()
+    blocks = css.split(':root[data-theme="dark"]')
+    tokens = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", blocks[0]))
+    if theme == "dark":
+        tokens |= dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", blocks[1]))
+    pairs = [
+        (text, surface)
+        for text in ("text", "muted", "accent")
+        for surface in ("page", "surface", "sunken", "hover")
+    ]
+    pairs += [(tone, f"{tone}-soft") for tone in ("allow", "deny", "warn", "note")]
+    pairs += [
+        (tone, "surface")
+        for tone in (
+            "allow",
+            "deny",
+            "warn",
+            "mediated",
+            "code-key",
+            "code-section",
+            "code-comment",
+            "code-string",
+            "code-number",
+        )
+    ]
+    pairs += [("on-accent", "accent-fill"), ("text", "chosen"), ("muted", "chosen")]
+    low = {pair: round(_contrast(tokens[pair[0]], tokens[pair[1]]), 2) for pair in pairs}
+    assert {pair: ratio for pair, ratio in low.items() if ratio < 4.5} == {}
+
+
+def _contrast(one: str, other: str) -> float:
+    lights = sorted((_luminance(one), _luminance(other)))
+    return (lights[1] + 0.05) / (lights[0] + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    parts = [int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+    red, green, blue = (
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue

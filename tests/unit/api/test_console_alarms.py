@@ -1,0 +1,71 @@
+"""Tests of `appliance.api.console_alarms`."""
+
+from typing import Any
+
+import pytest
+
+from appliance.api.console_alarms import open_alarms
+
+GOOD: dict[str, Any] = {
+    "probe": "passed",
+    "relay": "connected",
+    "rosmaster": "reachable",
+    "policy": {"revision": 3, "file": "robot.ini", "confirm_by": None, "differs_from_file": False},
+    "audit": {"failed": None, "degraded": None},
+    "monitors": {"revision": 1, "held": [], "failing": [], "refused": [], "differs_from_folder": False},
+    "ipsec": {"troubles": []},
+}
+
+
+def changed(path: str, value: object) -> dict[str, Any]:
+    """The good status with one field another."""
+    status = {name: dict(part) if isinstance(part, dict) else part for name, part in GOOD.items()}
+    section, _dot, field = path.partition(".")
+    if field:
+        status[section][field] = value
+    else:
+        status[section] = value
+    return status
+
+
+def test_a_healthy_appliance_has_none() -> None:
+    """Nothing is open where nothing is wrong; nor before the probe has run."""
+    assert open_alarms(GOOD) == []
+    assert open_alarms(changed("probe", "")) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "kind", "severity", "about"),
+    [
+        ("probe", "11312 answers", "probe", "alarm", "system"),
+        ("relay", "away", "relay", "alarm", "system"),
+        ("rosmaster", "being rebuilt", "rosmaster", "warning", "system"),
+        ("audit.failed", "disk full", "audit-failed", "alarm", "audit"),
+        ("audit.degraded", "fsync is slow", "audit-degraded", "warning", "audit"),
+        ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),
+        ("policy.differs_from_file", True, "policy-differs", "notice", "policy"),
+        ("monitors.held", ["safeTrigger"], "monitor-held:safeTrigger", "alarm", "monitors"),
+        ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),
+        ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),
+        ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
+        ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
+    ],
+)
+def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severity: str, about: str) -> None:
+    """A condition opens one alarm, with its severity, what it is about, and words for a person."""
+    (alarm,) = open_alarms(changed(path, value))
+    assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
+    assert len(alarm.text) > 5
+
+
+def test_the_gravest_come_first() -> None:
+    """Alarms stand before warnings, warnings before notices."""
+    status = changed("policy.differs_from_file", True)
+    status["relay"] = "away"
+    status["rosmaster"] = "being rebuilt"
+    assert [one.severity for one in open_alarms(status)] == ["alarm", "warning", "notice"]
+
+
+def test_a_status_without_monitors_and_tunnels_is_taken() -> None:
+    """Parts that an appliance does not have are no failure."""
+    assert open_alarms({name: part for name, part in GOOD.items() if name not in ("monitors", "ipsec")}) == []
