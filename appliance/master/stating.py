@@ -31,7 +31,10 @@ class Revision:
 
 
 class Stating:
-    """What the relays were told and what they said; `enabled(name)` says whether a monitor's events happen."""
+    """What the relays were told and what they said; `enabled(name)` says whether a monitor's events happen.
+
+    `rows` has state and counters of the monitors, as far as their relays have told.
+    """
 
     def __init__(
         self,
@@ -52,21 +55,12 @@ class Stating:
         self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}
         self._held: dict[int, set[str]] = {}
         self._rows: dict[int, list[messages.MonitorRow]] = {}
+        self.rows: dict[str, messages.MonitorRow] = {}
 
     @property
     def held(self) -> set[str]:
         """The monitors that hold their topics."""
         return {name for names in self._held.values() for name in names}
-
-    @property
-    def rows(self) -> dict[str, messages.MonitorRow]:
-        """State and counters of the monitors, as far as their relays have told."""
-        return {
-            row.name: row
-            for relay, rows in self._rows.items()
-            for row in rows
-            if self.allocation.of_file(row.file) == relay
-        }
 
     def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
         """These are in force. After a crash of control (`restarted`) the relays go on with what they have."""
@@ -140,10 +134,20 @@ class Stating:
         self.allocation.adopt(plan)
         self._restate()  # those that lose monitors, and one that came in between and was told the revision before
         self.relays.place(plan.moves)
+        self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:
             self._say_moved(plan, moved)
         return moved
+
+    def _merge_rows(self) -> None:
+        """State and counters of the monitors, each as the relay tells it that has the monitor."""
+        self.rows = {
+            row.name: row
+            for relay, rows in self._rows.items()
+            for row in rows
+            if self.allocation.of_file(row.file) == relay
+        }
 
     def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
         names = [move.name for move in plan.moves]
@@ -194,6 +198,7 @@ class Stating:
                 self._refused(relay, number, findings)
             case messages.MonitorsCounted(rows):
                 self._rows[relay] = rows
+                self._merge_rows()
 
     def lost(self, relay: int) -> None:
         """A relay is gone: what it has not answered is refused, since it may have died of it."""

@@ -32,7 +32,7 @@ class Recent:
 
     def give(self, caller_id: str, now: float) -> list[Batch]:
         """What a subscriber that is served now is given, the oldest first; who comes soon after gets it as well."""
-        self._forget(now)
+        self.forget_old(now)
         again, over = caller_id in self._given, self.over(now)
         self._given.add(caller_id)
         if self._until is None:
@@ -51,14 +51,15 @@ class Recent:
             return
         self._batches.append((now, Batch(batch.keep(), batch.messages, batch.last, owned=True)))
         self._count(batch.messages, size)
-        self._forget(now)
+        self.forget_old(now)
 
     def clear(self) -> None:
         """Keep nothing."""
         self._batches.clear()
         self._count(-self._messages, -self._bytes)
 
-    def _forget(self, now: float) -> None:
+    def forget_old(self, now: float) -> None:
+        """What is too old, or beyond the bounds, takes no memory any more."""
         while self._batches and (
             self._batches[0][0] < now - SECONDS or self._messages > _MESSAGES or self._bytes > _BYTES
         ):

@@ -224,7 +224,9 @@ class RelayedTopic:
             member.cut(reason)
 
     def traffic(self) -> TopicTraffic | None:
-        """The counters since the last call; None when nothing has changed."""
+        """The counters since the last call, a second ago or so; None when nothing has changed."""
+        if self._recent is not None:
+            self._recent.forget_old(self._clock())
         if self._reported:
             return None
         row = TopicTraffic(

@@ -186,6 +186,17 @@ def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -
     assert story.budget.used == 0
 
 
+def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
+    """It is let go at the next look at the counters, though no other message comes."""
+    story = monitored()
+    story.topic.received(batch(b"1"))
+    story.topic.traffic()
+    assert story.budget.used > 0
+    story.now += 1.5
+    story.topic.traffic()
+    assert story.budget.used == 0
+
+
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
     """The last message of a latched one; the next message of one whose subscriber triggered the connection."""
     story = monitored(latching="1")

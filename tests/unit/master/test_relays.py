@@ -1,0 +1,181 @@
+"""Each relay is told what it carries, with its own port of each node; what moves takes its grants along."""
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.master.allocation import SERVICE, TOPIC, Allocation, Move, Plan
+from appliance.master.delivery import Delivery
+from appliance.master.places import Places
+from appliance.master.recorder import Recorder
+from appliance.master.registry import Incarnation, Kind, Registry
+from appliance.master.relays import RelayControl
+from appliance.ros.uris import parse_node_uri
+from appliance.store.state import StateStore
+
+pytestmark = pytest.mark.anyio
+HOST = ipaddress.ip_address("10.0.0.5")
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The loop that control runs on."""
+    return "asyncio"
+
+
+class Nothing:
+    """Takes every call and does nothing: journal, store, recorder, delivery."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given, **_named: None
+
+
+class Ports(Nothing):
+    """A socket for each port, told apart by its descriptor."""
+
+    def __init__(self) -> None:
+        self.sockets: dict[int, socket.socket] = {}
+
+    def socket(self, port: int) -> socket.socket:
+        """As `Places`."""
+        if port not in self.sockets:
+            self.sockets[port] = socket.socket()
+        return self.sockets[port]
+
+
+class Link:
+    """A relay's end: what it was told, in order."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
+        self.end: Callable[[], None] = lambda: None
+
+    def attach(self, _loop: Any, received: Any, closed: Callable[[], None]) -> None:
+        """As `Channel`."""
+        self.say, self.end = received, closed
+
+    def send(self, message: messages.Message, descriptors: tuple[int, ...] = ()) -> None:
+        """As `Channel`."""
+        self.told.append((message, descriptors))
+
+    def close(self) -> None:
+        """As `Channel`."""
+
+    def heard(self) -> list[messages.Message]:
+        """What was told since the last time."""
+        told, self.told = [message for message, _descriptors in self.told], []
+        return told
+
+
+class World:
+    """Two relays; /left and the service /serve belong to the first, /right to the second."""
+
+    def __init__(self) -> None:
+        self.registry = Registry(cast(Any, Nothing()))
+        self.allocation = Allocation(2)
+        self.put(left=0, right=1)
+        self.ports = Ports()
+        self.relay = RelayControl(
+            self.registry,
+            cast(Places, self.ports),
+            cast(StateStore, Nothing()),
+            cast(Delivery, Nothing()),
+            cast(Recorder, Nothing()),
+            allocation=self.allocation,
+            broken=lambda _incarnation: None,
+        )
+        uri = "http://10.0.0.5:4000/"
+        self.node = Incarnation(
+            "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
+        )
+        self.registry.add(self.node)
+        self.links = [Link(), Link()]
+        for index, link in enumerate(self.links):
+            self.relay.attach(index, cast(Channel, link))
+        for kind, name, detail in (
+            (Kind.PUBLICATION, "/left", "std_msgs/String"),
+            (Kind.PUBLICATION, "/right", "std_msgs/String"),
+            (Kind.SERVICE, "/serve", "4001"),
+        ):
+            self.registry.register(self.node, kind, name, detail)
+            self.relay.placed(self.node, kind, name, detail)
+
+    def put(self, **topics: int) -> None:
+        """These topics belong to these relays."""
+        resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
+        self.allocation.adopt(Plan({}, {**resources, (SERVICE, "/serve"): 0}))
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for one in self.ports.sockets.values():
+            one.close()
+
+
+async def test_each_relay_is_told_what_it_carries() -> None:
+    """With its own port of the node; so are grants, withdrawals and what a relay is told that comes anew."""
+    world = World()
+    relay, node, (first, second) = world.relay, world.node, world.links
+    placed = messages.NodePlaced("key", "/node", "10.0.0.5")
+    assert (placed, (world.ports.socket(2).fileno(),)) in first.told
+    assert (placed, (world.ports.socket(3).fileno(),)) in second.told
+    assert messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001) in first.heard()
+    assert messages.PublicationPlaced("key", "/right", "std_msgs/String") == second.heard()[-1]
+    assert [relay.port(node, Kind.PUBLICATION, name) for name in ("/left", "/right")] == [2, 3]
+    assert relay.port(node, Kind.SERVICE, "/serve") == 2
+    relay.grant_topic(node, "/right", HOST, "/ear")
+    grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
+    assert (first.heard(), second.heard()) == ([], [grant])
+    again = Link()
+    relay.attach(1, cast(Channel, again))
+    assert again.heard() == [
+        messages.StateBegan(2), placed, messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
+        messages.StateEnded(2),
+    ]  # fmt: skip
+    relay.withdrawn(node, Kind.PUBLICATION, "/left")
+    assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
+    relay.node_withdrawn(node)
+    assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
+    world.close()
+
+
+async def test_a_topic_moves_with_its_grants() -> None:
+    """Withdrawn by the old allocation, placed by the new one; other topics are not touched."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_topic(world.node, "/right", HOST, "/ear")
+    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    for link in world.links:
+        link.heard()
+    moves = [Move(TOPIC, "/right", 1, 0)]
+    relay.withdraw_moving(moves)
+    world.put(left=0, right=0)
+    relay.place_moved(moves)
+    assert second.heard() == [messages.PublicationWithdrawn("key", "/right")]
+    assert first.heard() == [
+        messages.PublicationPlaced("key", "/right", "std_msgs/String"),
+        messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
+    ]
+    assert relay.port(world.node, Kind.PUBLICATION, "/right") == 2
+    world.close()
+
+
+async def test_one_relay_goes_and_its_connections_with_it() -> None:
+    """Numbers of connections are each relay's own; who is asked after them gets numbers that differ."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    for link, topic in ((first, "/left"), (second, "/right")):
+        link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
+    assert len({one.number for one in relay.connections.values()}) == 2
+    lost: list[int] = []
+    relay.lost = lost.append
+    second.end()
+    assert [one.resource for one in relay.connections.values()] == ["/left"]
+    assert (lost, relay.presence) == ([1], "1 of 2 are away")
+    first.end()
+    assert relay.presence == "away"
+    world.close()
