@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Request, Response
 
+from appliance.api.hosts import SLOW_SECONDS
 from appliance.api.hosts_models import HOST_NAME, Enrolled, Enrolment, NewCertificate, Renewal
 from appliance.api.kits import Wishes, kit_of
 from appliance.api.problems import ProblemError
@@ -143,7 +144,7 @@ class _Patience:
 
 
 async def _ask(services: Services, order: AdminRequest) -> dict[str, Any]:
-    answer = await services.control.ask(order, _ITSELF)
+    answer = await services.control.ask(order, _ITSELF, SLOW_SECONDS)
     if not answer.ok and answer.trouble == "forbidden":
         raise ProblemError(403, "not-recognised", answer.error)
     return answered(answer)

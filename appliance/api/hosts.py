@@ -30,7 +30,7 @@ from appliance.api.hosts_models import (
 from appliance.api.kits import Wishes, enrolment_of, kit_of
 from appliance.api.preconditions import IfMatch, etag, expected_revision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Admin, Operator, Viewer, ask
+from appliance.api.roles import Admin, Operator, Viewer, answered, ask
 from appliance.api.services import Services
 from appliance.channel.admin import (
     HostAdd,
@@ -45,6 +45,7 @@ from appliance.channel.admin import (
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
+SLOW_SECONDS = 45.0  # charon may have to be started first
 _Responses = dict[int | str, dict[str, Any]]
 _TAG = {"ETag": {"description": "of the table of hosts", "schema": {"type": "string"}}}
 _TAGGED: _Responses = {200: {"headers": _TAG}}
@@ -125,7 +126,8 @@ def _add_enrolment(router: APIRouter, desk: "_Desk") -> None:
             made, tag = await desk.token(new.name, new, wishes, expected, bearer)
             return Response(made.model_dump_json(), 201, {"ETag": tag}, media_type="application/json")
         key, request = await _key_and_request(new.request)
-        body = await ask(desk.control, HostAdd(new.name, request, new.days, new.address, expected), bearer)
+        order = HostAdd(new.name, request, new.days, new.address, expected)
+        body = await desk.slowly(order, bearer)
         return desk.archive(body, wishes, key, 201)
 
     @router.post("/{name}/token", operation_id="host_token", responses=_CHANGES)
@@ -148,7 +150,7 @@ def _add_enrolment(router: APIRouter, desk: "_Desk") -> None:
         """A new certificate for an enrolled host, in a kit; the one before is revoked, its tunnel closed."""
         expected, wishes = _expected(if_match), _wishes(new)
         key, request = await _key_and_request(new.request)
-        body = await ask(desk.control, HostRenew(name, request, new.days, expected), bearer)
+        body = await desk.slowly(HostRenew(name, request, new.days, expected), bearer)
         return desk.archive(body, wishes, key)
 
 
@@ -188,6 +190,10 @@ class _Desk:
         response.headers["ETag"] = etag(body["revision"])
         return body
 
+    async def slowly(self, order: Any, bearer: Bearer) -> dict[str, Any]:
+        """Control's answer to what waits for charon or the signer."""
+        return answered(await self.control.ask(order, bearer.name, SLOW_SECONDS))
+
     async def token(
         self, name: str, asked: "NewHost | TokenWishes", wishes: Wishes, expected: int | None, bearer: Bearer
     ) -> tuple[EnrolmentToken, str]:
@@ -196,7 +202,7 @@ class _Desk:
         order = HostToken(
             name, kept, seconds, asked.days, asked.address, expected, new=isinstance(asked, NewHost)
         )
-        body = await ask(self.control, order, bearer)
+        body = await self.slowly(order, bearer)
         try:
             enrolment = enrolment_of(body, wishes)
         except ValueError as error:

@@ -21,6 +21,7 @@ from appliance.store.state import StateStore
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _REVISION = "hosts.revision"
 MOST_HOSTS = 4096
+LONGEST_DAYS = 398  # of a certificate, as the authority has it
 MOST_MACHINES = 1024
 
 

@@ -19,7 +19,7 @@ from appliance.master.awaited import LONGEST_SECONDS, MOST
 from appliance.master.certification import Certification, fingerprint
 from appliance.master.checked_ports import CheckedPorts
 from appliance.master.declared import DeclaredHostsError
-from appliance.master.host_table import HostRefusedError
+from appliance.master.host_table import LONGEST_DAYS, HostRefusedError
 from appliance.master.host_view import HostView
 from appliance.master.self_service import SelfService
 from appliance.policy.model import Address
@@ -147,6 +147,8 @@ class Hosts:
                 raise HostRefusedError(
                     f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
                 )
+            if not 0 < days <= LONGEST_DAYS:
+                raise HostRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
             if self._certification.rest.port is None:
                 raise HostRefusedError(self._certification.rest.trouble)
             if not await self._certification.until_served():

@@ -3,7 +3,7 @@
 Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
 
 1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
-   nodes.
+   nodes. Those that wait for charon or the signer (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
 """
@@ -44,6 +44,8 @@ _CHANGES = (
     PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange | HostAdd | HostToken | HostEnrol
     | HostRenew | HostRenewItself | HostRenewed | HostPorts | HostsReload
 )  # fmt: skip
+_SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself
+_MOST_SLOW = 16
 
 
 class RestLink:
@@ -56,6 +58,7 @@ class RestLink:
         self._channel: Channel | None = None
         self._waiting: deque[messages.RequestMade] = deque()
         self._worker: asyncio.Task[None] | None = None  # of the present link
+        self._slow: set[asyncio.Task[None]] = set()
         self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
         self.served: Callable[[str], None] = lambda pin: None  # noqa: ARG005 - set by control
         tokens.changed = self._state_tokens
@@ -101,10 +104,26 @@ class RestLink:
     async def _work(self, channel: Channel) -> None:
         while self._waiting and channel is self._channel:
             made = self._waiting.popleft()
-            answer = await self._answer(made)
-            if channel is self._channel:
-                self._send(messages.RequestAnswered(made.number, answer))
+            if isinstance(made.request, _SLOW):
+                self._begin(channel, made)
+            else:
+                await self._serve(channel, made)
             await asyncio.sleep(0)
+
+    def _begin(self, channel: Channel, made: messages.RequestMade) -> None:
+        """Serve beside the others what waits for charon or the signer."""
+        if len(self._slow) >= _MOST_SLOW:
+            text = "too many hosts are being enrolled: try again"
+            self._send(messages.RequestAnswered(made.number, AdminAnswer(False, error=text, trouble="busy")))
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(channel, made))
+        self._slow.add(task)
+        task.add_done_callback(self._slow.discard)
+
+    async def _serve(self, channel: Channel, made: messages.RequestMade) -> None:
+        answer = await self._answer(made)
+        if channel is self._channel:
+            self._send(messages.RequestAnswered(made.number, answer))
 
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
         if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:

@@ -165,10 +165,17 @@ if ! swanctl --list-sas --ike @connection@ | grep -q INSTALLED; then
     die "no tunnel. $why says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
 fi
 if [ -d /run/systemd/system ]; then
-    systemctl enable --quiet rosrv-tunnel.service rosrv-renew.timer
-    systemctl restart rosrv-tunnel.service rosrv-renew.timer
+    systemctl enable --quiet rosrv-tunnel.service
+    systemctl restart rosrv-tunnel.service
 else
     background keep /etc/rosrv/keep.sh
+fi
+if [ -z "@rest@" ]; then
+    say "warning: the appliance's REST is not reached through tunnels: the certificate cannot be renewed by itself"
+elif [ -d /run/systemd/system ]; then
+    systemctl enable --quiet rosrv-renew.timer
+    systemctl restart rosrv-renew.timer
+else
     background renew sh -c 'while sleep 3600; do /etc/rosrv/renew.sh; done'
 fi
 if [ -n "@rest@" ] && ! curl --silent --fail --max-time 20 --insecure --pinnedpubkey "@pin@" -o /dev/null "@rest@/v1/authority"; then

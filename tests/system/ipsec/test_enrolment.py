@@ -4,20 +4,25 @@ The laptop is a network namespace with its own /etc and /run, without systemd; s
 Debian's. REST is reached before the tunnel from the management network.
 """
 
+import datetime
 import json
 import os
 import re
+import signal
 import subprocess
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.lab import Lab
 from tests.support.appliance import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.requirements import need_program, need_root
+from tests.support.rest import Rest
 from tests.support.script_host import ScriptHost
 from tests.support.tunnel_site import MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
@@ -199,3 +204,148 @@ def test_somebody_in_between_gets_nothing(site: TunnelSite, laptop: ScriptHost, 
     assert not laptop.run("ls", "/etc/rosrv/other/rosrv-other", check=False).stdout
     site.recorded(mark, event="host enrolled")
     site.appliance.rosrv("host", "revoke", "other")
+
+
+def rest_of(site: TunnelSite) -> Rest:
+    """REST as the first admin, from the management network (the attacker's machine, which has a token here)."""
+    (site.home / "api.pem").write_text((site.appliance.state / "api/certificate.pem").read_text())
+    return Rest(f"https://{MIDDLE}:{API}", str(site.appliance.ready["token"]), site.home / "api.pem")
+
+
+def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """A kit from REST joins; the kit of later has no key; a new one closes the old tunnel; revoked, it is out."""
+    rest, ask = rest_of(site), site.attacker.run
+    seen = ask(lambda: rest.get("/v1/hosts"))
+    new = {"name": "rested", "endpoint": MIDDLE, "how": "kit"}
+    made = ask(lambda: rest.post("/v1/hosts", new, match=seen.etag))
+    assert made.status == 201, made.body
+    assert ask(lambda: rest.post("/v1/hosts", new, match=seen.etag)).status == 412
+    join_kit(laptop, tmp_path / "kit", made.body)
+    assert ask(lambda: rest.get("/v1/hosts/rested")).json["state"] == "up"
+    later = ask(lambda: rest.get(f"/v1/hosts/rested/kit?endpoint={MIDDLE}"))
+    (tmp_path / "later.tar.gz").write_bytes(later.body)
+    with tarfile.open(tmp_path / "later.tar.gz") as tar:
+        names = tar.getnames()
+    assert "rosrv-rested/swanctl/x509/rosrv.pem" in names
+    assert not [name for name in names if "private" in name]
+    mark = site.mark
+    again = ask(lambda: rest.post("/v1/hosts/rested/kit", {"endpoint": MIDDLE}, match="*"))
+    assert again.status == 200, again.body
+    site.recorded(mark, event="tunnel down")
+    join_kit(laptop, tmp_path / "again", again.body)
+    mark = site.mark
+    gone = ask(lambda: rest.request("DELETE", "/v1/hosts/rested", None, {"If-Match": "*"}))
+    assert gone.status == 200, gone.body
+    site.recorded(mark, event="tunnel down")
+    assert ask(lambda: rest.get("/v1/hosts/rested")).json["state"] == "revoked"
+    laptop.run("/etc/rosrv/leave.sh")
+
+
+def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
+    """Unpack a kit on the host and run its script."""
+    folder.mkdir()
+    (folder / "kit.tar.gz").write_bytes(kit)
+    laptop.run("tar", "-xzf", str(folder / "kit.tar.gz"), "-C", str(folder))
+    laptop.run("sh", str(folder / "rosrv-rested/join.sh"))
+
+
+def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """A host in its tunnel sees neither console nor API there, good token or not: only renewal and lists."""
+    script = tmp_path / "join.sh"
+    laptop.run("sh", str(script), awaited(site, "narrow", script))
+    curl = ("curl", "--silent", "--insecure", "-o", "/dev/null", "-w", "%{http_code}")
+    token = f"Authorization: Bearer {site.appliance.ready['token']}"
+    inside = f"https://{OWN}:{API}"
+    for path, status in (
+        ("/v1/hosts", "403"), ("/v1/status", "403"), ("/healthz", "403"), ("/", "403"), ("/v1/enrol", "403"),
+        ("/v1/authority", "200"), ("/v1/revocations", "200"),
+    ):  # fmt: skip
+        assert laptop.run(*curl, "-H", token, inside + path).stdout == status, path
+    other = laptop.run(*curl, "-X", "POST", f"{inside}/v1/hosts/laptop/renewed").stdout
+    assert other == "403", "not for another host"
+    site.appliance.rosrv("host", "revoke", "narrow")
+
+
+def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """A certificate of a minute and a half warns, is renewed without --now when its time has come, and lives on."""
+    script = tmp_path / "join.sh"
+    mark = site.mark
+    laptop.run("sh", str(script), awaited(site, "brief", script, "--days", str(90 / 86_400)))
+    first = row(site, "brief")
+    assert first["state"] == "up"
+    # The kit's script looks at the certificate, which is dated an hour back: its last third has begun already.
+    assert "in force" in laptop.run("/etc/rosrv/renew.sh").stdout
+    site.recorded(mark, event="host renewed")
+    second = row(site, "brief")
+    assert second["expires"] > first["expires"]
+    site.recorded(mark, event="tunnel down")
+    site.recorded(site.mark - 1, event="tunnel up")
+    assert row(site, "brief")["serial"] == second["serial"]
+    site.appliance.rosrv("host", "revoke", "brief")
+
+
+def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """charon takes two hundred enrolled hosts, and the one that comes gets its own address among them."""
+    rest, ask = rest_of(site), site.attacker.run
+    request = signing_request(make_key(), "many").decode()
+
+    def enrol_many() -> list[int]:
+        asked = {"endpoint": MIDDLE, "how": "kit", "request": request}
+        return [
+            rest.post("/v1/hosts", asked | {"name": f"many-{one}"}, match="*").status for one in range(200)
+        ]
+
+    assert set(ask(enrol_many)) == {201}
+    script = tmp_path / "join.sh"
+    laptop.run("sh", str(script), awaited(site, "last", script))
+    found = row(site, "last")
+    assert found["state"] == "up"
+    assert len({one["address"] for one in site.hosts()}) == len(site.hosts())
+    mark = site.mark
+    site.appliance.rosrv("host", "revoke", "last")
+    revoked = site.recorded(mark, event="host revoked")
+    down = site.recorded(mark, event="tunnel down")
+    assert seconds_of(down) - seconds_of(revoked) < 1.0
+
+
+def seconds_of(record: dict[str, Any]) -> float:
+    """The moment of a record, in seconds since the epoch."""
+    return datetime.datetime.fromisoformat(str(record["time"])[:26] + "+00:00").timestamp()
+
+
+def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """While keys are made anew without pause, by the host's own will: within a second it is out, and stays out."""
+    script = tmp_path / "join.sh"
+    joined = laptop.run("sh", str(script), awaited(site, "other", script))
+    laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]
+    with (
+        RosSession(MASTER, site.home, site.robot) as on_robot,
+        RosSession(f"http://{OWN}:11311", site.home, laptop) as on_laptop,
+    ):
+        talker = on_laptop.talker("rospy", "/orders", "--rate", "50", name="boss")
+        listener = on_robot.listener("rospy", "/orders", name="arm")
+        listener.wait_for(event="received")
+        rekey = (
+            "while :; do swanctl --rekey --ike rosrv; swanctl --rekey --child ros;"
+            " swanctl --initiate --child ros --timeout 2; done >/dev/null 2>&1"
+        )
+        rekeying = laptop.popen(["sh", "-c", rekey], start_new_session=True)
+        try:
+            listener.wait_for(event="received", since=len(listener.events) + 20)
+            mark = site.mark
+            site.appliance.rosrv("host", "revoke", "other")
+            revoked = site.recorded(mark, event="host revoked")
+            closed = site.recorded(mark, event="connection closed")
+            down = site.recorded(mark, event="tunnel down")
+            assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < 1.0
+            site.recorded(mark, event="tunnel refused", decision="deny")
+            heard = len(listener.seen(event="received"))
+            site.recorded(site.mark, event="tunnel refused", decision="deny")
+            assert len(listener.seen(event="received")) == heard
+            assert row(site, "other")["state"] == "revoked"
+            assert row(site, "other")["remote"] is None
+        finally:
+            os.killpg(rekeying.pid, signal.SIGKILL)
+            rekeying.wait()
+        talker.kill()  # it cannot say good-bye to anybody
+    laptop.run("/etc/rosrv/leave.sh")

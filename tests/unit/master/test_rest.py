@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AnyRequest, PolicyLoad, StatusWanted
+from appliance.channel.admin import AdminAnswer, AnyRequest, HostAdd, PolicyLoad, StatusWanted
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import TokenKept
 from appliance.master.rest import RestLink
@@ -25,12 +25,14 @@ class Everything:
         self.obstacle: str | None = None
         self.changed: Callable[[], None] = lambda: None
         self.ends: list[Channel] = []  # closed after the play
+        self.only_slow = False  # whether only others than the status wait for `go`
         self.go = asyncio.Event()
         self.go.set()
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer:
         """Answer when told to."""
-        await self.go.wait()
+        if not isinstance(request, StatusWanted) or not self.only_slow:
+            await self.go.wait()
         self.asked.append((request, who))
         if isinstance(request, PolicyLoad) and request.text == "defect":
             raise RuntimeError("secret detail")
@@ -97,6 +99,45 @@ def test_tokens_are_told_at_once_and_after_every_change() -> None:
         assert await api.until(1) == [messages.TokensStated([TOKEN])]
         world.changed()
         assert len(await api.until(2)) == 2
+
+    run(play)
+
+
+def test_enrolments_hold_nobody_up() -> None:
+    """Those that wait for charon are served beside the others, so many at most; then they are answered too."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.only_slow = True
+        world.go.clear()
+        api = Api(world, link)
+        for number in range(20):
+            api.channel.send(messages.RequestMade(number, "w", HostAdd(f"h{number}", "request")))
+        api.channel.send(messages.RequestMade(99, "w", StatusWanted()))
+        heard = (await api.until(6))[1:]
+        assert [one.answer.trouble for one in heard if one.number != 99] == ["busy"] * 4
+        assert [one.answer.ok for one in heard if one.number == 99] == [True]
+        world.go.set()
+        assert sum(one.answer.ok for one in (await api.until(22))[1:]) == 17
+
+    run(play)
+
+
+def test_what_it_is_recognised_by_is_passed_on() -> None:
+    """The api says the pin of its key; anything but one ends the link."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        pins: list[str] = []
+        link.served = pins.append
+        api = Api(world, link)
+        pin = "sha256//" + "A" * 43 + "="
+        api.channel.send(messages.RestServed(pin))
+        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        await api.until(2)
+        assert pins == [pin]
+        api.channel.send(messages.RestServed("$(reboot)"))
+        async with asyncio.timeout(20):
+            await api.closed.wait()
+        assert pins == [pin]
 
     run(play)
 
