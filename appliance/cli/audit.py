@@ -7,22 +7,12 @@ copy; with `--api` they read the running appliance's log over REST.
 import json
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, TextIO
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
 
 from appliance.audit.copies import read_copies
 from appliance.audit.output import Entry, as_json, as_object
@@ -32,6 +22,7 @@ from appliance.audit.signatures import read_public_key
 from appliance.cli.audit_errors import Errors, fail, tell
 from appliance.cli.audit_filter import filtered
 from appliance.cli.audit_output import line, print_entries, print_shown, print_verification, write
+from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
 
 app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)
@@ -137,8 +128,8 @@ def verify(
         source = appliance.audit()
         copies = None if checkpoints is None else read_copies(checkpoints)
         public_key = None if key is None else read_public_key(key)
-        with _progress("checking the chain", source.last) as progress:
-            result = source.verify(public_key, copies, progress)
+        with progress("checking the chain", source.last) as told:
+            result = source.verify(public_key, copies, told)
         if as_json_lines:
             write(json.dumps(msgspec.to_builtins(result)))
         else:
@@ -190,12 +181,12 @@ def export(
     """
     source = appliance.audit()
     entries = source.export(wanted)
-    with _progress("exporting", source.last) as progress:
+    with progress("exporting", source.last, shares_screen=output is None) as told:
         if output is None:
-            count = _write_all(entries, progress, sys.stdout)
+            count = _write_all(entries, told, sys.stdout)
         else:
             with output.open("x", encoding="ascii") as file:
-                count = _write_all(entries, progress, file)
+                count = _write_all(entries, told, file)
     if output is not None:
         tell(f"{count} records in {output}")
 
@@ -206,24 +197,11 @@ def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
     sys.stdout.flush()
 
 
-def _write_all(entries: Iterable[Entry], progress: Callable[[int], None], file: TextIO) -> int:
+def _write_all(entries: Iterable[Entry], told: Callable[[int], None], file: TextIO) -> int:
     count = 0
     for count, entry in enumerate(entries, 1):
         file.write(as_json(entry) + "\n")
         if count % _TOLD_EVERY == 0:
-            progress(entry.sequence)
+            told(entry.sequence)
     file.flush()
     return count
-
-
-@contextmanager
-def _progress(what: str, last: Callable[[], int]) -> Iterator[Callable[[int], None]]:
-    """Shows on a terminal how far long work is, up to the last record; elsewhere nothing."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda _sequence: None
-        return
-    columns = (SpinnerColumn(), TextColumn(what), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(what, total=last() or None)
-        yield lambda sequence: progress.update(task, completed=sequence)

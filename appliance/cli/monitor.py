@@ -14,6 +14,7 @@ from appliance.cli.monitor_bag import Recording, definitions_of, open_bag, refus
 from appliance.cli.monitor_input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor_output import lines, record, say_finding
 from appliance.cli.policy_output import counted, printable, say, say_json
+from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import CompiledProperty
@@ -21,6 +22,7 @@ from appliance.rosmop.logics.picture import dot_of, svg_of
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
 
+_TOLD_EVERY = 1000
 app = typer.Typer(
     help="Monitors: check specifications, try them on a recording, run them on the robot.",
     no_args_is_help=True,
@@ -107,17 +109,20 @@ def _load(files: list[Path], folders: list[Path], recorded: Definitions | None =
 def _report(monitors: MonitorSet, reader: Reader, recording: Recording | None, *, as_json: bool) -> None:
     counts = {"passed": 0, "changed": 0, "dropped": 0}
     verdicts = faults = 0
-    for replayed in replay(monitors, reader, recording):
-        outcome = replayed.outcome
-        if replayed.topic is not None:
-            counts[outcome.result] += 1
-        verdicts += len(outcome.verdicts)
-        faults += len(outcome.faults)
-        if as_json:
-            say_json(record(outcome, replayed.index, replayed.topic))
-        else:
-            for line in lines(outcome, replayed.index, replayed.topic):
-                say(line)
+    with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
+        for number, replayed in enumerate(replay(monitors, reader, recording)):
+            outcome = replayed.outcome
+            if replayed.topic is not None:
+                counts[outcome.result] += 1
+            verdicts += len(outcome.verdicts)
+            faults += len(outcome.faults)
+            if as_json:
+                say_json(record(outcome, replayed.index, replayed.topic))
+            else:
+                for line in lines(outcome, replayed.index, replayed.topic):
+                    say(line)
+            if not number % _TOLD_EVERY:
+                told(sum(counts.values()))
     if not as_json:
         total = ", ".join(f"{number} {word}" for word, number in counts.items())
         say(f"{counted(sum(counts.values()), 'message')}: {total}; "
