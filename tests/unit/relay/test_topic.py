@@ -189,7 +189,7 @@ def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -
 def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
     """It is let go at the next look at the counters, though no other message comes."""
     story = monitored()
-    story.topic.received(batch(b"1"))
+    story.receive(batch(b"1"))
     story.topic.traffic()
     assert story.budget.used > 0
     story.now += 1.5
