@@ -12,7 +12,6 @@ Invariants:
 import asyncio
 import contextlib
 import contextvars
-import itertools
 import sqlite3
 import threading
 import time
@@ -27,27 +26,21 @@ import structlog
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.folding import Folder, FoldSettings, Key, summary
+from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
+from appliance.audit.lost import Lost
 from appliance.audit.record import Record, Severity
 from appliance.audit.retention import Retention
 from appliance.audit.signatures import Signatures, Signer
+from appliance.audit.waiting import Barrier, Settled, Waiter, answer
 from appliance.audit.writer import ChainWriter
 
 Durability = Literal["strict", "batched"]
-Settled = Callable[[str | None], None]
 _GATHER_SECONDS = 0.02
 _RETRY_SECONDS = 0.5
 _LARGEST_BATCH = 2048
-_TEXT_BACKLOG = 20_000
-_TEXT_STEP = 256
 _IDLE_SECONDS = 1.0
 _CLOSE_SECONDS = 10.0
-_REMOVED_AT_ONCE = 512
-_RETENTION_SECONDS = 5.0
-_AGE_SECONDS = 3600.0
-_HOUSE_SECONDS = 10.0
-_ASK_AGAIN_SECONDS = 30.0
-_WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
 _logger = structlog.get_logger()
 
 
@@ -56,15 +49,6 @@ class Lag(NamedTuple):
 
     records: int
     seconds: float
-
-
-class _Barrier(NamedTuple):
-    settled: Settled
-
-
-class _Waiter(NamedTuple):
-    loop: asyncio.AbstractEventLoop
-    future: asyncio.Future[str | None]
 
 
 class _Signature(NamedTuple):
@@ -108,27 +92,26 @@ class AuditLog:
         self.ids = IdSource(clock=clock)
         self.strict = durability == "strict"
         self._clock = clock
-        self._checkpoint_every = checkpoint_every
-        self._checkpoint_seconds = checkpoint_seconds
-        self._retention = retention or Retention()
-        self._retained_at = 0.0
-        self._aged_at = 0.0
         self._queue_limit = queue_limit
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
         self._queue: deque[Any] = deque()
         self._held: list[Record] = []
-        self._barriers: list[_Barrier | _Waiter] = []
+        self._house = Housekeeping(
+            path,
+            self._signatures,
+            retention or Retention(),
+            Checkpoints(checkpoint_every, checkpoint_seconds),
+            clock=clock,
+            make=self._own,
+            hold=self._held.append,
+        )
+        self._barriers: list[Barrier | Waiter] = []
         self._writer: ChainWriter | None = None
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
-        self._degraded: str | None = None
-        self._house_at = 0.0
-        self._asked_at = 0.0
         self._caught_up = self._written_at = time.monotonic()
-        self._unsealed = 0
-        self._sealed_at = time.monotonic()
-        self._lost = _Lost()
+        self._lost = Lost()
         self._idle = False
         self._ended = False
         self._counts_recovered = False
@@ -159,14 +142,14 @@ class AuditLog:
 
         It is called on the log's thread.
         """
-        self._put(_Barrier(settled))
+        self._put(Barrier(settled))
         self._hurry.set()
 
     async def wait_durable(self) -> str | None:
         """Wait until all that was recorded so far is on disk; the reason when it cannot be written."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
-        self._put(_Waiter(loop, future))
+        self._put(Waiter(loop, future))
         if not self.strict:
             self._hurry.set()
         return await future
@@ -179,7 +162,7 @@ class AuditLog:
     @property
     def degraded(self) -> str | None:
         """Why checkpoints, the full-text index or retention are behind; None when they are not."""
-        return self._degraded
+        return self._house.degraded
 
     @property
     def lag(self) -> Lag:
@@ -238,8 +221,8 @@ class AuditLog:
         with contextlib.suppress(IndexError):
             while True:
                 item = self._queue.popleft()
-                if isinstance(item, _Barrier | _Waiter):
-                    _answer([item], self._failed)
+                if isinstance(item, Barrier | Waiter):
+                    answer([item], self._failed)
 
     def _serve(self) -> None:
         self._attempt(self._open)
@@ -249,9 +232,9 @@ class AuditLog:
             self._turn()
         self._turn()
         self._held.extend(self._folder.finish())
-        self._unsealed += len(self._held)
-        if self._attempt(self._write) and self._unsealed:
-            self._keep_house(self._seal)
+        self._house.unsealed += len(self._held)
+        if self._attempt(self._write) and self._house.unsealed:
+            self._house.attempt(self._house.seal)
         self._answer_barriers()
         self._unwritten = self._failed
         if self._writer is not None:
@@ -265,18 +248,10 @@ class AuditLog:
             self._held.extend(self._folder.expire(now))
             written = self._attempt(self._write)
             self._answer_barriers()
-            if written and self._seal_is_due():
-                self._keep_house(self._seal)
-            self._keep_house(self._index_backlog)
+            self._house.after_batch(written=written)
             if not more or not written:
                 break
-        if self._writer is not None and not self._queue:
-            # One record alone does not pay a commit of the index; it waits for others or for a quiet second.
-            quiet = time.monotonic() - self._written_at >= _IDLE_SECONDS / 2
-            if quiet or self._writer.text_lag >= _TEXT_STEP:
-                self._keep_house(self._index)
-        if self._writer is not None and time.monotonic() >= self._retained_at:
-            self._keep_house(self._retain)
+        self._house.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
 
     def _wait(self) -> None:
         if self._failed is not None:
@@ -298,10 +273,9 @@ class AuditLog:
         now = time.monotonic()
         due = self._folder.next_due()
         waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
-        if now >= self._house_at:
-            waits.append(self._retained_at - now)
-            if self._unsealed:
-                waits.append(self._sealed_at + self._checkpoint_seconds - now)
+        house = self._house.next_due(now)
+        if house is not None:
+            waits.append(house)
         return max(0.001, min(waits))
 
     def _drain(self) -> bool:
@@ -315,11 +289,11 @@ class AuditLog:
             if isinstance(item, Record):
                 self._held.extend(offer(item, now))
             elif isinstance(item, _Signature):
-                self._keep_house(partial(self._keep_signature, item))
+                self._house.attempt(partial(self._house.keep_signature, *item))
             elif isinstance(item, _Refusal):
-                self._refused(item.number, item.reason)
+                self._house.refused(item.number, item.reason)
             elif isinstance(item, _AskSignatures):
-                self._keep_house(self._ask_signatures)
+                self._house.attempt(self._house.ask_signatures)
             else:
                 self._barriers.append(item)
         return bool(queue)
@@ -330,22 +304,10 @@ class AuditLog:
             if self._writer is None and action != self._open:
                 self._open()
             action()
-        except _WRITE_ERRORS as error:
+        except WRITE_ERRORS as error:
             self._fail(error)
             return False
         return True
-
-    def _keep_house(self, action: Callable[[], None]) -> None:
-        """Do what can wait; when it fails it is tried again later; only writing records decides `failed`."""
-        if time.monotonic() < self._house_at:
-            return
-        try:
-            action()
-        except _WRITE_ERRORS as error:
-            self._degraded = f"{self.path}: {error}"
-            self._house_at = time.monotonic() + _HOUSE_SECONDS
-        else:
-            self._degraded = None
 
     def _fail(self, error: Exception) -> None:
         reason = str(error)
@@ -354,7 +316,7 @@ class AuditLog:
             self._failed_since = self._clock()
             _logger.error("the audit log cannot be written", reason=self._failed)
         if self._writer is not None:
-            writer, self._writer = self._writer, None
+            writer, self._writer, self._house.writer = self._writer, None, None
             with contextlib.suppress(sqlite3.Error):
                 writer.close()
 
@@ -368,7 +330,6 @@ class AuditLog:
             self._held.insert(
                 0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
             )
-        self._unsealed = writer.sequence - writer.checkpoint_sequence
         # Only what an earlier process left; what this one counts stands there as well and is still being counted.
         left = [] if self._counts_recovered else writer.open_folds()
         if left:
@@ -377,7 +338,7 @@ class AuditLog:
         self._continued = (writer.log_id, writer.sequence)
         if not self._failed_since:
             self._failed = None
-        self._signatures.ask(writer)
+        self._house.opened(writer)
 
     def _write(self) -> None:
         writer = self._writer
@@ -391,7 +352,7 @@ class AuditLog:
             self._continued = (writer.log_id, writer.sequence)
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
-            self._unsealed += len(batch) + len(report)
+            self._house.unsealed += len(batch) + len(report)
             self._caught_up = self._written_at = time.monotonic()
             if self._failed_since:
                 _logger.warning("the audit log is written again")
@@ -407,76 +368,10 @@ class AuditLog:
         detail = {"since": self._failed_since, "until": self._clock()}
         return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
 
-    def _seal_is_due(self) -> bool:
-        waited = time.monotonic() - self._sealed_at
-        return self._unsealed >= self._checkpoint_every or (
-            self._unsealed > 0 and waited >= self._checkpoint_seconds
-        )
-
-    def _seal(self) -> None:
-        writer = self._writer
-        if writer is None:
-            return
-        self._sealed_at = time.monotonic()
-        checkpoint, text = writer.seal(self._clock())
-        detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
-        writer.append([self._own("checkpoint", Severity.DEBUG, "", detail)])
-        self._unsealed = 0
-        if self._sealed_at - self._asked_at > _ASK_AGAIN_SECONDS:
-            # An answer may have been lost on the way; asking twice for the same is harmless.
-            self._ask_signatures()
-        else:
-            self._signatures.sealed(checkpoint.number, text)
-
-    def _retain(self) -> None:
-        """Remove one step of old records if they must go; the next step follows at once."""
-        writer, now = self._writer, time.monotonic()
-        self._retained_at = now + _RETENTION_SECONDS
-        if writer is None:
-            return
-        before = None
-        reason = self._retention.excess(writer.size())
-        if reason is None and self._retention.days is not None and now >= self._aged_at:
-            before = self._retention.oldest_kept(self._clock())
-            reason = f"older than {self._retention.days} days"
-        signed = self._signatures.has_signer
-        gone = None if reason is None else writer.removable(_REMOVED_AT_ONCE, signed=signed, before=before)
-        if gone is None:
-            self._aged_at = now + _AGE_SECONDS if before is not None else self._aged_at
-            return
-        detail = gone._asdict() | {"count": gone.last_sequence - gone.first_sequence + 1}
-        writer.remove(gone, self._own("records removed", Severity.NOTICE, reason or "", detail))
-        self._unsealed += 1
-        self._retained_at = 0.0
-
-    def _keep_signature(self, item: _Signature) -> None:
-        if self._writer is None:
-            return
-        refusal = self._signatures.keep(self._writer, item.number, item.signature, item.public_key)
-        if refusal is not None:
-            self._refused(item.number, refusal)
-
-    def _refused(self, number: int, reason: str) -> None:
-        self._held.append(self._own("signature refused", Severity.ALARM, reason, {"number": number}))
-
-    def _ask_signatures(self) -> None:
-        self._asked_at = time.monotonic()
-        if self._writer is not None:
-            self._signatures.ask(self._writer)
-
-    def _index(self) -> None:
-        while self._writer is not None and not self._queue and self._writer.index_text():
-            pass
-
-    def _index_backlog(self) -> None:
-        """Under load the full-text index waits, but only so long: what it lacks every search has to read."""
-        if self._writer is not None and self._writer.text_lag > _TEXT_BACKLOG:
-            self._writer.index_text(_LARGEST_BATCH)
-
     def _answer_barriers(self) -> None:
         result = self._failed if self._held or self._folder.touched else None
         barriers, self._barriers = self._barriers, []
-        _answer(barriers, result)
+        answer(barriers, result)
 
     def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> Record:
         return Record(
@@ -487,50 +382,6 @@ class AuditLog:
             reason=reason,
             detail=detail,
         )
-
-
-class _Lost:
-    """Counts records that did not fit into the queue."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._first = self._last = 0
-        self._lock = threading.Lock()
-
-    def add(self, record: Record) -> None:
-        with self._lock:
-            self._first = self._first if self.count else record.time
-            self._last = record.time
-            self.count += 1
-
-    def take(self) -> dict[str, Any]:
-        with self._lock:
-            detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
-            self.count = 0
-            return detail
-
-
-def _answer(barriers: list[_Barrier | _Waiter], result: str | None) -> None:
-    """Answer barriers; those of one event loop with one call into it."""
-    for loop, group in itertools.groupby(
-        barriers, lambda one: one.loop if isinstance(one, _Waiter) else None
-    ):
-        futures = []
-        for one in group:
-            if isinstance(one, _Waiter):
-                futures.append(one.future)
-            else:
-                one.settled(result)
-        if loop is not None:
-            # A closed loop raises RuntimeError: nobody waits any more.
-            with contextlib.suppress(RuntimeError):
-                loop.call_soon_threadsafe(_settle, futures, result)
-
-
-def _settle(futures: list[asyncio.Future[str | None]], result: str | None) -> None:
-    for future in futures:
-        if not future.done():
-            future.set_result(result)
 
 
 def _fold_key(key: Key) -> bytes:
