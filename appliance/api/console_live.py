@@ -24,10 +24,19 @@ from appliance.channel.admin import GraphWanted
 
 _PING_SECONDS = 15
 _SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next
+_EVENT = {
+    "type": "object",
+    "properties": {
+        "event": {"type": "string"},
+        "data": {"type": "string", "description": "JSON"},
+        "id": {"type": "string"},
+    },
+    "required": ["event", "data"],
+}
 _TEXT: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `now`, `graph`, `away`, `end`.",
-        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        "content": {"text/event-stream": {"schema": _EVENT}},
     }
 }
 

@@ -105,7 +105,9 @@ def test_every_operation_is_described(appliance: Appliance) -> None:
         "GET /v1/status", "GET /v1/policy", "POST /v1/policy", "GET /v1/policy/revisions", "POST /v1/policy/rollback",
         "POST /v1/policy/reload", "GET /v1/policy/explain", "GET /v1/audit", "GET /v1/audit/stream",
         "GET /v1/audit/{record_id}", "GET /v1/audit/verify", "GET /v1/audit/export", "GET /v1/graph", "GET /healthz",
-        "GET /readyz", "GET /metrics", "GET /v1/hosts", "POST /v1/hosts", "DELETE /v1/hosts/{name}", "POST /v1/enrol",
+        "GET /readyz", "GET /metrics", "GET /v1/monitors", "POST /v1/monitors", "PUT /v1/monitors/{name}",
+        "PATCH /v1/monitors", "DELETE /v1/monitors/{name}", "GET /v1/monitors/{name}/history", "GET /v1/tokens",
+        "GET /v1/hosts", "POST /v1/hosts", "DELETE /v1/hosts/{name}", "POST /v1/enrol",
         "POST /v1/hosts/{name}/token", "GET /v1/hosts/{name}/kit", "POST /v1/hosts/{name}/renew",
     } <= set(operations)  # fmt: skip
     assert len({one["operationId"] for one in operations.values()}) == len(operations)
