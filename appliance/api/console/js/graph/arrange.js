@@ -54,6 +54,7 @@ function added(/** @type {Map<string, any>} */ items, /** @type {Map<string, any
   /** @type {Map<string, Spot>} */
   const spots = new Map();
   for (const key of items.keys()) if (before.has(key)) spots.set(key, /** @type {Spot} */ (before.get(key)));
+  const all = extent(spots.values());
   for (const key of fresh.sort()) {
     const [w, h] = sizeOf(items.get(key));
     const near = [];
@@ -62,8 +63,8 @@ function added(/** @type {Map<string, any>} */ items, /** @type {Map<string, any
       if (line.to === key && spots.has(line.from)) near.push({ spot: /** @type {Spot} */ (spots.get(line.from)), side: 1 });
     }
     const beside = near[0];
-    const x = beside ? beside.spot.x + beside.side * ((beside.spot.w + w) / 2 + COLUMN) : w / 2;
-    const y = beside ? near.reduce((sum, one) => sum + one.spot.y, 0) / near.length : 0;
+    const x = beside ? beside.spot.x + beside.side * ((beside.spot.w + w) / 2 + COLUMN) : all.x + w / 2;
+    const y = beside ? near.reduce((sum, one) => sum + one.spot.y, 0) / near.length : all.y + all.h + GAP + h / 2;
     spots.set(key, free({ x, y, w, h }, [...spots.values()]));
   }
   return spots;

@@ -15,14 +15,18 @@ const CLOSEST = 2.5;
 export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
+  const all = extent(spots.values());
   const own = useRef(false); // whether the reader chose what is seen; until then all is
   const fit = () => {
     own.current = false;
-    if (box.current) setLook(fitted(extent(spots.values()), box.current));
+    if (box.current) setLook(fitted(all, box.current));
   };
   const newest = useRef(fit);
   newest.current = fit;
   useEffect(() => fit(), [arranged, spots.size > 0]);
+  useEffect(() => {
+    if (!own.current) fit(); // something new stands outside of what was seen
+  }, [all.x, all.y, all.w, all.h]);
   useEffect(() => {
     if (!box.current) return undefined;
     const observer = new ResizeObserver(() => own.current || newest.current());

@@ -52,7 +52,7 @@ function near(/** @type {any} */ a, /** @type {any} */ b) {
 
 function denied(/** @type {any} */ one, /** @type {any[]} */ more) {
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
-    <div><${Given} value=${one.caller_id} most=${60} mono none="nobody" /> <span class="muted">of</span> <${Given} value=${one.host} mono /> <span class="muted"><${Given} value=${one.category} none="" /></span> <${Given} value=${one.resource} most=${80} mono /><${More} more=${more} /></div>
+    <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${one.resource ? one.category : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" /><${More} more=${more} /></div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 

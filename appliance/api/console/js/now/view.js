@@ -42,7 +42,7 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
     <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
     <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>
-    <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : "Complete"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
+    <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : "Written"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
   </section>`;
 }
 
