@@ -1,0 +1,69 @@
+"""Tests of `appliance.api.monitor_judgement`: what specifications are and would do, without an appliance."""
+
+import pytest
+
+from appliance.api.monitor_judgement import (
+    Compiler,
+    events_of,
+    findings_of,
+    judge,
+    picture_of,
+    properties_of,
+    refusal,
+)
+from appliance.api.problems import ProblemError
+
+A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
+TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
+IN_FORCE = {"files": {"a.rv": A}, "definitions": {}}
+
+
+def test_a_draft_says_what_it_would_change() -> None:
+    """Files that are added and changed, the monitors there would be; what is the same is not named."""
+    draft = judge(IN_FORCE, {"a.rv": A + " ", "b.rv": TICK}, {}, 7)
+    assert (draft.added, draft.changed, draft.removed, draft.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
+    assert judge(IN_FORCE, {"a.rv": A}, {}, 7).changed == []
+
+
+def test_a_draft_that_is_wrong_is_refused_with_its_place() -> None:
+    """The problem has every finding as a structure, and as lines of its detail."""
+    with pytest.raises(ProblemError) as refused:
+        judge(IN_FORCE, {"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}, {}, 7)
+    problem = refused.value
+    assert (problem.status, problem.kind, problem.line) == (422, "specifications-refused", 2)
+    assert problem.detail.splitlines()[0] == "refused; revision 7 of the specifications stays in force"
+    assert problem.detail.splitlines()[1].startswith("c.rv:2:")
+
+
+def test_findings_without_a_place_stay_words() -> None:
+    """What cannot be pointed at is in the detail alone."""
+    problem = refusal("refused", ["a would go, too: it is in the same file", "a.rv:1:2: error: odd: 1:2"])
+    assert problem.findings is not None
+    assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
+    assert "would go, too" in problem.detail
+    assert findings_of(["nonsense", "a:b:c: error: x"]) == []
+
+
+def test_a_monitor_is_told_apart() -> None:
+    """Events of topics, services and clocks; properties with what they handle; a picture of what is finite."""
+    compiler = Compiler()
+    a = compiler.monitor(1, {"a.rv": A, "b.rv": TICK}, {}, "a")
+    b = compiler.monitor(1, {}, {}, "b")  # compiled before: the same revision is not compiled again
+    (said,) = events_of(a)
+    assert (said.name, said.topic, said.type, said.part, said.every) == (
+        "said",
+        "/chatter",
+        "std_msgs/String",
+        None,
+        None,
+    )
+    tick, asked = events_of(b)
+    assert (tick.topic, tick.every) == (None, 0.5)
+    assert (asked.topic, asked.type, asked.part) == ("/set", "std_srvs/SetBool", "request")
+    (matched,) = properties_of(a)
+    assert (matched.logic, matched.handled, matched.drawn) == ("ere", ["match"], True)
+    assert str(picture_of(a)).startswith("<svg ")
+    assert picture_of(b) is None
+    with pytest.raises(KeyError):
+        compiler.monitor(1, {}, {}, "nobody")
+    assert {one.file for one in compiler.warnings("a.rv")} <= {"a.rv"}
