@@ -344,3 +344,53 @@ def test_missing_log(tmp_path: Path) -> None:
         verify(tmp_path / "audit.db")
     with pytest.raises(LogUnreadableError, match="no such directory"):
         verify(tmp_path / "nowhere" / "audit.db")
+
+
+def content(path: Path) -> list[tuple[object, ...]]:
+    """All that a reviewer can read: records and checkpoints."""
+    with closing(sqlite3.connect(path)) as connection:
+        records = connection.execute(f"SELECT {COLUMNS}, hash FROM record ORDER BY sequence").fetchall()
+        return records + connection.execute("SELECT * FROM checkpoint ORDER BY number").fetchall()
+
+
+def test_altered_byte_by_byte(log: Path) -> None:
+    """Bytes all over the file, altered one at a time: each is found, or changes nothing that anybody reads."""
+    before, data = content(log), log.read_bytes()
+    found_out = 0
+    for position in range(7, len(data), len(data) // 250):
+        changed = bytearray(data)
+        changed[position] ^= 0x55
+        log.write_bytes(changed)
+        try:
+            result = verify(log)
+        except LogUnreadableError:
+            found_out += 1
+            continue
+        if result.ok:
+            assert content(log) == before, f"byte {position} of {len(data)}"
+        else:
+            assert all(one.message for one in result.findings)
+            found_out += 1
+    log.write_bytes(data)
+    assert verify(log).ok
+    assert found_out > 50
+
+
+def test_a_clock_that_was_set_back(make_log, path: Path) -> None:
+    """Records of a clock that jumped into the past are in the order they were made, and the log is whole."""
+    now = [2_000_000_000_000_000_000]
+    log = make_log(clock=lambda: now[0], checkpoint_every=10)
+    for number in range(30):
+        log.record(decision(log, number, time=now[0]))
+        if number == 15:
+            now[0] -= 10**18  # thirty years
+        assert settle(log) is None
+    log.close()
+    result = verify(path)
+    assert result.ok, result.findings
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT sequence, id, time FROM record WHERE event = 'decision' ORDER BY sequence"
+        rows = connection.execute(query).fetchall()
+    assert len(rows) == 30
+    assert [row[1] for row in rows] == sorted(row[1] for row in rows)
+    assert min(row[2] for row in rows) < max(row[2] for row in rows) - 9 * 10**17
