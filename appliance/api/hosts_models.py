@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from appliance.api.policy_models import Model
 
@@ -24,6 +24,12 @@ SigningRequest = Annotated[
 ]
 State = Literal["up", "down", "expired", "revoked", "not wanted", "awaited", "not enrolled"]
 PortsState = Literal["closed", "open", "unknown"]
+
+
+class Asked(Model):
+    """What is taken is exact: `true` is no number, and a text of digits is none either."""
+
+    model_config = ConfigDict(strict=True)
 
 
 class PortsSeen(Model):
@@ -88,7 +94,7 @@ class Hosts(Model):
     troubles: list[str] = Field(description="what a person should look at")
 
 
-class KitWishes(Model):
+class KitWishes(Asked):
     """What goes into a kit besides the certificate."""
 
     endpoint: Annotated[
@@ -152,7 +158,7 @@ class EnrolmentToken(Model):
     )
 
 
-class Enrolment(Model):
+class Enrolment(Asked):
     """What a host brings to be enrolled."""
 
     token: Annotated[str, Field(pattern=TOKEN)]
@@ -174,7 +180,7 @@ class Enrolled(Model):
     files: dict[str, str]
 
 
-class Renewal(Model):
+class Renewal(Asked):
     """A signing request for a new key, and the present key's signature over its bytes (base64)."""
 
     request: SigningRequest
@@ -200,7 +206,7 @@ class Revoked(Model):
     taken_back: int = Field(description="registrations and grants")
 
 
-class PortsTold(Model):
+class PortsTold(Asked):
     """What `rosrv protect --check` saw."""
 
     state: PortsState
