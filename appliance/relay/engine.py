@@ -205,7 +205,7 @@ class Engine:
     def _let_monitor(self, relayed: RelayedTopic) -> None:
         """Messages of a topic go through the monitors if one stands there, and past them otherwise."""
         middle, key, topic = self._middle, relayed.key, relayed.topic
-        through = (lambda batch: middle.through(key, topic, batch)) if middle.stands(topic) else None
+        through = middle.lane(key, topic).through if middle.stands(topic) else None
         relayed.monitor(through, wanted=middle.wants(topic))
 
     def _monitors_changed(self) -> None:

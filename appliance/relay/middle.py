@@ -1,8 +1,7 @@
 """Monitors in the middle: the specifications in force, and what they do to messages, requests and replies.
 
 A topic without an enabled event never comes here (`stands` is asked when something changes, not per message). The
-messages of a batch are taken many at a time where they need nothing but the common (`_walk`), one by one where there
-is something to tell; what nobody changed or dropped leaves in the buffer it came in.
+messages of the others go through their lanes (`lane.py`).
 
 Invariants:
 - Whatever goes wrong with a monitor, a defect of this program included, ends the way of that message and of nothing
@@ -11,11 +10,10 @@ Invariants:
 - One swap is between two messages. What monitors publish is not given to monitors.
 - The clock of monitors never goes back and makes no leap: it is the time of the day when the relay started, and
   from there the monotonic clock. The messages of one batch have come at the same time.
-- The relay always answers its supervisor: when monitors have taken `_LONGEST` seconds of processor time since the
+- The relay always answers its supervisor: when monitors have taken `lane.LONGEST` seconds of processor time since the
   loop last came to its timers (they never do unless messages take them long), the messages until then are dropped.
 """
 
-import struct
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,24 +24,15 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.compiling import Compiler, Result
-from appliance.relay.frames import Batch
+from appliance.relay.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.observations import SHOWN, Observations
-from appliance.relay.passage import Passage
 from appliance.relay.report import Reporter
-from appliance.relay.telling import Place, Telling, refusal
-from appliance.rosmop.batch import Walker
+from appliance.relay.telling import Telling, refusal
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import Published
 
-_LENGTH = struct.Struct("<I")
-_unpack_length = _LENGTH.unpack_from
-_LONGEST = 2.0
-_LOOK_EVERY = 16  # messages
-_MANY = 256  # messages
 _AFTER_DEFECT = 1.0
-_TOO_LONG = "the monitors take too long for their messages"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,22 +53,25 @@ class Middle:
         self._loop = loop
         self._reporter = reporter
         self._offset = time.time_ns() - time.monotonic_ns()
-        self._set: MonitorSet | None = None
+        self.monitors: MonitorSet | None = None
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
-        self._blocked = ""
-        self._spent = 0.0
+        self.blocked = ""
+        self.spent = 0.0
+        self.sight = object()
         self._timer: Timer | None = None
         self._due: int | None = None
         self._compiler = Compiler(loop, self._compiled)
         self.observations = Observations(
             loop,
             reporter,
-            lambda: [self._telling.row(one) for one in self._set.monitors] if self._set is not None else [],
+            lambda: (
+                [self.telling.row(one) for one in self.monitors.monitors] if self.monitors is not None else []
+            ),
         )
         self.publish: Callable[[Published], None] = lambda published: None  # noqa: ARG005 - set by the engine
         self.changed: Callable[[], None] = lambda: None
-        self._telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
+        self.telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
 
     # --- what control states ---
 
@@ -88,181 +80,112 @@ class Middle:
         self._switches = dict(message.enabled)
         if self._compiler.busy:
             self._compiler.later(message)
-        elif self._stated is not None and not self._blocked and _same(message, self._stated):
+        elif self._stated is not None and not self.blocked and _same(message, self._stated):
             self._taken(message, [])
-        elif self._stated is None or self._blocked:
+        elif self._stated is None or self.blocked:
             self._compiler.now(message)
         else:
             self._compiler.later(message)
 
     def _compiled(self, message: SpecificationsStated, result: Result) -> None:
+        self.look_again()
         if isinstance(result, list):
             self._refuse(message, result)
             return
-        before, now = self._set, self._now()
+        before, now = self.monitors, self.now()
         outcome = (
             result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
         )
-        self._set, self._stated, self._blocked = result, message, ""
+        self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
         for monitor in result.monitors:
             monitor.held = monitor.held or (
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
             )
-        self._telling.keep([one.name for one in result.monitors], began, now)
-        self._telling.told(outcome, ("", ""))
+        self.telling.keep([one.name for one in result.monitors], began, now)
+        self.telling.told(outcome, ("", ""))
         self._taken(message, began)
 
     def _taken(self, message: SpecificationsStated, began: list[str]) -> None:
+        self.look_again()
         held: list[str] = []
-        if self._set is not None:
-            now = self._now()
-            for monitor in self._set.monitors:
-                self._set.set_enabled(monitor.name, self._switches.get(monitor.name, True), now)
-            held = [monitor.name for monitor in self._set.monitors if monitor.held]
-        self._schedule()
+        if self.monitors is not None:
+            now = self.now()
+            for monitor in self.monitors.monitors:
+                self.monitors.set_enabled(monitor.name, self._switches.get(monitor.name, True), now)
+            held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
+        self.schedule()
         self.changed()
         self._reporter.send(SpecificationsTaken(message.revision, began, held))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
-        if self._set is None:
+        self.look_again()
+        if self.monitors is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
-            self._blocked = reason
+            self.blocked = reason
         self.changed()
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100]))
 
     def switch(self, name: str, enabled: bool) -> None:
         """Let the events of a monitor happen, or not; an unknown name is fine (it is gone)."""
+        self.look_again()
         self._switches[name] = enabled
-        if self._set is not None and any(one.name == name for one in self._set.monitors):
-            self._set.set_enabled(name, enabled, self._now())
-            self._schedule()
+        if self.monitors is not None and any(one.name == name for one in self.monitors.monitors):
+            self.monitors.set_enabled(name, enabled, self.now())
+            self.schedule()
             self.changed()
 
     def resume(self, name: str) -> None:
         """Let the topics of a monitor that holds them go on."""
-        if self._set is not None and any(one.name == name for one in self._set.monitors):
-            self._set.resume(name)
+        self.look_again()
+        if self.monitors is not None and any(one.name == name for one in self.monitors.monitors):
+            self.monitors.resume(name)
 
     # --- what is asked when something changes ---
 
     def stands(self, topic: str) -> bool:
         """Whether messages of a topic go through here."""
-        return bool(self._blocked) or (self._set is not None and self._set.wants(topic))
+        return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
 
     def wants(self, topic: str) -> bool:
         """Whether a monitor wants a topic's messages even if nobody else does."""
-        return self._set is not None and self._set.wants(topic)
+        return self.monitors is not None and self.monitors.wants(topic)
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
         """Why a publisher's messages cannot be understood by the monitors of its topic; empty when they can."""
-        if self._set is None or not self._set.wants(topic):
+        if self.monitors is None or not self.monitors.wants(topic):
             return ""
-        name = self._set.topics[topic]
-        return _other_definition(topic, name, self._set.md5sum(name), header)
+        name = self.monitors.topics[topic]
+        return _other_definition(topic, name, self.monitors.md5sum(name), header)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
         """The same of a service, by the header it answers with."""
-        name = self._set.services.get(service) if self._set is not None else None
-        if self._set is None or name is None or not self._serves(service):
+        name = self.monitors.services.get(service) if self.monitors is not None else None
+        if self.monitors is None or name is None or not self._serves(service):
             return ""
-        return _other_definition(service, name, self._set.definitions.service_md5sum(name), header)
+        return _other_definition(service, name, self.monitors.definitions.service_md5sum(name), header)
 
     def header_of(self, topic: str) -> dict[str, str] | None:
         """The connection header, without names, for what monitors publish on a topic; None if none does."""
-        if self._set is None or topic not in self._set.publications:
+        if self.monitors is None or topic not in self.monitors.publications:
             return None
-        name = self._set.publications[topic]
+        name = self.monitors.publications[topic]
         return {
             "type": name,
-            "md5sum": self._set.md5sum(name),
-            "message_definition": self._set.definitions.full_text(name),
+            "md5sum": self.monitors.md5sum(name),
+            "message_definition": self.monitors.definitions.full_text(name),
             "latching": "0",
         }
 
     # --- messages ---
 
-    def through(self, key: str, topic: str, batch: Batch) -> Batch | None:
-        """The frames that go on, as the monitors leave them; None when none does."""
-        monitors = self._set
-        if self._blocked or monitors is None:
-            return self._block(batch, (key, topic))
-        passage = Passage(batch, (key, topic), self._now())
-        walker = monitors.walker(topic)
-        while passage.position < passage.end:
-            if walker is None:
-                self._one_by_one(monitors, passage, batch.messages)
-            elif self._spent > _LONGEST or not self._walk(monitors, walker, passage):
-                self._one_by_one(monitors, passage, passage.turns())
-        if self._due is not None or monitors.next_due is not None:
-            self._schedule()
-        return passage.result()
+    def lane(self, key: str, topic: str) -> Lane:
+        """Where the messages of this topic of this incarnation go through."""
+        return Lane(self, (key, topic))
 
-    def _walk(self, monitors: MonitorSet, walker: Walker, passage: Passage) -> bool:
-        """Take the messages that need nothing but the common; False if the next one needs more."""
-        if not monitors.walks(walker, passage.time):
-            return False
-        telling, place, before = self._telling, passage.place, passage.position
-        began = time.thread_time() if passage.messages > _MANY else None  # else too little to count
-        try:
-            walked = walker.walk(
-                passage.view,
-                before,
-                passage.run,
-                passage.pieces,
-                stride=passage.stride,
-                time_ns=passage.time,
-                loud=walker.changes and telling.shows(place),
-                told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
-            )
-        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
-            telling.defect(error, place, passage.time)
-            return False
-        if began is not None:
-            self._spent += time.thread_time() - began
-        telling.walked(walker, walked, place, passage.time)
-        passage.walked(walked.position, walked.run, sum(walked.dropped) if walker.drops else 0)
-        return passage.position == passage.end
-
-    def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:
-        """Give so many messages to the engine."""
-        topic, place, now, telling = passage.place[1], passage.place, passage.time, self._telling
-        view, position, end = passage.view, passage.position, passage.end
-        process = monitors.process
-        shows = telling.shows(place)
-        looked = 0
-        spent = self._spent - time.thread_time()
-        while position < end and looked < count:
-            first = position + 4
-            following = first + _unpack_length(view, position)[0]
-            body = view[first:following]
-            before = bytes(body[:SHOWN]) if shows else b""
-            try:
-                outcome = (
-                    process(topic, body, now) if self._spent <= _LONGEST else _dropped(body, now, _TOO_LONG)
-                )
-            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = _dropped(body, now, telling.defect(error, place, now))
-            if outcome.events or outcome.log or outcome.faults or outcome.before:
-                telling.told(outcome, place)
-            result = outcome.result
-            if result == "dropped":
-                telling.dropped(outcome, place, body)
-                passage.cut(position, following)
-            elif result == "changed":
-                if shows:
-                    telling.changed(outcome, place, before, len(body))
-                    shows = telling.shows(place)
-                else:
-                    telling.changed_again(outcome, place)
-                if outcome.buffer is not body:
-                    passage.replace(position, following, outcome.buffer)
-            position = following
-            looked += 1
-            if not looked % _LOOK_EVERY or outcome.faults:
-                self._spent = spent + time.thread_time()
-        passage.position = position
-        self._spent = spent + time.thread_time()
+    def look_again(self) -> None:
+        """Something has happened that may change what lanes have prepared."""
+        self.sight = object()
 
     def request(self, key: str, service: str, body: bytes) -> Judged:
         """What becomes of a request."""
@@ -274,8 +197,9 @@ class Middle:
 
     def tick(self) -> None:
         """A second is over."""
-        self._spent = 0.0
-        self._telling.tick(self._now())
+        self.look_again()
+        self.spent = 0.0
+        self.telling.tick(self.now())
         self.observations.tick()
 
     def close(self) -> None:
@@ -286,87 +210,73 @@ class Middle:
 
     # --- inside ---
 
-    def _block(self, batch: Batch, place: Place) -> Batch | None:
-        if not self._blocked:
-            return batch
-        now, position = self._now(), 0
-        while position < len(batch.view):
-            end = position + 4 + _unpack_length(batch.view, position)[0]
-            body = batch.view[position + 4 : end]
-            self._telling.dropped(_dropped(body, now, self._blocked), place, body)
-            position = end
-        return None
-
     def _service(self, key: str, service: str, part: str, body: bytes) -> Judged:
-        if self._blocked or self._spent > _LONGEST:
-            return Judged(b"", self._blocked or _TOO_LONG)
-        if self._set is None or not self._serves(service):
+        if self.blocked or self.spent > LONGEST:
+            return Judged(b"", self.blocked or TOO_LONG)
+        if self.monitors is None or not self._serves(service):
             return Judged(body)
-        place, now, began = (key, service), self._now(), time.thread_time()
+        self.look_again()
+        place, now, began = (key, service), self.now(), time.thread_time()
         view = memoryview(body)
         try:
-            outcome = self._set.process_service(service, part, bytearray(body), now)
+            outcome = self.monitors.process_service(service, part, bytearray(body), now)
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            outcome = _dropped(view, now, self._telling.defect(error, place, now))
-        self._telling.told(outcome, place)
-        self._spent += time.thread_time() - began
-        self._schedule()
+            outcome = dropped(view, now, self.telling.defect(error, place, now))
+        self.telling.told(outcome, place)
+        self.spent += time.thread_time() - began
+        self.schedule()
         if outcome.result == "dropped":
-            self._telling.dropped(outcome, place, view)
+            self.telling.dropped(outcome, place, view)
             return Judged(b"", refusal(outcome, part))
         if outcome.result == "changed":
-            self._telling.changed(outcome, place, body[:SHOWN], len(body))
+            self.telling.changed(outcome, place, body[:SHOWN], len(body))
             return Judged(bytes(outcome.buffer))
         return Judged(body)
 
     def _serves(self, service: str) -> bool:
-        return self._set is not None and any(
+        return self.monitors is not None and any(
             monitor.enabled and step.event.topic == service and step.event.part is not None
-            for monitor in self._set.monitors
+            for monitor in self.monitors.monitors
             for step in monitor.steps
         )
 
     # --- time ---
 
-    def _now(self) -> int:
+    def now(self) -> int:
+        """The time of monitors, in nanoseconds."""
         return self._offset + time.monotonic_ns()
 
-    def _schedule(self) -> None:
+    def schedule(self) -> None:
         """See that `_advance` is called when the next tick or deadline is due, or earlier."""
-        due = self._set.next_due if self._set is not None else None
+        due = self.monitors.next_due if self.monitors is not None else None
         if due is None or (self._due is not None and self._due <= due):
             return
         if self._timer is not None:
             self._timer.cancel()
         self._due = due
-        self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self._advance)
+        self._timer = self._loop.after(max(0, due - self.now()) / 1e9, self._advance)
 
     def _advance(self) -> None:
+        self.look_again()
         self._due = self._timer = None
-        if self._set is None:
+        if self.monitors is None:
             return
         began = time.thread_time()
         try:
-            for outcome in self._set.advance(self._now()):
-                self._telling.told(outcome, ("", ""))
+            for outcome in self.monitors.advance(self.now()):
+                self.telling.told(outcome, ("", ""))
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            now = self._now()
-            self._telling.defect(error, ("", ""), now)
+            now = self.now()
+            self.telling.defect(error, ("", ""), now)
             self._due = now + int(_AFTER_DEFECT * 1e9)
             self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
             return
-        self._spent += time.thread_time() - began
-        self._schedule()
+        self.spent += time.thread_time() - began
+        self.schedule()
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
     return (one.files, one.definitions, one.on_fault) == (other.files, other.definitions, other.on_fault)
-
-
-def _dropped(body: memoryview, now: int, reason: str) -> Outcome:
-    outcome = Outcome(body, now)
-    outcome.result, outcome.reason = "dropped", reason
-    return outcome
 
 
 def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str, str]) -> str:

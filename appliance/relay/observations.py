@@ -74,10 +74,10 @@ class Observations:
         )
 
     def add(self, kind: str, monitor: str, place: tuple[str, str], time: int, count: int) -> None:
-        """So many more happened at `place`; they are told as a count."""
+        """So many more happened at `place`, the last at this time; they are told as a count."""
         key = (kind, monitor, *place, "")
         self._told[key] = self._told.get(key, 0) + count
-        self._last[key] = time
+        self._last[key] = max(time, self._last.get(key, 0))
 
     def told(self, kind: str, monitor: str, place: tuple[str, str]) -> bool:
         """Whether this has been told in this second, so that the next is only counted."""

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorRow
+from appliance.relay.counts import Counts
 from appliance.relay.observations import SHOWN, Observations
-from appliance.rosmop.batch import Walked, Walker
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import Published
@@ -32,6 +32,7 @@ class Telling:
         self._happened: dict[tuple[str, ...], int] = {}
         self._again: dict[tuple[tuple[str, ...], Place], int] = {}
         self._shown: set[Place] = set()
+        self._owed: list[Counts] = []
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
         """Other monitors are in force; those that began count anew, and not what happened to those before them."""
@@ -48,23 +49,9 @@ class Telling:
         """Whether the next drop of a monitor at a place is only counted."""
         return self._observations.told("drop", monitor, place)
 
-    def walked(self, walker: Walker, walked: Walked, place: Place, time: int) -> None:
-        """Messages that needed nothing to be told: their events, and drops and changes beyond the first."""
-        for number, count in enumerate(walked.happened):
-            if count:
-                events = walker.events[number]
-                self._happened[events] = self._happened.get(events, 0) + count
-        if walker.changes:
-            for number, count in enumerate(walked.changed):
-                if count:
-                    key = (walker.events[number], place)
-                    self._again[key] = self._again.get(key, 0) + count
-        if walker.drops:
-            for number, count in enumerate(walked.dropped):
-                if count:
-                    monitor = walker.monitors[number]
-                    self._counter(monitor).drops += count
-                    self._observations.add("drop", monitor, place, time, count)
+    def owe(self, counts: Counts) -> None:
+        """There are counts to be taken when the second is over."""
+        self._owed.append(counts)
 
     def told(self, outcome: Outcome, place: Place) -> None:
         """Tell what an outcome has besides its result, and publish what it publishes."""
@@ -147,6 +134,7 @@ class Telling:
         self._shown.clear()
 
     def _sum_up(self, time: int) -> None:
+        self._settle()
         for events, count in self._happened.items():
             for event in events:
                 self._counter(event.partition(".")[0]).events += count
@@ -156,6 +144,20 @@ class Telling:
             self._counter(monitor).changes += count
             self._observations.add("change", monitor, place, time, count)
         self._again.clear()
+
+    def _settle(self) -> None:
+        """Take what lanes have counted: events, and drops and changes beyond the first."""
+        for owed in self._owed:
+            walker, place = owed.walker, owed.place
+            for number, count in enumerate(owed.take()):
+                events, monitor = walker.events[number], walker.monitors[number]
+                self._happened[events] = self._happened.get(events, 0) + count.happened
+                if count.changed:
+                    self._again[events, place] = self._again.get((events, place), 0) + count.changed
+                if count.dropped:
+                    self._counter(monitor).drops += count.dropped
+                    self._observations.add("drop", monitor, place, count.last_drop, count.dropped)
+        self._owed.clear()
 
     def row(self, monitor: Monitor) -> MonitorRow:
         """The state and counters of one monitor."""

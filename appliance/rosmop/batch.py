@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from appliance.rosmop.compile.batch import BatchCode, batches
 from appliance.rosmop.compile.shapes import Layout, Shape
 from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.runtime.context import Turn
 
@@ -38,6 +39,19 @@ class Walked(NamedTuple):
 _Loop = Callable[..., tuple[int, int, Sequence[int], Sequence[int], Sequence[int]]]
 
 
+class Prepared(NamedTuple):
+    """What holds for all walks of a topic until the engine, or somebody else, has done something.
+
+    `loud`: no message may be changed. `told`: for each event whether it may drop none. `enabled` and `runs` are the
+    monitors' and the properties' at the moment.
+    """
+
+    loud: bool
+    told: Sequence[bool]
+    enabled: Sequence[bool]
+    runs: Sequence[Run]
+
+
 class Walker:
     """The loops of one topic, with what they are handed."""
 
@@ -52,7 +66,6 @@ class Walker:
         self.changes = bool(code.writers)
         """Whether messages may be changed."""
         self._monitors = tuple(monitors[number] for number in code.specifications)
-        self._several = len(self._monitors) > 1
         self._running: tuple[RunningProperty, ...] = tuple(
             monitors[number].properties[index] for number, index in code.properties
         )
@@ -69,39 +82,41 @@ class Walker:
                 return False
         return True
 
-    def walk(
+    def prepare(self, *, loud: bool, told: Sequence[bool]) -> Prepared:
+        """See `Prepared`; good until the engine is asked for anything."""
+        return Prepared(
+            loud,
+            told,
+            [monitor.enabled for monitor in self._monitors],
+            [running.run for running in self._running],
+        )
+
+    def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self,
         view: memoryview,
         position: int,
         run: int,
         pieces: list[Any],
-        *,
         stride: int,
         time_ns: int,
-        loud: bool,
-        told: Sequence[bool],
+        prepared: Prepared,
     ) -> Walked:
         """Take messages from `position` on, as many as need nothing special.
 
         Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written;
         `stride` is the size of each, if they are all of one size, else 0. What goes on before a dropped message is
-        appended to `pieces`. `loud`: no message may be changed; `told`: for each event whether it may drop none.
+        appended to `pieces`.
         """
         self._turn.now = time_ns
         end = len(view)
-        runs = [running.run for running in self._running]
-        enabled = [monitor.enabled for monitor in self._monitors] if self._several else ()
-        shared = (pieces, loud, told, enabled, runs)
-        layout = self._layout(view, position, stride) if stride and self._shape is not None else None
+        layout = self._layout(view, position, stride) if stride else None
         if layout is None or self._alike is None:
-            return Walked._make(self._alone(view, position, end, run, *shared))
-        frames = layout.frames.iter_unpack(view[position:])
-        first = Walked._make(
-            self._alike(view, position, end, run, *shared, frames, stride, layout.lengths, layout.written)
-        )
+            return Walked._make(self._alone(view, position, end, run, pieces, *prepared))
+        frames = (layout.frames.iter_unpack(view[position:]), stride, layout.lengths, layout.written)
+        first = Walked._make(self._alike(view, position, end, run, pieces, *prepared, *frames))
         if first.position == end:
             return first
-        second = Walked._make(self._alone(view, first.position, end, first.run, *shared))
+        second = Walked._make(self._alone(view, first.position, end, first.run, pieces, *prepared))
         return second if first.position == position else _together(first, second)
 
     def _layout(self, view: memoryview, position: int, stride: int) -> Layout | None:

@@ -118,7 +118,9 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
     assert isinstance(kind, kinds.Integer)  # noqa: S101  the common type of two numbers
     if operator in ("/", "%"):
         return operands.value(kind, _division(operator, operands, left, right, kind))
-    code = f"({left} {operator} {right})" if operator in _BITS else wrapped(f"{left} {operator} {right}", kind)
+    code = (
+        f"({left} {operator} {right})" if operator in _BITS else wrapped(f"{left} {operator} {right}", kind)
+    )
     return operands.value(kind, code)
 
 

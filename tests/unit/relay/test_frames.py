@@ -33,6 +33,7 @@ def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, 
         position, turn = position + count, turn + 1
         batch = one.received(count)
         if batch is not None:
+            assert batch.last is not None
             batches.append((bytes(batch.view), batch.messages, batch.last))
     return batches
 

@@ -261,7 +261,7 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(world: Moni
     """Even one that is ours."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
-    monitors = world.engine._middle._set
+    monitors = world.engine._middle.monitors
     assert monitors is not None
     process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]
     publisher.send(string("a"))

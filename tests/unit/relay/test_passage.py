@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow, SpecificationsStated
 from appliance.relay.frames import FrameReceiver, MemoryBudget
+from appliance.relay.lane import Lane
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
 from appliance.relay.middle import Middle
@@ -52,7 +53,8 @@ class Monitored:
         self.time = 1_000_000_000
         self._loop = Loop()
         self.middle = Middle(self._loop, self.heard)
-        self.middle._now = lambda: self.time  # type: ignore[method-assign]
+        self.middle.now = lambda: self.time  # type: ignore[method-assign]
+        self._lanes: dict[str, Lane] = {}
         self.set = MonitorSet.load(texts, known, on_fault)
         if together:
             self.set.write_loops()
@@ -70,7 +72,8 @@ class Monitored:
         batch = receiver.received(len(traffic.frames))
         assert batch is not None
         assert batch.messages == traffic.messages
-        left = self.middle.through("key", traffic.topic, batch)
+        lane = self._lanes.setdefault(traffic.topic, self.middle.lane("key", traffic.topic))
+        left = lane.through(batch)
         if left is None:
             return 0, b"", b""
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
@@ -89,7 +92,7 @@ class Monitored:
 
     def rows(self) -> list[MonitorRow]:
         """The counters."""
-        return [self.middle._telling.row(one) for one in self.set.monitors]
+        return [self.middle.telling.row(one) for one in self.set.monitors]
 
     def state(self) -> list[object]:
         """Variables, states of properties, what is due."""
@@ -120,9 +123,9 @@ def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traff
             if number % 4 == 3:
                 one_told, told = (way.told() for way in ways)
                 assert one_told == told
-        assert ways[0].rows() == ways[1].rows()
         one_told, told = (way.told() for way in ways)
         assert one_told == told
+        assert ways[0].rows() == ways[1].rows()
     finally:
         for way in ways:
             way.close()
