@@ -1,5 +1,6 @@
 """A tunnel to an appliance in a namespace of its own on a bare host, which forwards IKE and ESP to it."""
 
+import subprocess
 from pathlib import Path
 
 from appliance.network.lab import Lab
@@ -44,5 +45,26 @@ def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
                     on_ocu.listener("rospy", "/chatter", name="ear").wait_for(event="received")
                     told = on_ocu.run("/usr/bin/rosnode", "info", "/voice", check=False).stdout
                     assert "contacting node http://10.113.11.1:" in told
+                assert authority_seen_from(joined).startswith("-----BEGIN CERTIFICATE-----")
             rules = [rule["purpose"] for rule in appliance.status()["firewall"]["forwarding"]]
             assert "UDP 4500 to the appliance, IPv4" in rules
+
+
+def authority_seen_from(joined: JoinedHost) -> str:
+    """What REST answers in the tunnel, where certificates are renewed, without any setting for it."""
+    asked = joined.popen(
+        [
+            "curl",
+            "--silent",
+            "--show-error",
+            "--insecure",
+            "--max-time",
+            "20",
+            "https://10.113.11.1:8443/v1/authority",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    out, _ = asked.communicate(timeout=30)
+    return str(out)

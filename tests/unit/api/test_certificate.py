@@ -4,12 +4,13 @@ import datetime
 import socket
 import ssl
 import stat
+import subprocess
 import threading
 from pathlib import Path
 
 import pytest
 
-from appliance.api.certificate import CERTIFICATE, KEY, tls_context
+from appliance.api.certificate import CERTIFICATE, KEY, pin_of, tls_context
 
 NOW = datetime.datetime.now(datetime.UTC)
 
@@ -65,11 +66,26 @@ def test_it_is_kept_and_its_key_is_its_owners(tmp_path: Path) -> None:
 def test_a_new_one_is_made_for_a_new_name_or_before_it_ends(
     tmp_path: Path, names: list[str], days: int
 ) -> None:
-    """An address that is not in it, or an end that is near, gives a new one."""
+    """A new address, or an end that is near, gives a new one; hosts that pinned its key still know it."""
     tls_context(tmp_path, ["10.1.2.3"], NOW)
-    first = (tmp_path / CERTIFICATE).read_bytes()
+    first, pin = (tmp_path / CERTIFICATE).read_bytes(), pin_of(tmp_path)
     tls_context(tmp_path, names, NOW + datetime.timedelta(days=days))
     assert (tmp_path / CERTIFICATE).read_bytes() != first
+    assert pin_of(tmp_path) == pin
+
+
+def test_a_pin_is_that_of_the_key(tmp_path: Path) -> None:
+    """As curl takes it, and as openssl makes it from the certificate; another key has another."""
+    tls_context(tmp_path, [], NOW)
+    pipe = "openssl x509 -pubkey -noout | openssl pkey -pubin -outform der"
+    pipe += " | openssl dgst -sha256 -binary | openssl base64"
+    done = subprocess.run(
+        ["/bin/sh", "-c", pipe], input=(tmp_path / CERTIFICATE).read_bytes(), capture_output=True, check=True
+    )
+    assert pin_of(tmp_path) == f"sha256//{done.stdout.decode().strip()}"
+    (tmp_path / "other").mkdir()
+    tls_context(tmp_path / "other", [], NOW)
+    assert pin_of(tmp_path / "other") != pin_of(tmp_path)
 
 
 def test_what_cannot_be_used_is_an_error(tmp_path: Path) -> None:

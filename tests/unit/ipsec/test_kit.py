@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from appliance.ipsec.kit import Kit, archive, swanctl_conf
+from appliance.ipsec.kit import Kit, Rest, archive, swanctl_conf
 from appliance.network.firewall.rules import PortRange
 from appliance.network.protect import protection
 
@@ -42,7 +42,7 @@ def test_a_kit_is_one_folder_with_a_private_key_for_its_owner_only() -> None:
     assert found["rosrv-ocu-1/swanctl/private/rosrv.key"] == ("KEY\n", 0o600)
     assert found["rosrv-ocu-1/swanctl/x509/rosrv.pem"][0] == "CERTIFICATE\n"
     assert found["rosrv-ocu-1/swanctl/x509ca/rosrv-ca.pem"][0] == "AUTHORITY\n"
-    for script in ("join.sh", "leave.sh", "keep.sh"):
+    for script in ("join.sh", "leave.sh", "keep.sh", "renew.sh"):
         assert found[f"rosrv-ocu-1/{script}"][1] == 0o755
 
 
@@ -51,7 +51,7 @@ def test_a_host_that_made_its_key_gets_none() -> None:
     assert "rosrv-ocu-1/swanctl/private/rosrv.key" not in unpack(replace(KIT, key=None))
 
 
-@pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh"])
+@pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh", "renew.sh"])
 def test_scripts_are_complete_shell(script: str) -> None:
     """The shell reads them without a complaint, and what stands for a value was replaced."""
     text = unpack(KIT)[f"rosrv-ocu-1/{script}"][0]
@@ -85,3 +85,16 @@ def test_the_tunnel_carries_the_way_to_the_appliance_only() -> None:
 def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
     """Its ROS ports are open to the appliance's tunnel address and to nobody else."""
     assert "ip saddr { 10.113.11.1 } accept" in unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
+
+
+def test_a_kit_says_where_its_certificate_is_renewed() -> None:
+    """URL and pin of REST in the tunnel; where that cannot be reached, the script says so instead of trying."""
+    text = unpack(replace(KIT, rest=Rest("https://10.113.11.1:8443", "sha256//pin=")))[
+        "rosrv-ocu-1/renew.sh"
+    ][0]
+    assert 'rest="https://10.113.11.1:8443"' in text
+    assert 'pin="sha256//pin="' in text
+    without = unpack(KIT)["rosrv-ocu-1/renew.sh"][0]
+    done = subprocess.run(["/bin/sh"], input=without, text=True, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert "rosrv host kit ocu-1" in done.stderr

@@ -11,6 +11,7 @@ from appliance.ipsec.strongswan import (
     host_of,
     plugins,
     pool,
+    proposals_of,
 )
 
 TUNNEL = Tunnel("ocu-1", "10.113.11.2", "a1")
@@ -56,3 +57,16 @@ def test_a_connection_that_is_not_ours_is_nobodys() -> None:
     """A handshake before it is known whose it is has no host."""
     assert host_of("host-ocu-1") == "ocu-1"
     assert host_of("(unnamed)") is None
+
+
+def test_ml_kem_is_offered_where_charon_has_it() -> None:
+    """First of all and beside Curve25519; a charon without it is told of what it has, and nothing weaker."""
+    assert proposals_of(["CURVE_25519", "ECP_384"]).key_exchange == ["x25519", "ecp384"]
+    found = proposals_of(["ECP_384", "CURVE_25519", "ML_KEM_768", "MODP_1024"])
+    assert found.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]
+    assert found.ike[0] == "aes256gcm16-prfsha384-x25519-ke1_mlkem768"
+    assert found.esp[0] == "aes256gcm16-x25519-ke1_mlkem768"
+    (row,) = connection(
+        Tunnel("a", "10.0.0.2", "1f"), address="10.0.0.1", certificate=b"", authority=b"", proposals=found
+    ).values()
+    assert row["proposals"] == list(found.ike)
