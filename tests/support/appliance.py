@@ -43,8 +43,13 @@ class Appliance:
         isolation: str | None = None,
         options: tuple[str, ...] = (),
         json: bool = True,
+        relays: int = 1,
     ) -> None:
-        """`json` False: as a person starts it; there is no `ready` then, only the lines in `process`."""
+        """`json` False: as a person starts it; there is no `ready` then, only the lines in `process`.
+
+        `relays` relay processes, on every machine the same.
+        """
+        self.relays = relays
         self.host: Host = host or ThisMachine()
         self.isolation = isolation or ("none" if isinstance(self.host, ThisMachine) else "container")
         self.options = options
@@ -81,7 +86,8 @@ class Appliance:
         if loopback:
             command += ["--rosmaster-port", "0"]
         command += self.options  # last, for of a flag given twice the second counts
-        self.process = Process(self.host, command, env=_environment(), label="rosrv up")
+        environment = _environment() | {"ROSRV_RELAYS": str(self.relays)}
+        self.process = Process(self.host, command, env=environment, label="rosrv up")
         if self.json:
             self.ready = self.process.wait_for(event="ready", timeout=2 * LIMIT)
         else:

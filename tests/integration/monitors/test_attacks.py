@@ -2,7 +2,6 @@
 
 import os
 import signal
-import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,12 +47,8 @@ def beside(version: int) -> str:
 def appliance() -> Iterator[Appliance]:
     """Two relays and no monitors."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with tempfile.TemporaryDirectory(prefix="rosrv-attacks-") as name:
-        config = Path(name) / "appliance.yaml"
-        Path(name).chmod(0o755)
-        config.write_text("relays: 2\n")
-        with Appliance(options=("--config", str(config), "--api", "off")) as appliance:
-            yield appliance
+    with Appliance(options=("--api", "off"), relays=2) as appliance:
+        yield appliance
 
 
 @pytest.fixture

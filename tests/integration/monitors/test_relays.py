@@ -43,10 +43,8 @@ def appliance() -> Iterator[Appliance]:
         folder.chmod(0o755)
         for one in ("left", "right"):
             (folder / f"{one}.rv").write_text(specification(one, one))
-        config = folder / "appliance.yaml"
-        config.write_text("relays: 2\n")
-        options = ("--config", str(config), "--monitors", str(folder), "--api", "off")
-        with Appliance(options=options) as appliance:
+        options = ("--monitors", str(folder), "--api", "off")
+        with Appliance(options=options, relays=2) as appliance:
             yield appliance
 
 

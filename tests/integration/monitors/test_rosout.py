@@ -29,9 +29,9 @@ def appliance() -> Iterator[Appliance]:
         folder.chmod(0o755)
         (folder / "gate.rv").write_text(SPECIFICATION)
         config = folder / "appliance.yaml"
-        config.write_text("relays: 2\nmonitors_on_rosout: true\n")
+        config.write_text("monitors_on_rosout: true\n")
         options = ("--config", str(config), "--monitors", str(folder), "--api", "off")
-        with Appliance(options=options) as appliance:
+        with Appliance(options=options, relays=2) as appliance:
             yield appliance
 
 
