@@ -1,7 +1,7 @@
-"""How fast the audit log takes, proves and finds records: python benchmarks/audit_records.py [RECORDS]
+"""How fast the audit log takes, proves and finds records: python -m benchmarks.audit_records [RECORDS]
 
 Measured: the time `record()` costs its caller; records a second in both kinds of durability, with an idle
-event loop and next to a thread that is always busy; how long a loop is held up; searches over RECORDS (by
+event loop and next to a thread that is always busy; how long a loop is held up; forwarding; searches over RECORDS (by
 default a million) records; verification. Everything on one directory (TMPDIR) and its disk.
 """
 
@@ -21,6 +21,10 @@ from appliance.audit.query import Filter
 from appliance.audit.record import Record, RuleReference, Severity
 from appliance.audit.search import search
 from appliance.audit.verify import verify
+from appliance.forwarding.forwarder import Forwarder
+from appliance.forwarding.receiver import StreamReceiver
+from appliance.forwarding.syslog import Formatter
+from benchmarks.syslog_sink import Sink
 
 _ROWS: list[tuple[str, str]] = []
 
@@ -161,6 +165,29 @@ def measure_busy(directory: Path) -> None:
     log.close()
 
 
+def measure_forwarding(directory: Path, count: int) -> None:
+    """Reading committed records, making messages of them, and sending them to a receiver that takes everything."""
+    log = open_log(directory, "forward", "batched")
+    for number in range(count):
+        log.record(record(log, number))
+    asyncio.run(log.wait_durable())
+    log.close()
+    path = directory / "forward" / "audit.db"
+    formatter = Formatter(facility=13, longest=8192, host_name="robot")
+    with Sink() as sink:
+        kept = path.with_name("position.json")
+        one = Forwarder(path, kept, StreamReceiver("127.0.0.1", sink.port), formatter, chosen="all")
+        start, used = time.perf_counter(), time.process_time()
+        while one.step() == 0.0:
+            pass
+        row("forwarded over TCP: records/s", f"{count / (time.perf_counter() - start):,.0f}")
+        row(
+            "forwarded: CPU of a record (with the receiver's)",
+            f"{(time.process_time() - used) / count * 1e6:.0f} us",
+        )
+        one.close()
+
+
 def timed(name: str, action: Callable[[], object]) -> None:
     """A line with the best of three runs."""
     best = float("inf")
@@ -214,12 +241,20 @@ def main() -> None:
     print(f"{os.cpu_count()} cores, Python {sys.version.split()[0]}")
     with tempfile.TemporaryDirectory(prefix="audit-benchmark-") as name:
         directory = Path(name)
-        for part in ("burst", "paced", "busy", "search", *(f"strict{n}" for n in (1, 10, 100, 1000))):
+        for part in (
+            "burst",
+            "paced",
+            "busy",
+            "search",
+            "forward",
+            *(f"strict{n}" for n in (1, 10, 100, 1000)),
+        ):
             (directory / part).mkdir()
         measure_burst(directory, 100_000)
         measure_loop(directory)
         measure_busy(directory)
         measure_strict(directory)
+        measure_forwarding(directory, 20_000)
         measure_search(directory, count)
 
 
