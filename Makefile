@@ -16,7 +16,7 @@ help: ## list the targets
 setup: ## install what is missing: Debian packages and .venv
 	@scripts/setup
 
-demo: setup ## the appliance at work: a simulated robot, its operator and an attacker, in about a minute
+demo: setup ## the appliance at work: a simulated robot, its operator and an attacker, in a minute or two
 	@$(BIN)/rosrv demo $(ARGS)
 
 check: setup ## format, lint, types, dependency directions, unit tests

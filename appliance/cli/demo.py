@@ -2,8 +2,8 @@
 
 A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator,
 and an attacker. The operator drives and fires; the attacker tries what ROS 1 lets anybody do; for each
-the rule that decided is read from the audit log. At last the operator himself makes a mistake that no policy can
-forbid, and a monitor keeps it from the robot. The exit status says whether the robot did what its
+the rule that decided is read from the audit log. At last the operator himself makes mistakes that no policy can
+forbid, and monitors keep them from the robot. The exit status says whether the robot did what its
 operator wanted and nothing else: scripts can rely on it.
 """
 
@@ -11,7 +11,6 @@ import shutil
 import signal
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -20,6 +19,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from appliance.cli.demo_mistakes import Mistakes, Ways
+from appliance.cli.demo_results import Result
+from appliance.cli.doorway import Doorway
 from appliance.cli.landshark import (
     ATTACKER,
     MASTER_URI,
@@ -58,21 +60,13 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 Record = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Result:
-    """One thing that should happen, or should not, and what became of it."""
-
-    what: str
-    good: bool
-    remark: str
-
-
 class Show:
     """The demonstration, act by act; `results` is what the summary tells."""
 
-    def __init__(self, stage: Stage, console: Console) -> None:
-        self.stage, self.console = stage, console
+    def __init__(self, stage: Stage, door: Doorway, console: Console) -> None:
+        self.stage, self.door, self.console = stage, door, console
         self.results: list[Result] = []
+        self.ways: Ways = {}
         self.last_sequence = -1
         self.robot: list[Actor] = []
 
@@ -91,7 +85,8 @@ class Show:
             self.refuse(self.stage.attack(name))
         self.shut_out(self.stage.attack(AROUND))
         self.aftermath(operator, before)
-        self.mistake(operator)
+        operator.stop()
+        self.ways = Mistakes(self.stage, self).run()
         self.summary()
         return all(result.good for result in self.results)
 
@@ -111,6 +106,10 @@ class Show:
         ready = self.stage.start_appliance()
         self.say(f"nodes may connect: ROS_MASTER_URI={ready['master']}  (the real one is hidden)")
         self.say(f"policy:            {self.stage.policy}")
+        self.say(
+            f"console:           https://127.0.0.1:{self.door.port}/   (of this machine; its certificate is its own)"
+        )
+        self.say(f"token for it:      {ready['token']}")
         self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
         self.robot = self.stage.start_robot()
         self.say(", ".join(actor.name for actor in self.robot))
@@ -197,31 +196,6 @@ class Show:
             self.say(f"{'' if result.good else 'NOT: '}{result.what}: {result.remark}")
         self.results += results
 
-    def mistake(self, operator: Actor) -> None:
-        """What a policy cannot forbid, for it is the operator who does it: a monitor can."""
-        self.headline("The operator makes a mistake: he fires while the gun points at the robot itself")
-        operator.stop()
-        self.stage.command("aim", "0", "-0.6")
-        self.fires("without a monitor the robot hits itself", hit=True)
-        self.stage.enable_monitor("safeTrigger")
-        self.say(f"rosrv monitor enable safeTrigger  ({self.stage.monitors / 'safe_triggering.rv'})")
-        self.fires("with the monitor it does not", hit=False)
-        dropped = self.stage.audit("--event", "message dropped", "--limit", "10")
-        mine = [one for one in dropped if one["detail"].get("monitor") == "safeTrigger"]
-        why = mine[0]["reason"] if mine else "missing"
-        self.say(f"audit record: {why}")
-        self.results.append(Result("audit record: the dropped trigger", bool(mine), why))
-        self.stage.command("aim", "0", "0.2")
-        self.fires("away from the robot it still fires", hit=True)
-
-    def fires(self, what: str, *, hit: bool) -> None:
-        """Pull the trigger; `hit`: a shot is to come."""
-        fired = self.stage.command("fire")
-        shots = fired["shots"] - fired["before"]
-        good = shots == (1 if hit else 0)
-        self.results.append(Result(what, good, f"{shots} shots"))
-        self.say(f"{'' if good else 'NOT: '}{what}: {'1 shot' if shots == 1 else f'{shots} shots'}")
-
     def summary(self) -> None:
         """How much of it was as it should be, and what was not."""
         bad = [result for result in self.results if not result.good]
@@ -273,10 +247,14 @@ def demo(
     hold: Annotated[
         bool, typer.Option("--hold", help="Keep everything running at the end, until Ctrl-C")
     ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.svg", help="Draw the robot's ways, without and with monitors, from above"),
+    ] = None,
 ) -> None:
     """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
 
-    Example: rosrv demo --hold
+    Example: rosrv demo --hold --picture drive.svg
     """
     console, errors = Console(), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
@@ -285,7 +263,11 @@ def demo(
         with ExitStack() as stack:
             lab = stack.enter_context(Lab("rosrv-demo"))
             stage = stack.enter_context(Stage(lab, EXAMPLES))
-            good = Show(stage, console).run()
+            show = Show(stage, stack.enter_context(stage.console()), console)
+            good = show.run()
+            if picture is not None:
+                stage.draw(show.ways, picture)
+                console.print(f"  {picture}: the robot's ways from above", soft_wrap=True)
             command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
             if not hold:
                 console.print(
@@ -295,6 +277,7 @@ def demo(
             else:
                 console.print(
                     f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} on these hosts.\n"
+                    f"Console:          https://127.0.0.1:{show.door.port}/  (the token is above)\n"
                     f"Look at it:       {command} status --state {stage.state}\n"
                     f"                  {command} audit tail --deny --state {stage.state}\n"
                     f"Be the attacker:  ip netns exec {stage.attacker_host.namespace.name} "

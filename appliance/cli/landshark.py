@@ -19,18 +19,22 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from appliance.cli.doorway import Doorway
 from appliance.network.lab import Host, Lab
 
 NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
 APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"
 MASTER_URI = f"http://{APPLIANCE}:11311"
+CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
 START_SECONDS = 60.0  # an appliance or a node that is not there by then is not coming
 ATTACK_SECONDS = 60.0
+COMMAND_SECONDS = 120.0  # a drive through the yard and what starts before it
 
 Event = dict[str, Any]
 
@@ -164,6 +168,8 @@ class Stage:
             "none",
             "--state",
             str(self.state),
+            "--api",
+            f"{CONSOLE[0]}:{CONSOLE[1]}",
         ]
         return self._start(self.appliance_host, "rosrv up", command).expect("ready")
 
@@ -203,10 +209,32 @@ class Stage:
         """One command of the operator, once his unit has ended: what `command.py` says of it."""
         program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
         actor = self._start(self.operator_host, "ocu command", program)
-        said = actor.expect({"drive": "drove", "aim": "aimed", "fire": "fired"}[what])
+        said = actor.expect(
+            {"drive": "drove", "reach": "reached", "aim": "aimed", "fire": "fired"}[what], COMMAND_SECONDS
+        )
         actor.stop()
         self.actors.remove(actor)
         return said
+
+    def draw(self, ways: dict[str, Sequence[Sequence[float]]], picture: Path) -> None:
+        """The ways of the robot (metres), without and with monitors, from above as an SVG."""
+        file = self.directory / "ways.json"
+        file.write_text(json.dumps(ways))
+        command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
+        done = subprocess.run(
+            command,
+            cwd=self.nodes.parents[2],
+            capture_output=True,
+            text=True,
+            timeout=START_SECONDS,
+            check=False,
+        )
+        if done.returncode:
+            raise DemoError(f"the picture {picture} cannot be drawn: {done.stderr.strip()}")
+
+    def console(self) -> Doorway:
+        """A door from this machine to the console, which listens on loopback of the appliance's host."""
+        return Doorway(self.appliance_host, CONSOLE)
 
     def enable_monitor(self, name: str) -> None:
         """`rosrv monitor enable NAME`, while the robot runs."""

@@ -50,6 +50,24 @@ def draw(without: "Drive", guarded: "Drive") -> str:
     return "\n".join(parts) + "\n"
 
 
+def draw_ways(without: list[physics.Pose], guarded: list[physics.Pose]) -> str:
+    """The picture of two drives of which only the places are known."""
+    parts = [
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 640" role="img">',
+        "<title>The LandShark's ways from above, without and with monitors</title>",
+        f"<style>{STYLE}</style>",
+        '<rect width="1000" height="640" fill="#ffffff"/>',
+        _text(40, 44, "The robot's ways, without and with monitors", "title"),
+        _yard(),
+        _track(without, "without"),
+        _track(guarded, "guarded"),
+        *(_end(way[-1], colour) for way, colour in ((without, WITHOUT), (guarded, GUARDED))),
+        *_legend_of_ways(),
+        "</svg>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
 def _at(x: float, y: float) -> tuple[float, float]:
     return CENTRE[0] + x * SCALE, CENTRE[1] - y * SCALE
 
@@ -91,14 +109,12 @@ def _track(poses: list[physics.Pose], kind: str) -> str:
 
 
 def _ends(without: "Drive", guarded: "Drive") -> list[str]:
-    parts = []
-    for drive, colour in ((without, WITHOUT), (guarded, GUARDED)):
-        pose = drive.poses[-1]
-        x, y = _at(pose.x, pose.y)
-        parts.append(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="{colour}" stroke="#ffffff" stroke-width="2"/>'
-        )
-    return parts
+    return [_end(drive.poses[-1], colour) for drive, colour in ((without, WITHOUT), (guarded, GUARDED))]
+
+
+def _end(pose: physics.Pose, colour: str) -> str:
+    x, y = _at(pose.x, pose.y)
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="{colour}" stroke="#ffffff" stroke-width="2"/>'
 
 
 def _note(x: float, y: float, row: float, lines: tuple[str, ...]) -> str:
@@ -128,13 +144,18 @@ def _notes(without: "Drive", guarded: "Drive") -> list[str]:
     ]  # fmt: skip
 
 
-def _legend() -> str:
+def _legend_of_ways() -> list[str]:
     parts = []
     for row, (kind, words) in enumerate((("without", "without monitors"), ("guarded", "with monitors"))):
         y = 545 + 26 * row
         parts.append(f'<path class="track {kind}" d="M698 {y - 5}h44"/>')
         parts.append(_text(752, y, words))
     parts.append('<circle cx="720" cy="593" r="7" fill="#6b7280"/>' + _text(752, 598, "end of the drive"))
+    return parts
+
+
+def _legend() -> str:
+    parts = _legend_of_ways()
     parts.append(_star(720, 619, fired=True) + _text(752, 624, "a shot"))
     parts.append(_star(720, 645, fired=False) + _text(752, 650, "a shot that safeTrigger dropped"))
     return "\n".join(parts)

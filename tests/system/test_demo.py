@@ -1,8 +1,11 @@
 """`rosrv demo`, the first thing a newcomer runs: it works, tells the truth, and leaves nothing behind."""
 
 import os
+import re
 import signal
+import ssl
 import subprocess
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -13,7 +16,7 @@ from tests.support.nodes import has_ros
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 
-LIMIT = 180
+LIMIT = 280
 
 
 @pytest.fixture(autouse=True)
@@ -23,15 +26,23 @@ def machine() -> None:
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
 
 
-def left_behind() -> list[str]:
-    """The namespaces and folders of a demonstration that are still there."""
-    folders = [str(path) for path in Path("/tmp").glob("rosrv-demo-*")]
-    return [namespace.name for namespace in namespaces("rosrv-demo.")] + folders
+def present() -> set[str]:
+    """The namespaces and folders of demonstrations on this machine."""
+    folders = {str(path) for path in Path("/tmp").glob("rosrv-demo-*")}
+    return {namespace.name for namespace in namespaces("rosrv-demo.")} | folders
 
 
-def test_demo() -> None:
+@pytest.fixture
+def before() -> set[str]:
+    """What was there before this test."""
+    return present()
+
+
+def test_demo(tmp_path: Path, before: set[str]) -> None:
     """The robot obeys its operator, every attack is refused by a rule, and the exit status says so."""
-    done = subprocess.run([ROSRV, "demo"], capture_output=True, text=True, timeout=LIMIT, check=False)
+    picture = tmp_path / "drive.svg"
+    command = [ROSRV, "demo", "--picture", str(picture)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert "NOT OK" not in said
@@ -46,18 +57,40 @@ def test_demo() -> None:
         "allowed   watch the battery",
         "without a monitor the robot hits itself: 1 shot",
         "with the monitor it does not: 0 shots",
+        "without a monitor it runs into the obstacle",
+        "without a monitor it leaves its zone",
+        "with the monitor it stops before the obstacle",
+        "with the monitor it stays in its zone",
+        "console:           https://127.0.0.1:",
     ):
         assert line in said
-    assert left_behind() == []
+    assert picture.read_text().count("<polyline") == 2
+    assert present() <= before
+
+
+def test_the_console_of_the_demo_is_reached_from_this_machine() -> None:
+    """The address that is printed answers on this machine, over TLS, to the token beside it."""
+    with Process(ThisMachine(), [ROSRV, "demo"], env=os.environ, label="rosrv demo") as demo:
+        demo.wait_for_text("A LandShark of unmodified", timeout=LIMIT)
+        said = demo.story()
+        port = re.search(r"https://127\.0\.0\.1:(\d+)/", said)
+        token = re.search(r"rosrv_\w+", said)
+        assert port and token, said
+        unverified = ssl._create_unverified_context()  # noqa: S323  its certificate is in the folder of the demo
+        wanted = f"https://127.0.0.1:{port[1]}/v1/status"
+        request = urllib.request.Request(wanted, headers={"Authorization": f"Bearer {token[0]}"})
+        with urllib.request.urlopen(request, timeout=LIMIT, context=unverified) as answer:  # noqa: S310  https
+            assert answer.status == 200
+        assert demo.stop(with_signal=signal.SIGTERM, timeout=30) == 130, demo.story()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-def test_demo_interrupted(number: signal.Signals) -> None:
+def test_demo_interrupted(number: signal.Signals, before: set[str]) -> None:
     """Interrupted in the middle, it ends at once and leaves no host, no process and no folder."""
     with Process(ThisMachine(), [ROSRV, "demo"], env=os.environ, label="rosrv demo") as demo:
         demo.wait_for_text("drove", timeout=LIMIT)
         assert demo.stop(with_signal=number, timeout=30) == 130, demo.story()
-    assert left_behind() == []
+    assert present() <= before
 
 
 def test_demo_without_root() -> None:

@@ -1,13 +1,17 @@
-"""One command of an operator: `command.py drive FORWARD TURN SECONDS`, `command.py aim PAN TILT`, `command.py fire`.
+"""One command of an operator: `command.py drive FORWARD TURN SECONDS`, `reach X Y`, `aim PAN TILT`, `fire`.
 
-Speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON object, `drove` (with
-the position at the end), `aimed` (with the angle reached) or `fired` (with the number of shots so far). What is said
+Places in metres, speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON
+object, `drove` (with the position at the end), `reached` (with the way there, whether the robot got there, how near
+it came to the obstacle's edge, negative inside it, and how far from the origin), `aimed` (with the angle reached)
+or `fired` (with the number of shots so far). What is said
 once is latched for a while, as `rostopic pub -1` does: a driver or recorder that connects a moment later hears it, too.
 """
 
+import math
 import sys
 import threading
 
+import physics
 import rospy
 from geometry_msgs.msg import TwistStamped
 from landshark_messages import paintball_trigger
@@ -19,6 +23,10 @@ from std_msgs.msg import UInt32
 HERTZ = 10
 SECONDS = 10.0  # a driver that is not there by then is not coming
 SETTLED = 1.0
+THERE = 0.5  # metres
+STEERED = 0.3  # radians off the way at which it turns only
+STUCK = 2.0  # seconds without coming nearer
+UNDER_WAY = 60.0  # seconds at most
 LATCHED = 1.5
 
 
@@ -69,6 +77,43 @@ def drive(forward, turn, seconds):
     report("drove", x=round(position.x, 2), y=round(position.y, 2))
 
 
+def pose_of(odometry):
+    """Where the robot is and where it looks."""
+    position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
+    return physics.Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
+
+
+def reach(x, y):
+    """Drive to a place at top speed, straight; give up when the robot comes no nearer."""
+    display = Display("/landshark/odom", Odometry)
+    publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
+    display.wait(lambda _odometry: True)
+    rate, way, nearest, stuck = rospy.Rate(HERTZ), [], math.inf, 0
+    for _ in range(int(UNDER_WAY * HERTZ)):
+        pose = pose_of(display.message)
+        way.append(pose)
+        away = math.hypot(x - pose.x, y - pose.y)
+        off = physics.normal_angle(math.atan2(y - pose.y, x - pose.x) - pose.heading)
+        turning = abs(off) > STEERED
+        stuck = 0 if turning or away < nearest - 0.01 else stuck + 1
+        nearest = min(nearest, away)
+        if nearest < THERE or stuck > STUCK * HERTZ:
+            break
+        message = TwistStamped()
+        message.header.stamp = rospy.Time.now()
+        message.twist.linear.x, message.twist.angular.z = 0.0 if turning else physics.TOP_SPEED, 2 * off
+        publisher.publish(message)
+        rate.sleep()
+    things = [(pose, thing) for pose in way for thing in physics.YARD]
+    report(
+        "reached",
+        there=nearest < THERE,
+        to_obstacle=round(min(math.dist((at.x, at.y), (it.x, it.y)) - it.radius for at, it in things), 2),
+        farthest=round(max(math.hypot(pose.x, pose.y) for pose in way), 2),
+        way=[(round(pose.x, 2), round(pose.y, 2)) for pose in way],
+    )
+
+
 def aim(pan, tilt):
     """Turn the gun, and wait until it points there."""
     display = Display("/landshark/joint_states", JointState)
@@ -97,9 +142,9 @@ def fire():
 def main():
     """Do one thing."""
     what, *values = rospy.myargv()[1:] or ["nothing"]
-    actions = {"drive": (drive, 3), "aim": (aim, 2), "fire": (fire, 0)}
+    actions = {"drive": (drive, 3), "reach": (reach, 2), "aim": (aim, 2), "fire": (fire, 0)}
     if what not in actions or len(values) != actions[what][1]:
-        sys.exit("usage: command.py drive FORWARD TURN SECONDS | aim PAN TILT | fire")
+        sys.exit("usage: command.py drive FORWARD TURN SECONDS | reach X Y | aim PAN TILT | fire")
     rospy.init_node("ocu")
     actions[what][0](*map(float, values))
     rospy.sleep(LATCHED)
