@@ -255,7 +255,6 @@ def _make_master(
         lambda: base.policies.current,
         reach.registry,
         HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host),
-        is_namespace=parameters.is_namespace,
     )
     return Master(
         port=base.port(RVMASTER),

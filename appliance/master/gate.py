@@ -34,23 +34,12 @@ class HostLimits:
 
 
 class Gate:
-    """Decides calls by the policy that `policy()` returns at that moment.
+    """Decides calls by the policy that `policy()` returns at that moment."""
 
-    `is_namespace(key)` says whether a parameter holds others.
-    """
-
-    def __init__(
-        self,
-        policy: Callable[[], Policy],
-        registry: Registry,
-        limits: HostLimits,
-        *,
-        is_namespace: Callable[[str], bool],
-    ) -> None:
+    def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
         self._registry = registry
         self._limits = limits
-        self._is_namespace = is_namespace
 
     def asked(self, call: Call, arguments: tuple[object, ...]) -> tuple[Category, str]:
         """The category and resource that a call is decided and recorded under."""

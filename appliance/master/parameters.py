@@ -57,15 +57,6 @@ class ParameterMirror:
         self._bytes_limit = bytes_limit
         self._depth_limit = depth_limit
 
-    def is_namespace(self, key: str) -> bool:
-        """Whether `key` (canonical) holds other keys."""
-        node: Value = self.tree
-        for part in _parts(key):
-            if not isinstance(node, dict) or part not in node:
-                return False
-            node = node[part]
-        return isinstance(node, dict)
-
     def check(self, key: str, value: Value) -> None:
         """Raise `ProtocolError` or `LimitReachedError` for a value that would be too deep or too much."""
         weight, depth = measure(value)
