@@ -26,7 +26,7 @@ EVENTS: dict[str, str] = {
     "hosts reloaded": "The file of declared hosts was read again; `detail` has what that opened and closed.",
     "enrolment refused": "Somebody asked to be enrolled and was refused; `host` is the real address.",
     "renewal refused": "A host asked for a new certificate and was refused.",
-    "ports checked": "A host said whether its ROS ports are closed to others than the appliance.",
+    "ports checked": "Somebody tried the ROS ports of a machine from outside and told how they are; `detail` has who.",
     "topics moved": "Topics or services are carried by another relay process; `detail` has which, and their monitors.",
     "tunnel up": "The tunnel of an enrolled host is up; `host` is its virtual address, `detail` has the real one.",
     "tunnel moved": "A standing tunnel comes from another real address now; `detail` has both.",

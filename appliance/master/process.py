@@ -285,7 +285,9 @@ class _Control:
             self._base.policies.reload()
         except PolicyRefusedError as error:
             _log.error("the policy was refused, the last good one stays in force", findings=error.findings)
-        self._reloading = asyncio.get_running_loop().create_task(self._reload_hosts())  # held until it is done
+        self._reloading = asyncio.get_running_loop().create_task(
+            self._reload_hosts()
+        )  # held until it is done
 
     async def _reload_hosts(self) -> None:
         try:

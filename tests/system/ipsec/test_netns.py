@@ -1,5 +1,6 @@
 """A tunnel to an appliance in a namespace of its own on a bare host, which forwards IKE and ESP to it."""
 
+import json
 import subprocess
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from appliance.network.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
 from tests.support.requirements import need_root
+from tests.support.script_host import ScriptHost
 from tests.support.tunnels import JoinedHost, need_strongswan
 
 ROBOT, OCU, BARE = "10.89.0.10", "10.89.0.20", "10.89.0.2"
@@ -68,3 +70,30 @@ def authority_seen_from(joined: JoinedHost) -> str:
     )
     out, _ = asked.communicate(timeout=30)
     return str(out)
+
+
+def test_a_host_enrols_itself_through_the_forwarding(tmp_path: Path) -> None:
+    """From a network that was named, to the bare host's own address; from any other REST is not there at all."""
+    need_root()
+    need_strongswan()
+    config = tmp_path / "appliance.yaml"
+    config.write_text(f"api: 0.0.0.0:8443\napi_networks: [{OCU}/32]\n")
+    with Lab("rosrv-ipsect") as lab:
+        bare = lab.host("bare", f"{BARE}/24", gateway="10.89.0.1")
+        ocu, robot = lab.host("ocu", f"{OCU}/24"), lab.host("robot", f"{ROBOT}/24")
+        script = tmp_path / "join.sh"
+        options = ("--config", str(config))
+        with (
+            Appliance(bare, policy=POLICY, isolation="netns", options=options) as appliance,
+            ScriptHost(ocu, tmp_path / "ocu") as laptop,
+            ScriptHost(robot, tmp_path / "robot") as stranger,
+        ):
+            done = appliance.rosrv(
+                "host", "add", "ocu-1", "--appliance", BARE, "--token", "--out", str(script), "--json"
+            )
+            token = json.loads(done.stdout)["token"]
+            refused = stranger.run("sh", str(script), token, check=False)
+            assert refused.returncode == 1
+            assert "no answer from the appliance" in refused.stderr
+            assert "the tunnel is up" in laptop.run("sh", str(script), token).stdout
+            assert "in force" in laptop.run("/etc/rosrv/renew.sh", "--now").stdout
