@@ -45,7 +45,6 @@ class Stating:
     ) -> None:
         self.allocation = allocation
         self.relays: Relays = NoRelays()
-        self.refused: list[str] = []
         self._recorder = recorder
         self._on_fault: Literal["drop", "pass"] = on_fault
         self._enabled = enabled
@@ -53,9 +52,15 @@ class Stating:
         self._known: set[int] = set()  # relays that had specifications before
         self._fresh: set[int] = set()  # relays that have not answered since they are there
         self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}
+        self._refusals: dict[int, list[str]] = {}
         self._held: dict[int, set[str]] = {}
         self._rows: dict[int, list[messages.MonitorRow]] = {}
         self.rows: dict[str, messages.MonitorRow] = {}
+
+    @property
+    def refused(self) -> list[str]:
+        """Why a relay does not take what is in force; empty when all do."""
+        return [finding for findings in self._refusals.values() for finding in findings]
 
     @property
     def held(self) -> set[str]:
@@ -206,7 +211,7 @@ class Stating:
             self._answer(at, number, ["a relay process ended while it took them: try again"])
 
     def _taken(self, relay: int, number: int, began: list[str], held: list[str]) -> None:
-        self.refused = []
+        self._refusals.pop(relay, None)
         self._held[relay] = set(held)
         if relay in self._fresh and began:
             self._recorder.happened(
@@ -224,7 +229,7 @@ class Stating:
 
     def _refused(self, relay: int, number: int, findings: list[str]) -> None:
         if number == self._now.number:
-            self.refused = findings
+            self._refusals[relay] = findings
         self._recorder.happened(
             "specifications refused",
             f"the relay does not take revision {number}: {findings[0] if findings else ''}",

@@ -183,6 +183,16 @@ async def test_held_monitors_and_rows_of_both(world: World) -> None:
     assert stating.held == {"a"}
 
 
+async def test_a_relay_that_does_not_take_what_is_in_force_is_told_of_until_it_does(world: World) -> None:
+    """Whatever the other one says."""
+    stating = world.stating
+    stating.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
+    stating.received(messages.SpecificationsTaken(1, ["a"], []), 0)
+    assert stating.refused == ["no memory"]
+    stating.received(messages.SpecificationsTaken(1, ["b"], []), 1)
+    assert stating.refused == []
+
+
 async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
     """The next one has the allocation that was kept; a relay's first answer to it is no restart."""
     kept: list[str] = []
