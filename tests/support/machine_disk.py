@@ -105,7 +105,17 @@ def checkout_archive(path: Path) -> None:
     for folder in ("appliance", "tests"):
         _compile(ROOT / folder, as_if_in=ROOT / folder)
     listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        # Root may run the tests of somebody else's checkout.
+        [
+            "git",
+            "-c",
+            f"safe.directory={ROOT}",
+            "ls-files",
+            "-z",
+            "--cached",
+            "--others",
+            "--exclude-standard",
+        ],
         cwd=ROOT,
         capture_output=True,
         check=True,
