@@ -105,6 +105,8 @@ class Engine:
         command = [self._program, "--data-root", str(DATA), "--exec-root", str(self.directory / "exec")]
         command += ["--pidfile", str(self.directory / "pid"), "--host", self.address]
         if self._builds:
+            # Should the tests be killed, nobody else would end it (the lab ends what lives on its hosts).
+            command = ["setpriv", "--pdeathsig", "TERM", *command]
             command += ["--bridge=none", "--iptables=false", "--ip-forward=false", "--ip-masq=false"]
         with self._log.open("ab") as log:
             self._process = self.host.popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
@@ -218,26 +220,39 @@ class Compose:
         return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
-        """Until the service's health check has passed."""
+        """Until the health check of a service has passed, since its container was started last."""
         container = self.container(service)
-        deadline = time.monotonic() + timeout
-        while (state := self.engine.inspect(container)["State"])["Health"]["Status"] != "healthy":
-            if not state["Running"] or time.monotonic() > deadline:
-                raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
+        since = self.engine.inspect(container)["State"]["StartedAt"]
+        command = [
+            "events",
+            "--since",
+            since,
+            "--filter",
+            f"container={container}",
+            "--format",
+            "{{.Status}}",
+        ]
+        for line in self._follow(command, timeout):
+            if line == "health_status: healthy":
+                return
+            if line == "die":
+                break
+        state = self.engine.inspect(container)["State"]
+        raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
 
     def wait_for_log(self, service: str, text: str, *, timeout: float = 60, since: str = "0s") -> str:
         """The first line of a service's output that contains `text`; `since` is a moment, as Docker writes it."""
-        command = [
-            shutil.which("docker") or "docker",
-            "logs",
-            "--follow",
-            container := self.container(service),
-        ]
-        command[3:3] = [] if since == "0s" else ["--since", since]
-        environment = os.environ | {"DOCKER_HOST": self.engine.address}
+        moment = [] if since == "0s" else ["--since", since]
+        for line in self._follow(["logs", "--follow", *moment, self.container(service)], timeout):
+            if text in line:
+                return line
+        raise DockerError(f"{service} did not say {text!r} within {timeout:.0f} s\n{self.story()}")
+
+    def _follow(self, command: Sequence[str], seconds: float) -> Iterator[str]:
+        """The lines of a docker command that goes on, as they come, for so long."""
         with subprocess.Popen(
-            ["timeout", str(timeout), *command],
-            env=environment,
+            ["timeout", str(seconds), shutil.which("docker") or "docker", *command],
+            env=os.environ | {"DOCKER_HOST": self.engine.address},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -246,13 +261,9 @@ class Compose:
             assert follow.stdout is not None
             try:
                 for line in follow.stdout:
-                    if text in line:
-                        return line.rstrip("\n")
+                    yield line.rstrip("\n")
             finally:
                 follow.terminate()
-        raise DockerError(
-            f"{service} ({container}) did not say {text!r} within {timeout:.0f} s\n{self.story()}"
-        )
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
         """`rosrv audit search --json` in the appliance; of its records those that have these fields."""
