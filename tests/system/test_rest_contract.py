@@ -63,14 +63,15 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
     """No answer is a failure of the server, or has a status, type, header or form the contract does not name; what
     breaks the contract is refused; nothing works without a token; and nobody was started again.
 
-    Left out: whether whatever fits the form is accepted, because a form cannot say what a right policy is; and the
-    stream, which does not end by itself.
+    Left out: whether whatever fits the form is accepted, because a form cannot say what a right policy is; the
+    stream, which does not end by itself; and the end of a token, which the fuzzer would give its own.
     """
     rest = appliance.rest()
     assert rest.get("/healthz").status == 200
     done = fuzz(
-        rest, tmp_path, "--exclude-checks", "positive_data_acceptance", "--exclude-path", "/v1/audit/stream"
-    )
+        rest, tmp_path, "--exclude-checks", "positive_data_acceptance", "--exclude-path", "/v1/audit/stream",
+        "--exclude-operation-id", "revoke_token",
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert "passed" in done.stdout
     rows = appliance.status()["processes"]
