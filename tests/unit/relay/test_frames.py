@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.relay.frames import LARGE, SCRATCH, Batch, FrameReceiver, MemoryBudget, boundary_at
+from appliance.relay.frames import (
+    LARGE,
+    SCRATCH,
+    Batch,
+    FrameReceiver,
+    MemoryBudget,
+    boundary_at,
+    equal_frames,
+    last_frame,
+)
 from appliance.ros.errors import LimitExceededError, PeerError
 
 LIMIT = 16 << 20
@@ -152,3 +161,38 @@ def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
         (2, 28),
         (3, 28),
     ]
+
+
+@given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
+def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
+    """What is said of the whole buffer is what walking from frame to frame finds."""
+    data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
+    stride, count = equal_frames(memoryview(data), len(data))
+    if count:
+        assert lengths[:count] == [stride - 4] * count
+        assert all(length + 4 > len(data) - stride * count for length in lengths[count:])
+    else:
+        assert stride == 0
+        assert len(lengths) < 4 or len(set(lengths)) > 1 or torn >= lengths[0] + 4
+
+
+def test_a_batch_of_equal_frames_says_so() -> None:
+    """Who reads them can take all fields in one go; a frame of another size ends that."""
+    one, _ = receiver()
+    data = frame(6) * 5 + frame(6)[:3]
+    one.buffer()[: len(data)] = data
+    equal = one.received(len(data))
+    rest = frame(6)[3:] + frame(6) * 3 + frame(7)
+    one.buffer()[: len(rest)] = rest
+    other = one.received(len(rest))
+    assert equal is not None
+    assert other is not None
+    assert (equal.messages, equal.stride, equal.last) == (5, 10, 40)
+    assert (other.messages, other.stride, other.last) == (5, 0, 40)
+
+
+def test_the_last_frame_is_looked_for_where_it_is_not_known() -> None:
+    """A batch that something was cut out of is latched all the same."""
+    view = memoryview(frame(6) + frame(0) + frame(10, 3))
+    assert last_frame(view) == 14
+    assert bytes(Batch(view, 3, None).keep_last().view) == frame(10, 3)
