@@ -28,6 +28,7 @@ from appliance.cli.running import Appliance, speaks
 app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)
 
 _POLL_SECONDS = 0.2
+_CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
 _TOLD_EVERY = 1000
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
 _AlwaysJson = Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")]
@@ -162,7 +163,7 @@ def checkpoints(
             if not found:
                 if not follow:
                     break
-                pause.wait(_POLL_SECONDS)
+                pause.wait(_CHECKPOINT_SECONDS)
 
 
 @app.command()
