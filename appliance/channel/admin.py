@@ -2,7 +2,8 @@
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make tokens: an api that fell to a stranger gains no access that lasts.
+passes on `RestRequest`, which cannot make tokens. An api that fell to a stranger can change policy, monitors and hosts
+as an admin can: each change is recorded and can be taken back (`policy rollback`, `host revoke`).
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """

@@ -213,31 +213,31 @@ def rest_of(site: TunnelSite) -> Rest:
 
 
 def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A kit from REST joins; the kit of later has no key; a new one closes the old tunnel; revoked, it is out."""
+    """A kit joins, under an odd name; a later one has no key; a new one closes the tunnel; revoked, it is out."""
     rest, ask = rest_of(site), site.attacker.run
     seen = ask(lambda: rest.get("/v1/hosts"))
-    new = {"name": "rested", "endpoint": MIDDLE, "how": "kit"}
+    new = {"name": "re.st_e-D", "endpoint": MIDDLE, "how": "kit"}
     made = ask(lambda: rest.post("/v1/hosts", new, match=seen.etag))
     assert made.status == 201, made.body
     assert ask(lambda: rest.post("/v1/hosts", new, match=seen.etag)).status == 412
     join_kit(laptop, tmp_path / "kit", made.body)
-    assert ask(lambda: rest.get("/v1/hosts/rested")).json["state"] == "up"
-    later = ask(lambda: rest.get(f"/v1/hosts/rested/kit?endpoint={MIDDLE}"))
+    assert ask(lambda: rest.get("/v1/hosts/re.st_e-D")).json["state"] == "up"
+    later = ask(lambda: rest.get(f"/v1/hosts/re.st_e-D/kit?endpoint={MIDDLE}"))
     (tmp_path / "later.tar.gz").write_bytes(later.body)
     with tarfile.open(tmp_path / "later.tar.gz") as tar:
         names = tar.getnames()
-    assert "rosrv-rested/swanctl/x509/rosrv.pem" in names
+    assert "rosrv-re.st_e-D/swanctl/x509/rosrv.pem" in names
     assert not [name for name in names if "private" in name]
     mark = site.mark
-    again = ask(lambda: rest.post("/v1/hosts/rested/kit", {"endpoint": MIDDLE}, match="*"))
+    again = ask(lambda: rest.post("/v1/hosts/re.st_e-D/kit", {"endpoint": MIDDLE}, match="*"))
     assert again.status == 200, again.body
     site.recorded(mark, event="tunnel down")
     join_kit(laptop, tmp_path / "again", again.body)
     mark = site.mark
-    gone = ask(lambda: rest.request("DELETE", "/v1/hosts/rested", None, {"If-Match": "*"}))
+    gone = ask(lambda: rest.request("DELETE", "/v1/hosts/re.st_e-D", None, {"If-Match": "*"}))
     assert gone.status == 200, gone.body
     site.recorded(mark, event="tunnel down")
-    assert ask(lambda: rest.get("/v1/hosts/rested")).json["state"] == "revoked"
+    assert ask(lambda: rest.get("/v1/hosts/re.st_e-D")).json["state"] == "revoked"
     laptop.run("/etc/rosrv/leave.sh")
 
 
@@ -246,7 +246,7 @@ def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
     folder.mkdir()
     (folder / "kit.tar.gz").write_bytes(kit)
     laptop.run("tar", "-xzf", str(folder / "kit.tar.gz"), "-C", str(folder))
-    laptop.run("sh", str(folder / "rosrv-rested/join.sh"))
+    laptop.run("sh", str(folder / "rosrv-re.st_e-D/join.sh"))
 
 
 def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
