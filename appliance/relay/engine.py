@@ -102,6 +102,7 @@ class Engine:
             self._middle.switch(message.name, message.enabled)
         elif isinstance(message, MonitorResumed):
             self._middle.resume(message.name)
+            self._ask_for_latched()
         elif isinstance(message, OwnHeaderStated):
             self._state_header(message)
         elif isinstance(message, OwnPublished):
@@ -215,6 +216,13 @@ class Engine:
                 self._let_monitor(relayed)
         for client in list(self._clients):
             client.judge_again()
+        self._ask_for_latched()
+
+    def _ask_for_latched(self) -> None:
+        """What monitors kept back of a latching publisher may go through now: it gives it to a new connection."""
+        for relayed, publisher in list(self._topics.values()):
+            if relayed.lacks_latched and isinstance(publisher, Publisher):
+                publisher.connect_anew()
 
     def _state_header(self, message: OwnHeaderStated) -> None:
         self._own_headers[message.topic] = {

@@ -105,6 +105,7 @@ class RelayedTopic:
         self._served: tuple[Member, ...] = ()
         self._latched: Batch | None = None
         self._latching = False
+        self._withheld = False
         self._recent: Recent | None = None
         self._paused = False
         self._connected = False
@@ -173,9 +174,15 @@ class RelayedTopic:
         if (self.members or self._wanted) and self.upstream is not None:
             self.upstream.want()
 
+    @property
+    def lacks_latched(self) -> bool:
+        """Whether monitors have kept back what a latching publisher gave, and nothing came through since."""
+        return self._latching and self._withheld and self._latched is None
+
     def upstream_closed(self) -> None:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
         self._latch(None)
+        self._withheld = False
         self._paused = False
         self._connected = False
         self._settle_recent()
@@ -187,7 +194,9 @@ class RelayedTopic:
         self._bytes += len(batch.view)
         self._reported = False
         left = batch if self._through is None else self._through(batch)
-        if left is not None:
+        if left is None:
+            self._withheld = True
+        else:
             self._pass_on(left)
             if self._served:
                 self._delays.add(self._clock() - since, left.messages)

@@ -167,6 +167,12 @@ class Publisher:
         self._header = header
         self._flow(header, self._stream.take(), self._parser.rest)
 
+    def connect_anew(self) -> None:
+        """Have a latching publisher give its message again."""
+        if self._socket is not None and self._wanted:
+            self._drop_connection()
+            self.ask()
+
     def judge_again(self) -> None:
         """Other specifications are in force: a publisher that does not fit them is refused, or again carried."""
         if self._socket is not None:

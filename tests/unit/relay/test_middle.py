@@ -336,6 +336,39 @@ def test_a_hold_specification_blocks_its_topics_after_a_restart_until_it_is_resu
     other.close()
 
 
+def test_a_latched_message_that_was_kept_back_comes_when_the_monitor_lets_it(world: Monitored) -> None:
+    """Its publisher says it once and to whoever connects: a held topic would stay without it after `resume`."""
+    latching = TYPED | {"latching": "1"}
+    world.load("hold " + GUARD.strip(), restarted=True)
+    subscriber = world.connect(encode_header(WANTED))
+    publisher = world.upstream(latching)
+    assert world.gets_header(subscriber)["latching"] == "1"
+    publisher.send(string("map"))
+    world.event("drop")
+    world.state(MonitorResumed("guard"))
+    again = world.upstream(latching)
+    again.send(string("map"))
+    world.gets(subscriber, string("map"))
+    world.load("hold " + GUARD.strip().replace("longer", "wider"), revision=2)
+    again.send(string("next"))
+    world.gets(subscriber, string("next"))
+
+
+def test_a_latched_message_that_a_monitor_dropped_comes_when_it_is_replaced(world: Monitored) -> None:
+    """Also to subscribers that are there already; without a drop no connection is made anew."""
+    latching = TYPED | {"latching": "1"}
+    world.load(GUARD)
+    subscriber = world.connect(encode_header(WANTED))
+    publisher = world.upstream(latching)
+    world.gets_header(subscriber)
+    publisher.send(string("bad"))
+    world.event("drop")
+    world.load(GUARD.replace('"bad"', '"worse"'), revision=2)
+    again = world.upstream(latching)
+    again.send(string("bad"))
+    world.gets(subscriber, string("bad"))
+
+
 LATCH = """
 gate() {
     bool open = false;
