@@ -17,6 +17,7 @@ from appliance.relay.loop import Loop
 from appliance.relay.middle import Middle
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
+from appliance.rosmop.batch import Walked
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -263,4 +264,32 @@ def test_most_messages_are_taken_together() -> None:
     monitored.middle.tick()
     assert single == 1
     assert [(row.events, row.changes) for row in monitored.rows()] == [(5000, 5000)]
+    monitored.close()
+
+
+def test_a_defect_of_the_loops_is_told_once_and_the_engine_goes_on() -> None:
+    """Messages go on, one by one; the loops of this topic are not tried again."""
+    monitored = Monitored(
+        {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
+        definitions(),
+        together=True,
+    )
+    tried = []
+
+    def defect(*arguments: object) -> Walked:
+        tried.append(arguments)
+        raise ZeroDivisionError
+
+    walker = monitored.set.walker("/plain")
+    assert walker is not None
+    walker.walk = defect  # type: ignore[method-assign, assignment]
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    frame = struct.pack("<I", len(body)) + body
+    changed = frame[:5] + struct.pack("<i", 3) + frame[9:]
+    for _ in range(3):
+        left = monitored.through(Traffic("/plain", frame * 6, 6))
+        assert left == (6, changed * 6, changed)
+    told = [one for one in monitored.told() if "kind='fault'" in one]
+    assert len(told) == len(tried) == 1
+    assert "a defect of rosrv" in told[0]
     monitored.close()
