@@ -2,7 +2,8 @@
 
 A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
 one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
-and loading. Times are processor time, the median of the rounds, in microseconds for a message.
+the reference in the loops that take a batch at once, of equally long messages, of others, and alone; and loading.
+Times are processor time, the median of the rounds, in microseconds for a message.
 """
 
 import statistics
@@ -52,6 +53,20 @@ def monitors(text: str) -> MonitorSet:
     return loaded
 
 
+def batched(messages: int, alike: bool) -> float:
+    """A message in a batch of so many; what the loop writes is there already after the first round."""
+    loaded = monitors(REFERENCE)
+    loaded.write_loops()
+    loaded.process("/cmd", bytearray(COMMAND), 1)
+    walker = loaded.walker("/cmd")
+    assert walker is not None
+    frame = struct.pack("<I", len(COMMAND)) + COMMAND
+    view, stride = memoryview(bytearray(frame * messages)), len(frame) if alike else 0
+    prepared = walker.prepare(loud=False, told=())
+    times = MESSAGES // messages
+    return microseconds(lambda: walker.walk(view, 0, 0, [], stride, 1, prepared), times) / messages
+
+
 DEFINITIONS = standard_definitions()
 
 
@@ -68,6 +83,12 @@ def main() -> None:
         rows.append((name, lambda loaded=loaded: loaded.process("/cmd", COMMAND, 1)))
     for name, action in rows:
         print(f"{name:32} {microseconds(action, MESSAGES):8.2f} µs")
+    for name, messages, alike in (
+        ("reference, batch, equally long", 1000, True),
+        ("reference, batch, of any length", 1000, False),
+        ("reference, comes alone", 1, False),
+    ):
+        print(f"{name:32} {batched(messages, alike):8.2f} µs")
     loading = microseconds(lambda: MonitorSet.load({"benchmark.rv": REFERENCE}, DEFINITIONS), 20) / 1000
     print(f"{'loading the reference':32} {loading:8.2f} ms")
 

@@ -5,15 +5,33 @@ One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`
 FSM at every message), with 10 and with 50 more on other topics; `topic_tools relay`; a typed rospy relay that does
 the monitor's work. Cells are medians of the rounds; ratios are to the C relay, of one round each.
 
-*window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay.
+*window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay;
+*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor of its own; *memory*: that of the relay while
+a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest.
 Needs g++, rosmaster, topic_tools and rospy.
 """
 
 import argparse
+import json
+import os
 import statistics
 import subprocess
+import threading
+from pathlib import Path
 
-from benchmarks.relay_throughput import HERE, PROGRAM, TYPE, Direct, Relay, Result, RosRelay, System, run
+from benchmarks.relay_throughput import (
+    HERE,
+    PROGRAM,
+    TYPE,
+    Direct,
+    Relay,
+    Result,
+    RosRelay,
+    System,
+    compiled,
+    cpu_seconds,
+    run,
+)
 
 COPYING = PROGRAM.with_name("copying_relay")
 DEFINITION = HERE / "nodes" / "msg" / f"{TYPE}.msg"
@@ -26,6 +44,8 @@ NAME() {
     @fail { ROS_ERROR("impossible"); }
 }
 """
+TOPICS = (1, 8)
+MORE_TOPICS = (1, 8, 20, 50, 100)
 SIZES = (32, 200, 4096, 65536, 1048576, 4194304)
 QUICK = {"window": (32, 4096, 65536, 1048576, 4194304), "flat": (32,), "paced": (200,)}
 WHOLE = {"window": SIZES, "flat": SIZES[:-1], "paced": SIZES[:4]}
@@ -81,6 +101,75 @@ def monitored(others: int) -> Relay:
     return relay
 
 
+def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
+    """That many topics at 1,000 messages of 200 bytes a second, a monitor on each.
+
+    The median and the largest of the topics' p50 (microseconds), and the share of a core that the relay takes.
+    """
+    relay = Relay("topics")
+    names = [f"/load{one}" for one in range(number)]
+    files = [(f"{one}.rv", specification(f"load{one}", name)) for one, name in enumerate(names)]
+    loads: list[subprocess.Popen[str]] = []
+    try:
+        relay.monitor(files, {f"{TYPE}.msg": DEFINITION.read_text()})
+        for _ in names:
+            command = [str(compiled()), "200", str(seconds), "paced"]
+            loads.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+        for name, load in zip(names, loads, strict=True):
+            assert load.stdin is not None
+            assert load.stdout is not None
+            port, topic = relay.place(int(load.stdout.readline()), name)
+            load.stdin.write(f"{port} {topic}\n")
+            load.stdin.flush()
+        before = cpu_seconds(relay.pid)
+        answers = [json.loads(load.communicate()[0]) for load in loads]
+        busy = (cpu_seconds(relay.pid) - before) / seconds
+    finally:
+        for load in loads:
+            load.kill()
+            load.wait()
+        relay.close()
+    delays = [answer["p50_us"] for answer in answers]
+    return statistics.median(delays), max(delays), busy
+
+
+def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
+    """Print how the delay grows with the number of topics."""
+    print("\n1,000 messages of 200 bytes a second on each topic, a monitor on each: p50 in microseconds")
+    first = 0.0
+    for number in numbers:
+        found = [topics_at_once(number, seconds) for _ in range(rounds)]
+        middle, worst, busy = (statistics.median(column) for column in zip(*found, strict=True))
+        first = first or middle
+        print(
+            f"{number:>4} topics: {middle:8.0f}  x{middle / first:.2f}, slowest topic {worst:.0f}"
+            f" (the relay takes {busy:.0%} of a core)",
+            flush=True,
+        )
+
+
+def resident(pid: int | None) -> float:
+    """MiB of memory of a process."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def show_memory(minutes: float) -> None:
+    """Print what the relay holds while messages come as fast as it goes, at twelve moments."""
+    relay = monitored(0)
+    print(f"\nas fast as it goes for {minutes:g} minutes, one monitor: MiB that the relay holds", flush=True)
+    try:
+        run("flat", 200, 0.4, relay)
+        load = threading.Thread(target=lambda: run("flat", 200, minutes * 60, relay))
+        load.start()
+        while load.is_alive():
+            load.join(minutes * 5)
+            print(f"{resident(relay.pid):.1f}", end=" ", flush=True)
+        print()
+    finally:
+        relay.close()
+
+
 def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) -> None:
     """Print one mode: medians, ratios to the C relay, losses, CPU time."""
     what = {
@@ -113,31 +202,43 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
     return text + (f" ({cpu:.2f})" if cpu else "")
 
 
+def begin(systems: list[System], *, peers: bool) -> None:
+    """Start what is put in the middle in turns."""
+    systems += [Direct(), CopyingRelay(), Relay("relay alone")]
+    systems += [monitored(others) for others in (0, 10, 50)]
+    if peers:
+        systems.append(RosRelay())
+        systems.append(RosRelay("rospy", ("/usr/bin/python3", str(HERE / "nodes" / "rospy_relay.py"))))
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, help="of each cell (3; with --all 5)")
     parser.add_argument("--seconds", type=float, help="of each run (0.4; with --all 1.5)")
     parser.add_argument("--all", action="store_true", help="every size in every mode")
-    parser.add_argument("--modes", type=lambda text: text.split(","), default=["window", "flat", "paced"])
+    parser.add_argument(
+        "--modes",
+        type=lambda text: text.split(","),
+        help="of window,flat,paced,topics,memory (the first three; with --all all)",
+    )
+    parser.add_argument("--minutes", type=float, help="of the memory run (1; with --all 10)")
+    parser.add_argument("--relays", action="store_true", help="without topic_tools and rospy")
     parser.add_argument("--sizes", type=lambda text: tuple(int(one) for one in text.split(",")))
     options = parser.parse_args()
     rounds = options.rounds or (5 if options.all else 3)
     seconds = options.seconds or (1.5 if options.all else 0.4)
+    modes = options.modes or ["window", "flat", "paced", *(["topics", "memory"] if options.all else [])]
     plan = {
         mode: options.sizes or sizes
         for mode, sizes in (WHOLE if options.all else QUICK).items()
-        if mode in options.modes
+        if mode in modes
     }
     results: Results = {}
-    systems: list[System] = [Direct(), CopyingRelay()]
+    systems: list[System] = []
     try:
-        systems += [Relay("relay alone")]
-        systems += [monitored(others) for others in (0, 10, 50)]
-        systems += [
-            RosRelay(),
-            RosRelay("rospy", ("/usr/bin/python3", str(HERE / "nodes" / "rospy_relay.py"))),
-        ]
+        if plan:
+            begin(systems, peers=not options.relays)
         for _round in range(rounds):
             for mode, sizes in plan.items():
                 for size in sizes:
@@ -149,6 +250,10 @@ def main() -> None:
             system.close()
     for mode, sizes in plan.items():
         show(results, mode, sizes, [system.name for system in systems])
+    if "topics" in modes:
+        show_topics(MORE_TOPICS if options.all else TOPICS, rounds, max(2.0, seconds))
+    if "memory" in modes:
+        show_memory(options.minutes or (10 if options.all else 1))
 
 
 if __name__ == "__main__":

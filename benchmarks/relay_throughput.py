@@ -124,8 +124,7 @@ class Relay:
 
     def __init__(self, name: str = "relay") -> None:
         self.name = name
-        self._publisher = 0
-        self._runs = 0
+        self._publishers: dict[str, int] = {}
         self._relay = RelayProcess()
         self._link: ChannelPeer = self._relay.open_link(self._answer)
         self.pid: int | None = self._relay.process.pid
@@ -139,15 +138,18 @@ class Relay:
 
     def target(self, publisher: int) -> tuple[int, str]:
         """A new incarnation, whose publisher is this run's."""
-        self._publisher = publisher
-        self._runs += 1
-        key = str(self._runs)
+        return self.place(publisher, "/load")
+
+    def place(self, publisher: int, topic: str) -> tuple[int, str]:
+        """A new incarnation that publishes this topic; port and topic for its subscriber."""
+        key = str(len(self._publishers) + 1)
+        self._publishers[key] = publisher
         with socket.create_server((LOOPBACK, 0)) as listening:
             self._link.send(NodePlaced(key, "/load", LOOPBACK), (listening.fileno(),))
-            self._link.send(PublicationPlaced(key, "/load", TYPE))
-            self._link.send(GrantInstalled(key, "/load", LOOPBACK, "/load_listener"))
-            self._relay.ping(self._runs)
-            return int(listening.getsockname()[1]), "/load"
+            self._link.send(PublicationPlaced(key, topic, TYPE))
+            self._link.send(GrantInstalled(key, topic, LOOPBACK, "/load_listener"))
+            self._relay.ping(len(self._publishers))
+            return int(listening.getsockname()[1]), topic
 
     def close(self) -> None:
         """End the process."""
@@ -156,7 +158,9 @@ class Relay:
 
     def _answer(self, message: Any) -> None:
         if isinstance(message, UpstreamWanted):
-            self._link.send(UpstreamFound(message.key, message.topic, LOOPBACK, self._publisher))
+            self._link.send(
+                UpstreamFound(message.key, message.topic, LOOPBACK, self._publishers[message.key])
+            )
 
 
 class RosRelay:
