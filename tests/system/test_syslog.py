@@ -93,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def configure(folder: Path, tls: Certificates, to: str) -> Path:
+def configure(folder: Path, tls: Certificates, to: str, backend: str = "auto") -> Path:
     """The appliance's configuration: to this receiver, sealed every second; the key is the forwarder's."""
     mine = folder / "forwarder.key"
     shutil.copy(tls.key, mine)
@@ -105,7 +105,8 @@ def configure(folder: Path, tls: Certificates, to: str) -> Path:
     syslog = {"to": to}
     if to.startswith("tls"):
         syslog |= {"ca": "tls/ca.pem", "certificate": "tls/peer.pem", "key": "forwarder.key"}
-    file.write_text(json.dumps({"audit": {"checkpoint_seconds": 1, "syslog": syslog}}))
+    audit = {"checkpoint_seconds": 1, "syslog": syslog}
+    file.write_text(json.dumps({"audit": audit, "firewall": {"backend": backend}}))
     return file
 
 
@@ -162,11 +163,12 @@ def test_datagrams_to_rsyslog(lab: Lab, folder: Path) -> None:
         eventually(lambda: wanted <= keeper.sequences())
 
 
-def test_the_forwarder_reaches_its_receiver_only(lab: Lab, folder: Path) -> None:
+@pytest.mark.parametrize("backend", ["nft", "iptables"])
+def test_the_forwarder_reaches_its_receiver_only(lab: Lab, folder: Path, backend: str) -> None:
     """Whoever takes over the forwarder's process reaches the receiver, and nothing else: no host, no local port."""
     machine, other = lab.host("machine", "10.83.0.2/24"), lab.host("other", "10.83.0.66/24")
     keeper = Keeper(lab.host("keeper", f"{KEEPER}/24"), folder)
-    config = configure(folder, keeper.tls, f"tls://{KEEPER}:6514")
+    config = configure(folder, keeper.tls, f"tls://{KEEPER}:6514", backend)
     listen = [sys.executable, "-c", _LISTEN]
     with (
         keeper.running(),
