@@ -9,6 +9,7 @@ Invariants:
 """
 
 import ipaddress
+import itertools
 import re
 import time
 from dataclasses import replace
@@ -127,7 +128,7 @@ class HostTable:
         taken |= {address: one for address, one in awaited.items() if one != name}
         if wanted is None:
             reserved = {one.address for one in self.declared.hosts.values()}
-            for one in list(self.pool.hosts())[1:]:
+            for one in itertools.islice(self.pool.hosts(), 1, None):
                 if str(one) not in taken and str(one) not in reserved:
                     return str(one)
             raise HostRefusedError(f"every address of {self.pool} is a host's: take a larger ipsec.pool")
@@ -135,7 +136,8 @@ class HostTable:
             address = ipaddress.IPv4Address(wanted)
         except ValueError:
             raise HostRefusedError(f"{wanted[:80]!r} is no IPv4 address") from None
-        if address not in list(self.pool.hosts()) or str(address) == self.own_address:
+        ends = (self.pool.network_address, self.pool.broadcast_address)
+        if address not in self.pool or address in ends or str(address) == self.own_address:
             raise HostRefusedError(f"{address} is not an address of a host in {self.pool}")
         if str(address) in taken:
             raise HostRefusedError(f"{address} is the address of {taken[str(address)]}")

@@ -7,7 +7,7 @@ from typing import Any
 from appliance.master.awaited import Awaited
 from appliance.master.host_table import HostTable
 from appliance.master.tunnels import Tunnels
-from appliance.store.hosts import HostRow
+from appliance.store.hosts import AwaitedRow, HostRow
 
 SOON_SECONDS = 14 * 86_400.0
 _NEVER: dict[str, Any] = {"state": "unknown", "checked": None, "open": [], "who": ""}
@@ -30,21 +30,20 @@ class HostView:
 
     def rows(self) -> list[dict[str, Any]]:
         """Every host, enrolled, awaited or declared, by name."""
-        names = {*self._table.rows, *self._table.declared.hosts, *self._awaited.rows()}
-        return [self.row(name) for name in sorted(names)]
+        awaited = self._awaited.rows()
+        names = {*self._table.rows, *self._table.declared.hosts, *awaited}
+        return [self._row(name, awaited.get(name)) for name in sorted(names)]
 
-    def row(self, name: str) -> dict[str, Any]:
-        """One host; of one that nothing is known of, a row that says so."""
+    def _row(self, name: str, awaited: AwaitedRow | None) -> dict[str, Any]:
         declared = self._table.declared.hosts.get(name)
         row, seen = self._table.rows.get(name), self._tunnels.seen.get(name)
-        awaited = self._awaited.rows().get(name)
         promised = awaited.address if awaited else declared.address if declared else None
         certificate = self._table.certificates.get(name)
         now = time.time()
         return {
             "name": name,
             "address": row.address if row else promised,
-            "state": self._state(name, row, now),
+            "state": self._state(name, row, now, awaited=awaited is not None),
             "groups": list(declared.groups) if declared else [],
             "declared": declared is not None,
             "wanted": self._table.declared.wants(name),
@@ -123,11 +122,11 @@ class HostView:
             if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
         ]
 
-    def _state(self, name: str, row: HostRow | None, now: float) -> str:
+    def _state(self, name: str, row: HostRow | None, now: float, *, awaited: bool) -> str:
         if row is None:
-            return "awaited" if name in self._awaited.rows() else "not enrolled"
+            return "awaited" if awaited else "not enrolled"
         if row.revoked is not None:
-            return "awaited" if name in self._awaited.rows() else "revoked"
+            return "awaited" if awaited else "revoked"
         if not self._table.declared.wants(name):
             return "not wanted"
         if name in self._tunnels.seen:
