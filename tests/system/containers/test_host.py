@@ -61,7 +61,7 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
         assert hosts == {MACHINE}
 
         def open_ports() -> tuple[int, ...]:
-            return site.laptop.run(lambda: scan("10.79.0.1", LOCAL_PORTS, seconds=0.3)).open
+            return site.laptop.run(lambda: scan("10.79.0.1", LOCAL_PORTS, seconds=2.0)).open
 
         assert open_ports(), "without protection a scanner finds the nodes"
         site.machine.run(lambda: nft("-f", "-", text=rules))
