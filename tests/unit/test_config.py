@@ -124,3 +124,17 @@ def test_a_syslog_receiver_that_cannot_be(syslog: dict[str, object], why: str) -
     """What could not work, or would do nothing, is an error that says which key and why."""
     with pytest.raises(ValidationError, match=why):
         Settings.model_validate({"audit": {"syslog": syslog}})
+
+
+@pytest.mark.parametrize(
+    ("pool", "said"),
+    [
+        ("fd00:77::/64", "virtual addresses are IPv4"),
+        ("10.113.11.0/30", "prefix length from 16 to 29"),
+        ("10.0.0.0/8", "prefix length from 16 to 29"),
+    ],
+)
+def test_a_pool_of_virtual_addresses_that_cannot_be(pool: str, said: str) -> None:
+    """IPv6, too small and too large: each says what is taken."""
+    with pytest.raises(ValidationError, match=said):
+        Settings.model_validate({"ipsec": {"pool": pool}})

@@ -1,8 +1,14 @@
 """Tests of `rosrv protect` as a verb of the command."""
 
+from typing import Any
+
+import pytest
 from typer.testing import CliRunner
 
+from appliance.channel.admin import AdminAnswer, AdminRequest, HostPorts
+from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.main import app
+from appliance.network.scan import ScanResult
 
 
 def test_the_file_is_printed() -> None:
@@ -18,3 +24,63 @@ def test_the_help_has_examples_and_says_how_to_keep_it() -> None:
     text = CliRunner().invoke(app, ["protect", "--help"]).stdout
     for words in ("--apply", "--check 192.168.1.10", "systemctl enable --now nftables"):
         assert words in text
+
+
+def answering(monkeypatch: pytest.MonkeyPatch, body: dict[str, Any] | None) -> list[AdminRequest]:
+    """An appliance that answers with this, or (None) none at all; what it was asked."""
+    asked: list[AdminRequest] = []
+
+    def ask(_self: AdminSocket, request: AdminRequest) -> AdminAnswer:
+        asked.append(request)
+        if body is None:
+            raise NotRunningError("/var/lib/rosrv: no appliance runs with this state directory")
+        return AdminAnswer(True, body)
+
+    monkeypatch.setattr(AdminSocket, "ask", ask)
+    return asked
+
+
+def test_the_appliance_is_the_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without --appliance it is asked how the robot sees it; with it nothing is asked."""
+    asked = answering(monkeypatch, {"isolation": "netns", "master": "http://10.200.0.2:11311"})
+    result = CliRunner().invoke(app, ["protect", "--ports", "40000-40099", "--state", "/var/lib/rosrv"])
+    assert result.exit_code == 0, result.output
+    assert "ip saddr { 10.200.0.2 } accept" in result.stdout
+    assert len(asked) == 1
+    CliRunner().invoke(app, ["protect", "--appliance", "192.168.1.20", "--ports", "40000"])
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (None, "no appliance runs"),
+        ({"isolation": "none", "master": "http://127.0.0.1:11311"}, "without isolation"),
+    ],
+)
+def test_an_appliance_that_cannot_be_known_is_to_be_named(
+    monkeypatch: pytest.MonkeyPatch, body: dict[str, Any] | None, said: str
+) -> None:
+    """The error says why, and how to name it."""
+    answering(monkeypatch, body)
+    result = CliRunner().invoke(app, ["protect", "--ports", "40000-40099"])
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert "--appliance 192.168.1.20" in result.stderr
+
+
+def test_what_a_check_saw_is_told_where_an_appliance_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under the name of the host, with the ports that were open; nobody is told when no appliance was named."""
+    asked = answering(monkeypatch, {"name": "ocu", "ports": {}})
+    monkeypatch.setattr(
+        "appliance.cli.protect.scan", lambda address, _ports, _s: ScanResult(address, (40001,), 99, 0)
+    )
+    check = ["protect", "--check", "192.0.2.7", "--ports", "40000-40099"]
+    assert CliRunner().invoke(app, check).exit_code == 1
+    assert asked == []
+    result = CliRunner().invoke(app, [*check, "--as", "ocu", "--state", "/var/lib/rosrv"])
+    assert result.exit_code == 1
+    (told,) = asked
+    assert isinstance(told, HostPorts)
+    assert (told.name, told.state, told.open) == ("ocu", "open", [40001])
+    assert "the ports of ocu are open" in result.stderr
