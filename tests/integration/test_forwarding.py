@@ -10,8 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
 from tests.support.appliance import Appliance
-from tests.support.syslog import StreamCollector, eventually
+from tests.support.forgery import write_anew
+from tests.support.syslog import Message, StreamCollector, eventually
 
 
 @contextmanager
@@ -119,3 +123,33 @@ def test_only_denials(tmp_path: Path) -> None:
         assert denial.facility == 10
         assert denial.fields["caller_id"] == "/rogue\\u202e]\\n"
         assert all(one.fields.get("decision") != "allow" for one in collector.messages)
+
+
+def test_history_written_anew_by_root(tmp_path: Path) -> None:
+    """Root rewrites the log with the real key: here all is right, and the other machine's file knows better."""
+    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
+        with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+            assert master.noSuchCall("/thief")[0] == 0
+        work(appliance, 20)
+        (theft,) = appliance.audit("--caller", "/thief")
+        collector.wait_for(
+            lambda messages: any(int(one.fields["sequence"]) >= theft["sequence"] for one in sealed(messages))
+        )
+        assert appliance.stop() == 0
+        kept = tmp_path / "receiver.ndjson"
+        kept.write_text("".join(json.dumps(one.fields) + "\n" for one in sealed(collector.messages)))
+        key = load_pem_private_key((appliance.state / "signer" / "audit.key").read_bytes(), None)
+        assert isinstance(key, Ed25519PrivateKey)
+        log = appliance.state / "control" / "audit.db"
+        change = "UPDATE record SET decision = 'allow', caller_id = '/friend' WHERE caller_id = '/thief'"
+        write_anew(log, key, appliance.state / "signer", change)
+        assert "complete and unchanged" in appliance.rosrv("audit", "verify").stdout
+        assert appliance.audit("--caller", "/thief") == []
+        done = appliance.rosrv("audit", "verify", "--checkpoints", str(kept), check=False)
+        assert done.returncode == 1
+        assert "REWRITTEN" in done.stdout
+
+
+def sealed(messages: list[Message]) -> list[Message]:
+    """The checkpoints among them."""
+    return [one for one in messages if one.event == "checkpoint-signed"]
