@@ -14,6 +14,7 @@ Invariants:
 
 import json
 import zlib
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -26,11 +27,15 @@ Resource = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Files that stay together, and what they touch; `specifications` is how many there are."""
+    """Files that stay together, with how many specifications each has, and what they touch."""
 
-    files: frozenset[str]
-    specifications: int
+    files: Mapping[str, int]
     resources: frozenset[Resource]
+
+    @property
+    def specifications(self) -> int:
+        """How many monitors there are."""
+        return sum(self.files.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +96,7 @@ class Allocation:
         resources: dict[Resource, int] = {}
         loads = [0] * self.relays
         for group in groups_of(checked):
-            costs = [
-                (*self._cost(group, one, checked, carried), loads[one], one) for one in range(self.relays)
-            ]
+            costs = [(*self._cost(group, one, carried), loads[one], one) for one in range(self.relays)]
             relay = min(costs)[-1]
             loads[relay] += group.specifications
             files.update(dict.fromkeys(group.files, relay))
@@ -120,13 +123,10 @@ class Allocation:
         }
         self._save(json.dumps(kept))
 
-    def _cost(
-        self, group: Group, relay: int, checked: Checked, carried: Collection[Resource]
-    ) -> tuple[int, int]:
+    def _cost(self, group: Group, relay: int, carried: Collection[Resource]) -> tuple[int, int]:
         """The monitors, and the carried topics and services, that would have to move there."""
-        away = {name for name in group.files if self._plan.files.get(name, relay) != relay}
-        moving = sum(file in away for file in checked.monitors.values())
-        return moving, sum(
+        here = self._plan.files
+        return sum(count for name, count in group.files.items() if here.get(name, relay) != relay), sum(
             one in carried and self._of(self._plan.resources, one) != relay for one in group.resources
         )
 
@@ -146,14 +146,12 @@ def groups_of(checked: Checked) -> list[Group]:
         touched[file] |= {(SERVICE, one) for one in checked.services[name]}
     for file, topics in checked.published_by.items():
         touched[file] |= {(TOPIC, one) for one in topics}
-    joined = _join(touched, checked)
+    counts = Counter(checked.monitors.values())
     groups = [
         Group(
-            frozenset(files),
-            sum(file in files for file in checked.monitors.values()),
-            frozenset(one for file in files for one in touched[file]),
+            {file: counts[file] for file in files}, frozenset(one for file in files for one in touched[file])
         )
-        for files in joined
+        for files in _join(touched, checked)
     ]
     return sorted(groups, key=lambda group: (-group.specifications, sorted(group.files)))
 
