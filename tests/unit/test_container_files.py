@@ -1,0 +1,48 @@
+"""Tests that Dockerfile, compose.yaml and documentation keep step with the processes (the rest: system tests)."""
+
+import re
+from pathlib import Path
+
+import yaml
+
+from appliance.supervisor.privileges import SUPERVISORS
+from appliance.supervisor.roles import roles_of
+from appliance.supervisor.users import NUMERIC_IDS
+
+ROOT = Path(__file__).parents[2]
+TRUE = Path("/bin/true")
+
+
+def granted() -> set[str]:
+    """The capabilities in compose.yaml."""
+    return set(yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["cap_add"])
+
+
+def test_the_image_has_every_user() -> None:
+    """Each process's user is made in the image, with its number."""
+    made = re.findall(r"\b(ros[a-z-]+):(610\d\d)\b", (ROOT / "Dockerfile").read_text())
+    assert {name: int(number) for name, number in made} == NUMERIC_IDS
+
+
+def test_every_process_is_in_the_table_of_rights() -> None:
+    """The documentation names each process with its user and capabilities."""
+    text = (ROOT / "docs" / "next-to-your-robot.md").read_text()
+    rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", text, re.MULTILINE)
+    documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
+    roles = roles_of(rosmaster=TRUE, rosout=TRUE, api=True, syslog=True)
+    expected = {role.name: (role.user, set(role.capabilities)) for role in roles}
+    assert documented == expected | {"supervisor": ("root", granted())}
+
+
+def test_the_container_is_given_what_the_supervisor_knows() -> None:
+    """A right that the supervisor would give up at once is not asked for."""
+    assert granted() <= set(SUPERVISORS)
+
+
+def test_each_right_has_its_reason_beside_it() -> None:
+    """In compose.yaml every capability stands on a line with a comment."""
+    lines = [
+        line for line in (ROOT / "compose.yaml").read_text().splitlines() if re.match(r" +- [A-Z_]+\b", line)
+    ]
+    assert len(lines) == len(granted())
+    assert all(re.search(r"  # \w", line) for line in lines)
