@@ -28,6 +28,7 @@ _LOG = "control/audit.db"
 # Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid")
 _LOGS_OF_ROS = ("rosmaster",)
+_ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/upgrade-and-backup.md)"
 
 
 class BackupError(Exception):
@@ -55,7 +56,7 @@ def back_up(state: Path, file: Path) -> list[str]:
             os.fsync(raw.fileno())
     except (OSError, sqlite3.Error) as error:
         file.unlink()
-        raise BackupError(f"the backup was not made: {error}; run this as root") from error
+        raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
     return names
 
 
@@ -88,10 +89,19 @@ def _files(state: Path) -> Iterator[Path]:
     parts = {role.part for role in roles_of(syslog=True)} - set(_LOGS_OF_ROS)
     yield state / _LOG
     for part in sorted(parts):
-        for path in sorted((state / part).rglob("*")):
-            kept = path.is_file() and not path.is_symlink() and not path.name.endswith(_PASSING)
-            if kept and path != state / _LOG:
-                yield path
+        if not (state / part).exists():
+            continue  # a role that never ran here
+        # A folder that cannot be looked into is an error: a backup without the keys would be none.
+        for folder, folders, names in os.walk(state / part, onerror=_raise):
+            folders.sort()
+            for path in (Path(folder) / name for name in sorted(names)):
+                kept = path.is_file() and not path.is_symlink() and not path.name.endswith(_PASSING)
+                if kept and path != state / _LOG:
+                    yield path
+
+
+def _raise(error: OSError) -> None:
+    raise error
 
 
 def _copy_database(path: Path, copy: Path) -> None:

@@ -1,9 +1,13 @@
 """Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
 
 import io
+import os
 import sqlite3
 import stat
+import subprocess
+import sys
 import tarfile
+import tempfile
 from contextlib import closing
 from pathlib import Path
 
@@ -15,6 +19,7 @@ from appliance.audit.verify import verify
 from appliance.ipsec.checkpoints import SignedCheckpoints
 from appliance.supervisor.backup import BackupError, back_up, restore
 from tests.support.audit import decision, settle
+from tests.support.requirements import need_root
 
 
 @pytest.fixture
@@ -118,3 +123,31 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
         restore(tmp_path / "rubbish", tmp_path / "state")
     with pytest.raises(BackupError, match="nowhere cannot be put back"):
         restore(tmp_path / "nowhere", tmp_path / "state")
+
+
+def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
+    """A backup without the keys would be none: what cannot be looked into is an error, and no file is left."""
+    need_root()
+    file = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
+    file.chmod(0o777)
+    for path in (tmp_path, *tmp_path.parents):
+        if path.stat().st_uid == os.geteuid() and path != Path("/"):
+            path.chmod(path.stat().st_mode | 0o011)
+    for path in state.rglob("*"):
+        path.chmod(0o777)
+    (state / "signer").chmod(0o700)
+    program = (
+        "import os, sys; from pathlib import Path; from appliance.supervisor.backup import back_up;"
+        "os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534);"
+        "back_up(Path(sys.argv[1]), Path(sys.argv[2]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(state), str(file / "b.tar.gz")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "BackupError" in done.stderr
+    assert "signer" in done.stderr
+    assert list(file.iterdir()) == []
+    file.rmdir()
