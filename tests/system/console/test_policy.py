@@ -53,6 +53,23 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
     assert revision(appliance) == before
 
 
+def test_what_is_typed_stands_there(opened: Callable[..., Reader]) -> None:
+    """Typed quickly, key by key, over several lines, taken back and done again: the text is what was typed."""
+    reader = opened()
+    page = reader.go("policy")
+    first = reader.editor().inner_text()
+    reader.editor().click()
+    page.keyboard.press("Control+End")
+    lines = "\n".join(f"# line {number} of a long remark, typed without a pause" for number in range(12))
+    page.keyboard.type(lines)
+    expect(reader.editor()).to_contain_text("# line 11 of a long remark, typed without a pause")
+    page.get_by_role("tab", name="Diff").click()
+    expect(page.locator(".diff-line.added")).to_have_count(12)
+    page.get_by_role("button", name="Discard").click()
+    expect(page.get_by_text("as in force")).to_be_visible()
+    assert reader.editor().inner_text() == first
+
+
 def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: Callable[..., Reader]) -> None:
     """A dry run says what would change; loading it makes a new revision with author and comment; the diff is shown."""
     before = revision(appliance)

@@ -19,8 +19,8 @@ const SOURCE = "/console/static/vendor/codemirror.js";
 export function Editor({ label, value, change, language, findings = [], line = null, dry, height = "60vh" }) {
   const host = useRef(/** @type {HTMLElement | null} */ (null));
   const held = useRef(/** @type {any} */ (null));
-  const newest = useRef({ change, dry });
-  newest.current = { change, dry };
+  const newest = useRef({ change, dry, told: /** @type {Set<string>} */ (new Set()) });
+  Object.assign(newest.current, { change, dry });
   const [ready, setReady] = useState(false);
 
   useEffect(() => {
@@ -40,15 +40,21 @@ export function Editor({ label, value, change, language, findings = [], line = n
 
   useEffect(() => {
     const view = held.current?.view;
-    if (!view || view.state.doc.toString() === value) return;
-    view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: value } });
+    if (!view) return;
+    const { told } = newest.current;
+    if (view.state.doc.toString() === value) told.clear();
+    else if (!told.has(value)) {
+      // Not what was written here and comes back a moment late while more is written: the text is another now.
+      view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: value } });
+      told.clear();
+    }
   }, [value, ready]);
 
   useEffect(() => {
     if (!held.current) return;
     const { mirror, view } = held.current;
     view.dispatch(mirror.setDiagnostics(view.state, findings.map((one) => diagnostic(view.state, one))));
-  }, [findings, ready, value]);
+  }, [JSON.stringify(findings), ready]);
 
   useEffect(() => {
     if (!held.current || !line) return;
@@ -77,10 +83,15 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
         mirror.syntaxHighlighting(colours(mirror)), look(EditorView, height),
         EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable), tabindex: "0" }),
         EditorView.domEventHandlers({ beforeinput: typedOver }),
-        EditorView.updateListener.of((/** @type {any} */ update) => update.docChanged && newest.current.change?.(update.state.doc.toString())),
+        EditorView.updateListener.of((/** @type {any} */ update) => update.docChanged && tell(newest.current, update.state.doc.toString())),
       ],
     }),
   });
+}
+
+function tell(/** @type {any} */ reader, /** @type {string} */ text) {
+  reader.told.add(text);
+  reader.change?.(text);
 }
 
 /**
