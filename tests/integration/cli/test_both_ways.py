@@ -36,7 +36,7 @@ def appliance() -> Iterator[Appliance]:
         with xmlrpc.client.ServerProxy(running.master_uri) as master:
             for name in ("/a", "/b", "/c"):
                 master.registerPublisher(f"/node{name}", name, "std_msgs/String", "http://127.0.0.1:9/")
-            master.registerSubscriber("/hearer", "/a", "std_msgs/String", "http://127.0.0.1:9/")
+            master.getSystemState("/looker")
         yield running
 
 
