@@ -139,9 +139,8 @@ def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any
     assert all(port == 11311 or port in NODE_PORTS for port in found), found
     for address in (ROBOT_SIDE, OUTSIDE, LANDSHARK):
         assert ports_open(here, address, range(1, 65536, 199)) == ()
-        assert (
-            reaches(here, address, 11311) == reaches(here, address, 8443) == "OSError"
-        )  # there is no way to it
+        for port in (8443, 11311):
+            assert reaches(here, address, port) not in ("reached", "ConnectionRefusedError")  # nobody answers
     assert attacks["go past the master"]["answer"][1].startswith("0 of ")
 
 
