@@ -21,8 +21,9 @@ FOLDER = ROOT / "build" / "machine"
 AGENT = Path(__file__).with_name("machine_agent.py")
 KERNEL = "linux-image-cloud-amd64"
 GIGABYTES = 4  # the file is sparse
-# A machine that is booted needs these beside what the project names in packages.txt.
-_MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump")
+# A machine that is booted needs these beside what the project names in packages.txt; without a network it has what a
+# kit would install (curl), too.
+_MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl")
 _COMPILERS = ("g++", "pkg-config")  # and every -dev package: what the tests compile comes with the checkout
 # Of the environment: large, and for other tests.
 _NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")
