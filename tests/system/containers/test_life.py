@@ -43,7 +43,8 @@ def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
     alone("stop")
     state = alone.engine.inspect(container)["State"]
     assert state["ExitCode"] == 0, alone.story()
-    options = ("--since", begun, "--until", state["FinishedAt"], "--filter", f"container={container}")
+    now = alone.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
+    options = ("--since", begun, "--until", now, "--filter", f"container={container}")
     lines = alone.engine.docker(
         "events", *options, "--format", "{{.Status}} {{.TimeNano}}"
     ).stdout.splitlines()
