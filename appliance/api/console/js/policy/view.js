@@ -61,7 +61,7 @@ export function PolicyView() {
     <${Standing} live=${live} stale=${stale} showDiff=${() => setTab("diff")} />
     <div class="policy-grid">
       <section class="panel" aria-label="Text of the policy">
-        <div class="panel-head">${changed ? html`<${Badge} word="changed here, not loaded" tone="warn" />` : html`<${Badge} word="as in force" tone="allow" />`}<span class="muted small"><${Given} value=${live.policy_file} most=${90} mono /></span>
+        <div class="panel-head">${changed ? html`<${Badge} word="changed here, not loaded" tone="warn" />` : html`<${Badge} word="as in force" tone="allow" />`}<span class="muted small path"><${Given} value=${live.policy_file} most=${120} mono /></span>
           <span class="end">${changed && html`<button class="button small plain" onClick=${discard}>Discard</button>`}
             <${Button} small role="operator" onClick=${dry} title="Check, test, and list what would be decided differently (Ctrl S)">Dry run</${Button}>
             <${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is that of the policy in force" onClick=${() => setLoading(true)}>Load</${Button}></span></div>
