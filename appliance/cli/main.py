@@ -78,9 +78,13 @@ VERBS: dict[str, Verb | Group] = {
     "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
     "host": Verb("appliance.cli.host:app", "Enrol, list and revoke hosts that come through IPsec tunnels."),
     "backup": Verb(
-        "appliance.cli.backup:backup", "Write the state directory to one file; the appliance may run."
+        "appliance.cli.backup:backup",
+        "Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.",
     ),
-    "restore": Verb("appliance.cli.backup:restore", "Make a state directory of a backup."),
+    "restore": Verb(
+        "appliance.cli.backup:restore",
+        "Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.",
+    ),
     "token": Verb("appliance.cli.token:app", "Make, list and revoke access tokens for REST."),
 }
 app = application(VERBS, name="rosrv", help="A network-security appliance for ROS 1 robots.")

@@ -40,11 +40,11 @@ def test_the_table_says_what_the_verbs_say() -> None:
     """The help that is known without importing a verb is the first sentence of the verb's own."""
     for name, verb in table():
         own = str(loaded(verb, name.split()[-1]).help)
-        assert " ".join(own.split("\n\n")[0].split()) == verb.help, name
+        assert " ".join(own.split("\n\n", maxsplit=1)[0].split()) == verb.help, name
 
 
 def test_the_command_imports_only_what_a_verb_needs() -> None:
-    """Neither the command nor asking a running appliance imports the network library, REST's server, bags or compiler."""
+    """The command, and asking a running appliance, import no network library, REST server, bags or compiler."""
     program = (
         "import sys, appliance.cli.main, appliance.cli.status, appliance.cli.monitor_running\n"
         "heavy = ('pyroute2', 'fastapi', 'uvicorn', 'rosbags', 'lark', 'numpy', 'httpx', 'cryptography', 'pydantic')\n"
@@ -57,7 +57,7 @@ def test_the_command_imports_only_what_a_verb_needs() -> None:
 @pytest.mark.parametrize(("name", "command"), [pytest.param(*one, id=one[0]) for one in commands()])
 def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
     """One sentence first, an example of this very verb, `--json`; every option and argument is explained."""
-    if command.hidden or name.split()[-1] == "rvstate":
+    if command.hidden or name.rsplit(maxsplit=1)[-1] == "rvstate":
         pytest.skip("kept for ROSRV's own flag")
     example = [line for line in str(command.help).splitlines() if "rosrv " in line]
     assert any(f"rosrv {name}" in line for line in example), command.help
