@@ -78,7 +78,7 @@ def _use(node: ast.Call, place: str) -> Iterator[Use]:
     named = {one.arg: one.value for one in node.keywords if one.arg is not None}
     if called == "Record" and "event" in named:
         event = named["event"]
-    elif called in ("happened", "_own") and node.args:
+    elif called in ("happened", "_own", "_make") and node.args:
         event = node.args[0]
     else:
         return
