@@ -1,5 +1,6 @@
 """`rosrv backup` and `rosrv restore`: the state directory in one file, and back."""
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -11,10 +12,13 @@ from appliance.cli.running import DEFAULT_STATE, State
 from appliance.supervisor.backup import BackupError, back_up
 from appliance.supervisor.backup import restore as put_back
 
+_Json = Annotated[bool, typer.Option("--json", help="One JSON object")]
+
 
 def backup(
     file: Annotated[Path, typer.Argument(help="Where to; must not exist. It has keys in it: keep it as one")],
     state: State = DEFAULT_STATE,
+    as_json: _Json = False,
 ) -> None:
     """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.
 
@@ -26,12 +30,17 @@ def backup(
         names = back_up(state, file)
     except BackupError as error:
         _fail(str(error))
-    sys.stdout.write(f"{printable(str(file))}: {len(names)} files, {file.stat().st_size} bytes\n")
+    size = file.stat().st_size
+    if as_json:
+        sys.stdout.write(json.dumps({"file": str(file), "files": len(names), "bytes": size}) + "\n")
+    else:
+        sys.stdout.write(f"{printable(str(file))}: {len(names)} files, {size} bytes\n")
 
 
 def restore(
     file: Annotated[Path, typer.Argument(help="What `rosrv backup` wrote")],
     state: State = DEFAULT_STATE,
+    as_json: _Json = False,
 ) -> None:
     """Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.
 
@@ -41,6 +50,9 @@ def restore(
         names = put_back(file, state)
     except BackupError as error:
         _fail(str(error))
+    if as_json:
+        sys.stdout.write(json.dumps({"state": str(state), "files": len(names)}) + "\n")
+        return
     place = printable(str(state))
     sys.stdout.write(f"{place}: {len(names)} files; prove the log: rosrv audit verify --state {place}\n")
 

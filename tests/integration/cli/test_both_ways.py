@@ -137,8 +137,8 @@ def test_changing_is_the_same(appliance: Appliance, way: str, tmp_path: Path) ->
     assert said("monitor", "enable", "speed", "nobody")[0] == 1
     assert "no monitor is named nobody; there are: speed" in said("monitor", "enable", "speed", "nobody")[2]
     assert said("monitor", "enable", "speed") == (0, "enabled: speed", "")
-    status, shown, _ = said("monitor", "load", str(files["count.rv"]), "--note", "trial")
-    assert (status, shown.endswith("added count.rv")) == (0, True)
+    status, shown, error = said("monitor", "load", str(files["count.rv"]), "--note", "trial")
+    assert (status, shown.endswith("added count.rv"), error) == (0, True, "")
     status, shown, error = said("monitor", "load", str(files["wrong.rv"]))
     assert (status, shown) == (1, "")
     assert error.startswith("wrong.rv:2:") and "error: " in error.splitlines()[0]
