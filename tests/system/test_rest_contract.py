@@ -70,7 +70,7 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
     assert rest.get("/healthz").status == 200
     done = fuzz(
         rest, tmp_path, "--exclude-checks", "positive_data_acceptance", "--exclude-path", "/v1/audit/stream",
-        "--exclude-operation-id", "revoke_token",
+        "--exclude-path", "/v1/live", "--exclude-operation-id", "revoke_token",
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert "passed" in done.stdout
