@@ -100,7 +100,7 @@ def _monitors(rest: Calls, request: admin.MonitorsWanted | admin.MonitorChange) 
 
 
 def _replaced(body: dict[str, Any]) -> dict[str, Any]:
-    shown = {name: body[name] for name in ("revision", "replaced", "added", "changed", "removed")}
+    shown = {name: value for name, value in body.items() if name not in ("loaded", "monitors", "warnings")}
     warnings = [
         f"{one['file']}:{one['line']}:{one['column']}: {one['severity']}: {one['text']}"
         for one in body["warnings"]
