@@ -67,6 +67,7 @@ def test_what_is_typed_stands_there(opened: Callable[..., Reader]) -> None:
     expect(page.locator(".diff-line.added")).to_have_count(12)
     page.get_by_role("button", name="Discard").click()
     expect(page.get_by_text("as in force")).to_be_visible()
+    expect(reader.editor()).not_to_contain_text("of a long remark")
     assert reader.editor().inner_text() == first
 
 
