@@ -209,9 +209,10 @@ def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str,
             )
         rows.append(
             {
-                "beside": path, "quiet_p50_ms": round(1000 * quantile(quiet, 0.5), 3),
-                "p50_ms": round(1000 * quantile(loaded, 0.5), 3),
-                "quiet_p99_ms": round(1000 * quantile(quiet, 0.99), 3), "p99_ms": round(1000 * quantile(loaded, 0.99), 3),
+                "beside": path,
+                "quiet_p50_ms": round(1000 * quantile(quiet, 0.5), 3), "p50_ms": round(1000 * quantile(loaded, 0.5), 3),
+                "quiet_p99_ms": round(1000 * quantile(quiet, 0.99), 3),
+                "p99_ms": round(1000 * quantile(loaded, 0.99), 3),
             }
         )  # fmt: skip
     return rows
