@@ -73,19 +73,20 @@ class Machine:
         began = time.monotonic()
         # The death signal is sent when the *thread* ends that started it: pytest's fixtures run in the main one.
         assert threading.current_thread() is threading.main_thread()
-        self._process = subprocess.Popen(
-            [
-                "/usr/bin/setpriv",
-                "--pdeathsig=SIGKILL",
-                program,
-                *self._arguments(kernel, disk, checkout, port),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=(self.directory / "qemu.log").open("wb"),
-            start_new_session=True,
-            env=os.environ | {"TMPDIR": str(self.directory)},  # of the snapshot
-        )
+        with (self.directory / "qemu.log").open("wb") as log:
+            self._process = subprocess.Popen(
+                [
+                    "/usr/bin/setpriv",
+                    "--pdeathsig=SIGKILL",
+                    program,
+                    *self._arguments(kernel, disk, checkout, port),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                start_new_session=True,
+                env=os.environ | {"TMPDIR": str(self.directory)},  # of the snapshot
+            )
         self._line = self._connect(port)
         assert self._hear(BOOT_SECONDS) == {"ready": True}
         self.boot_seconds = time.monotonic() - began
