@@ -95,7 +95,7 @@ class Mistakes:
     def _recorded(self, event: str, monitor: str, what: str) -> None:
         """The record of what a monitor did."""
         found = self._stage.audit("--event", event, "--limit", "100")
-        mine = [one for one in found if _is_by(one["detail"], monitor)]
+        mine = [one for one in found if one["detail"]["monitor"] == monitor]
         why = mine[-1]["reason"] if mine else "missing"  # the first: it is in full
         self._teller.say(f"audit record: {why}")
         self._teller.results.append(Result(f"audit record: {what}", bool(mine), why))
@@ -103,12 +103,6 @@ class Mistakes:
     def _result(self, what: str, good: bool, remark: str) -> None:
         self._teller.results.append(Result(what, good, remark))
         self._teller.say(f"{'' if good else 'NOT: '}{what}: {remark}")
-
-
-def _is_by(detail: dict[str, Any], monitor: str) -> bool:
-    """Whether a record is of this monitor, alone or with others."""
-    events = detail.get("events") or []
-    return detail.get("monitor") == monitor or any(event.startswith(f"{monitor}.") for event in events)
 
 
 def _nearest(drive: Event) -> str:

@@ -1,17 +1,15 @@
 """`rosrv host add|list|kit|reload|revoke`: who may come through a tunnel."""
 
-import json
-import re
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
-from appliance.cli.host_kit import KitWriter, moment, new_file, usage_error, wishes_of, write_script
-from appliance.cli.policy_output import say
+from appliance.cli.host_kit import KitWriter, new_file, usage_error, wishes_of, write_script
+from appliance.cli.output import moment, say, say_json
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import seconds_of
 
 app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
 
@@ -31,8 +29,6 @@ _Open = Annotated[
     list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
 ]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
-_SPAN = re.compile(r"(\d{1,6})([mhd])")
-_UNITS = {"m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
 @app.command()
@@ -123,7 +119,7 @@ def list_hosts(
         if group is not None and group not in row["groups"]:
             continue
         if as_json:
-            _print(json.dumps(row))
+            say_json(row)
         else:
             say("  ".join(_words(row)))
     if as_json or group is not None:
@@ -144,7 +140,7 @@ def reload(running: Appliance, as_json: _Json = False) -> None:
     """
     body = running.ask_or_exit(HostsReload(), as_json=as_json)
     if as_json:
-        _print(json.dumps(body))
+        say_json(body)
         return
     say(f"{len(body['declared'])} hosts are declared")
     for word, names in (("may come again", body["opened"]), ("tunnel closed", body["closed"])):
@@ -163,7 +159,7 @@ def revoke(running: Appliance, name: _Name, as_json: _Json = False) -> None:
     """
     body = running.ask_or_exit(HostRevoke(name), as_json=as_json)
     if as_json:
-        _print(json.dumps(body))
+        say_json(body)
     elif not body["serial"]:
         say(f"{body['name']} is awaited no longer: its one-time token opens nothing")
     else:
@@ -202,11 +198,7 @@ def _ports_words(ports: dict[str, Any]) -> str:
 
 
 def _seconds(text: str) -> float:
-    found = _SPAN.fullmatch(text)
-    if found is None:
+    seconds = seconds_of(text, "mhd")
+    if seconds is None:
         raise usage_error(f"--within {text!r} is no time such as 30m, 1h or 7d")
-    return int(found[1]) * _UNITS[found[2]]
-
-
-def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
+    return seconds

@@ -1,7 +1,5 @@
 """What `rosrv host` writes for a host: its kit, or the script by which it enrols itself."""
 
-import datetime
-import json
 import os
 import re
 import sys
@@ -11,7 +9,7 @@ from typing import Any
 import typer
 
 from appliance.api.kits import Wishes, enrolment_of, kit_of
-from appliance.cli.policy_output import say
+from appliance.cli.output import moment, say, say_json
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -24,11 +22,6 @@ def usage_error(text: str) -> typer.Exit:
     """Write what was wrong with the command line; raise the result (exit status 2)."""
     typer.echo(f"rosrv host: {text}", err=True)
     return typer.Exit(2)
-
-
-def moment(seconds: float) -> str:
-    """A time as the lists show it."""
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
 def wishes_of(appliance: str, ports: str, opened: list[str] | None) -> Wishes:
@@ -78,7 +71,7 @@ class KitWriter:
                 err=True,
             )
         if as_json:
-            sys.stdout.write(json.dumps({key: body[key] for key in _SHOWN} | {"kit": str(self._path)}) + "\n")
+            say_json({key: body[key] for key in _SHOWN} | {"kit": str(self._path)})
             return
         say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
         say(
@@ -97,7 +90,7 @@ def write_script(path: Path, body: dict[str, Any], wishes: Wishes, *, as_json: b
     _write(path, script.encode(), "the token is lost: ask for another one")
     if as_json:
         shown = {key: body[key] for key in ("name", "address", "token", "token_expires")}
-        sys.stdout.write(json.dumps(shown | {"script": str(path)}) + "\n")
+        say_json(shown | {"script": str(path)})
         return
     sys.stdout.write(body["token"] + "\n")
     typer.echo(

@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Reader
 from appliance.cli.monitor_bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor_input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor_output import lines, record, say_finding
-from appliance.cli.policy_output import counted, printable, say, say_json
+from appliance.cli.output import counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet

@@ -1,15 +1,13 @@
 """`rosrv monitor reset`: the way back to the folder's specifications when the appliance does not start with its own."""
 
-import json
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from appliance.cli.policy_output import say
+from appliance.cli.output import say, say_json
 from appliance.master.monitors import forget_revision
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
@@ -44,7 +42,7 @@ def reset(
     finally:
         directory.close()
     if as_json:
-        sys.stdout.write(json.dumps({"given_up": revision}) + "\n")
+        say_json({"given_up": revision})
     elif revision is None:
         say("nothing to give up: the last specifications in force were the folder's")
     else:

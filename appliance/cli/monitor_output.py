@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from appliance.cli.policy_output import say, say_json
+from appliance.cli.output import say, say_json
 from appliance.rosmop.outcomes import Fault, Outcome
 from appliance.rosmop.positions import Finding
 

@@ -1,6 +1,5 @@
 """`rosrv monitor list|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,7 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
-from appliance.cli.policy_output import counted, say
+from appliance.cli.output import counted, say, say_json
 from appliance.cli.running import Appliance, speaks
 
 _WIDE = 200  # columns where nobody looks at them through a window
@@ -35,7 +34,7 @@ def list_monitors(appliance: Appliance, as_json: _Json = False) -> None:
     body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     if as_json:
         for row in body["monitors"]:
-            sys.stdout.write(json.dumps(row) + "\n")
+            say_json(row)
         return
     if body["refused"]:
         say(f"the relay does not take them: {body['refused'][0]}", "red")
@@ -131,7 +130,7 @@ def resume(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
     """
     body = appliance.ask_or_exit(MonitorResume(names), as_json=as_json)
     if as_json:
-        sys.stdout.write(json.dumps(body) + "\n")
+        say_json(body)
     else:
         say(f"resumed: {', '.join(body['names']) or 'none was held'}")
 
@@ -142,7 +141,7 @@ def rv_state(appliance: Appliance, as_json: _Json = False) -> None:
     body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     real, port, rows = body["rv_state"]
     if as_json:
-        sys.stdout.write(json.dumps(body["rv_state"]) + "\n")
+        say_json(body["rv_state"])
         return
     say(f"ROSMaster port {real}, RVMaster port {port}")
     for name, topic, xmlrpc, tcp in rows:
@@ -152,7 +151,7 @@ def rv_state(appliance: Appliance, as_json: _Json = False) -> None:
 def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
     body = appliance.ask_or_exit(MonitorSwitch(names, enabled), as_json=as_json)
     if as_json:
-        sys.stdout.write(json.dumps(body) + "\n")
+        say_json(body)
         return
     word = "enabled" if enabled else "disabled"
     say(f"{word}: {', '.join(body['names']) or 'nothing, it was so already'}")
@@ -168,7 +167,7 @@ def _state(row: dict[str, Any]) -> str:
 
 def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        sys.stdout.write(json.dumps(body) + "\n")
+        say_json(body)
         return
     for warning in body["warnings"]:
         say(warning, "yellow")

@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from appliance.cli.output import counted, printable, say, say_json
 from appliance.cli.policy_input import (
     Enrolled,
     Robot,
@@ -21,15 +22,7 @@ from appliance.cli.policy_input import (
     usage_error,
 )
 from appliance.cli.policy_learn import learn_policy
-from appliance.cli.policy_output import (
-    counted,
-    decision_fields,
-    printable,
-    request_fields,
-    say,
-    say_finding,
-    say_json,
-)
+from appliance.cli.policy_output import decision_fields, request_fields, say_finding
 from appliance.cli.policy_running import confirm, reload, revisions, rollback
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import (

@@ -1,6 +1,5 @@
 """`rosrv policy learn`: a least-privilege policy out of the audit log."""
 
-import json
 import os
 import sys
 import time
@@ -14,8 +13,8 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.query import Filter
 from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.output import counted, printable, say_json
 from appliance.cli.policy_input import Robot, networks_of, request_of, usage_error
-from appliance.cli.policy_output import counted, printable
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import Category, PolicyError, compile_policy
 from appliance.policy.learn import Learned, Observation, learn
@@ -51,7 +50,7 @@ def learn_policy(
         _write(output, learned.text)
     if as_json:
         fields = {"requests": learned.requests, "left_out": learned.left_out, "text": learned.text}
-        sys.stdout.write(json.dumps(fields) + "\n")
+        say_json(fields)
         return
     if output is None:
         sys.stdout.write(learned.text)

@@ -1,40 +1,7 @@
-"""How the policy verbs show things: coloured on a terminal, plain otherwise, JSON when asked for.
+"""How the policy verbs show findings, requests and decisions."""
 
-A stranger's strings (names, file names, whatever stands in a log) never reach a terminal with control
-characters in them, and are never read as markup.
-"""
-
-import json
-import sys
-
-from rich.console import Console
-from rich.text import Text
-
+from appliance.cli.output import say, say_json
 from appliance.policy import Decision, Finding, Request
-
-
-def printable(text: str) -> str:
-    """The text with everything that a terminal could act on escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
-def counted(number: int, noun: str) -> str:
-    """`1 error`, `2 errors`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def say(line: str, style: str = "") -> None:
-    """Write one line to standard output."""
-    shown = printable(line)
-    if sys.stdout.isatty():
-        Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
-    else:
-        sys.stdout.write(shown + "\n")
-
-
-def say_json(fields: dict[str, object]) -> None:
-    """Write one object on one line to standard output."""
-    sys.stdout.write(json.dumps(fields) + "\n")
 
 
 def say_finding(finding: Finding, *, as_json: bool) -> None:

@@ -1,20 +1,17 @@
 """`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
 
 import datetime
-import json
-import re
-import sys
 from typing import Annotated, Any
 
 import typer
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
+from appliance.cli.output import counted, say, say_json
 from appliance.cli.policy_input import usage_error
-from appliance.cli.policy_output import counted, say
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import seconds_of
 
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 @speaks
@@ -62,7 +59,7 @@ def confirm(appliance: Appliance, as_json: _Json = False) -> None:
     """
     body = appliance.ask_or_exit(PolicyConfirm(), as_json=as_json)
     if as_json:
-        sys.stdout.write(json.dumps(body) + "\n")
+        say_json(body)
     else:
         kept = f"revision {body['revision']} stays in force"
         say(kept if body["confirmed"] else f"nothing waits to be confirmed: {kept}")
@@ -77,7 +74,7 @@ def revisions(appliance: Appliance, as_json: _Json = False) -> None:
     """
     for row in appliance.ask_or_exit(PolicyRevisions(), as_json=as_json)["revisions"]:
         if as_json:
-            sys.stdout.write(json.dumps(row) + "\n")
+            say_json(row)
             continue
         loaded = datetime.datetime.fromtimestamp(row["loaded"], datetime.UTC).isoformat(timespec="seconds")
         mark = "in force" if row["in_force"] else ""
@@ -86,7 +83,7 @@ def revisions(appliance: Appliance, as_json: _Json = False) -> None:
 
 def _say_loaded(body: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        sys.stdout.write(json.dumps(body) + "\n")
+        say_json(body)
         return
     for warning in body["warnings"]:
         say(warning, "yellow")
@@ -101,7 +98,7 @@ def _say_loaded(body: dict[str, Any], *, as_json: bool) -> None:
 
 
 def _seconds(text: str) -> float:
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh])", text)
-    if found is None or float(found[1]) <= 0:
+    seconds = seconds_of(text, "smh")
+    if seconds is None:
         raise usage_error(f"--confirm-within {text!r} is not a time: write 30s, 5m or 1h")
-    return float(found[1]) * _UNITS[found[2]]
+    return seconds

@@ -1,6 +1,5 @@
 """`rosrv selftest`: what an operator runs on a fresh machine, or when in doubt."""
 
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
-from appliance.cli.policy_output import counted, printable
+from appliance.cli.output import counted, printable, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.selftest_findings import Found, fail
 from appliance.config import Settings, load_resolved
@@ -49,7 +48,7 @@ def selftest(
         warned += found.outcome == "warn"
         if as_json:
             row = {"check": found.check, "outcome": found.outcome, "text": found.text, "advice": found.advice}
-            sys.stdout.write(json.dumps(row) + "\n")
+            say_json(row)
             sys.stdout.flush()
         else:
             text = Text(printable(found.text))

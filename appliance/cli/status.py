@@ -1,7 +1,5 @@
 """`rosrv status`: the running appliance on one screen."""
 
-import json
-import sys
 import time
 from typing import Annotated, Any
 
@@ -12,7 +10,7 @@ from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
 from appliance.cli.healthy import no_relay
-from appliance.cli.policy_output import counted
+from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.status_view import age, processes_table, shortened
 
@@ -36,7 +34,7 @@ def status(
     body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
     troubles = list(troubles_of(body))
     if as_json:
-        sys.stdout.write(json.dumps({**body, "troubles": troubles}) + "\n")
+        say_json({**body, "troubles": troubles})
     else:
         _show(body, troubles)
     raise typer.Exit(1 if troubles else 0)

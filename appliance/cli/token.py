@@ -1,23 +1,18 @@
 """`rosrv token add|list|revoke`: who may use REST, and as what."""
 
 import datetime
-import json
-import re
-import sys
 from typing import Annotated
 
 import typer
 
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRole
-from appliance.cli.policy_input import usage_error
-from appliance.cli.policy_output import say
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.output import moment, say, say_json
+from appliance.cli.running import Appliance, speaks, usage_error
+from appliance.cli.spans import seconds_of
 
 app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
 
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
-_DAY = 86_400.0
-_UNITS = {"m": 60.0, "h": 3600.0, "d": _DAY, "w": 7 * _DAY}
 
 
 @app.command()
@@ -40,11 +35,11 @@ def add(
     """
     body = appliance.ask_or_exit(TokenAdd(name, role, _seconds(expires)), as_json=as_json)
     if as_json:
-        _print(json.dumps(body))
+        say_json(body)
         return
-    _print(body["token"])
+    say(body["token"])
     typer.echo(
-        f"rosrv: {body['role']} {body['name']}, until {_moment(body['expires'])}. "
+        f"rosrv: {body['role']} {body['name']}, until {moment(body['expires'])}. "
         "This is the only time it is shown.",
         err=True,
     )
@@ -60,13 +55,13 @@ def list_tokens(appliance: Appliance, as_json: _Json = False) -> None:
     now = datetime.datetime.now(datetime.UTC).timestamp()
     for row in appliance.ask_or_exit(TokenList(), as_json=as_json)["tokens"]:
         if as_json:
-            _print(json.dumps(row))
+            say_json(row)
             continue
         if row["revoked"] is not None:
-            end = f"revoked {_moment(row['revoked'])}"
+            end = f"revoked {moment(row['revoked'])}"
         else:
-            end = f"{'expired' if row['expires'] <= now else 'until'} {_moment(row['expires'])}"
-        say(f"{row['name']:<24} {row['role']:<9} {row['id']}  made {_moment(row['created'])}  {end}")
+            end = f"{'expired' if row['expires'] <= now else 'until'} {moment(row['expires'])}"
+        say(f"{row['name']:<24} {row['role']:<9} {row['id']}  made {moment(row['created'])}  {end}")
 
 
 @app.command()
@@ -82,21 +77,13 @@ def revoke(
     """
     body = appliance.ask_or_exit(TokenRevoke(name), as_json=as_json)
     if as_json:
-        _print(json.dumps(body))
+        say_json(body)
     else:
         say(f"token {body['name']} ({body['role']}) is revoked")
 
 
 def _seconds(text: str) -> float:
-    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([mhdw])", text)
-    if found is None or float(found[1]) <= 0:
+    seconds = seconds_of(text, "mhdw")
+    if seconds is None:
         raise usage_error(f"--expires {text!r} is not a time: write 30m, 12h, 90d or 52w")
-    return float(found[1]) * _UNITS[found[2]]
-
-
-def _moment(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
-
-
-def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
+    return seconds

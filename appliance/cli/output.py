@@ -1,0 +1,43 @@
+"""How all verbs show things: coloured on a terminal, plain otherwise, JSON when asked for.
+
+A stranger's strings (names, file names, whatever stands in a log) never reach a terminal with control
+characters in them, and are never read as markup.
+"""
+
+import datetime
+import json
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+
+def printable(text: str) -> str:
+    """The text with everything that a terminal could act on escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 error`, `2 errors`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def moment(seconds: float) -> str:
+    """A time (seconds since the epoch) as lists show it: to the minute, in UTC."""
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
+
+
+def say(line: str, style: str = "") -> None:
+    """Write one line to standard output."""
+    shown = printable(line)
+    if sys.stdout.isatty():
+        Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
+    else:
+        sys.stdout.write(shown + "\n")
+
+
+def say_json(fields: Mapping[str, Any]) -> None:
+    """Write one object on one line to standard output."""
+    sys.stdout.write(json.dumps(fields) + "\n")

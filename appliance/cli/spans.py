@@ -1,0 +1,14 @@
+"""Spans of time as they are given on the command line: `30s`, `5m`, `1.5h`, `90d`, `52w`."""
+
+import re
+
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+_SPAN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
+
+
+def seconds_of(text: str, units: str) -> float | None:
+    """The seconds of a span that has one of these units; None when the text is none, or no time at all."""
+    found = _SPAN.fullmatch(text)
+    if found is None or found[2] not in units or float(found[1]) <= 0:
+        return None
+    return float(found[1]) * _SECONDS[found[2]]
