@@ -190,11 +190,6 @@ class Policy:
         """
         return self._any_audit_only or not self._named.isdisjoint(self._hosts.atoms_of(address))
 
-    def hosts_named(self) -> tuple[Network, ...]:
-        """Every address and network that a rule names, itself or through groups (`*` is not among them)."""
-        networks = self._hosts.networks().items()
-        return tuple(net for net, atom in networks if not self._named.isdisjoint(self._hosts.above([atom])))
-
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
         return category in self._present

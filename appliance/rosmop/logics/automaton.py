@@ -149,33 +149,6 @@ def reachable(automaton: Automaton) -> list[int]:
     return list(seen)
 
 
-def shortest_trace(automaton: Automaton, wanted: Callable[[int], bool]) -> tuple[int, ...] | None:
-    """The events of a shortest trace (of one event or more) into a wanted state, or None if there is none."""
-    came_from: dict[int, tuple[int, int] | None] = {}
-    frontier: deque[int] = deque([automaton.initial])
-    visited = {automaton.initial}
-    while frontier:
-        state = frontier.popleft()
-        for event, target in enumerate(automaton.table[state]):
-            if wanted(target):
-                return _trace_back(came_from, state, event)
-            if target not in visited:
-                visited.add(target)
-                came_from[target] = (state, event)
-                frontier.append(target)
-    return None
-
-
-def _trace_back(came_from: dict[int, tuple[int, int] | None], state: int, last: int) -> tuple[int, ...]:
-    trace = [last]
-    step = came_from.get(state)
-    while step is not None:
-        state, event = step
-        trace.append(event)
-        step = came_from.get(state)
-    return tuple(reversed(trace))
-
-
 def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
     """Group events that a formula cannot tell apart: those it does not name are one class.
 

@@ -10,7 +10,6 @@ from appliance.rosmop.logics.automaton import (
     explore,
     letter_classes,
     minimise,
-    shortest_trace,
 )
 from appliance.rosmop.logics.components import strong_components
 from tests.unit.rosmop.logics.driving import seeded
@@ -79,13 +78,6 @@ def test_exploring_stops_at_the_limit() -> None:
 def test_events_that_are_not_named_are_one_class() -> None:
     """Classes are numbered by their first event; -1 stands for what is not named."""
     assert letter_classes(("x", "a", "y", "b"), ("b", "a")) == ([0, 1, 0, 2], [-1, 1, 0])
-
-
-def test_shortest_trace_needs_an_event() -> None:
-    """The initial state counts only if it is entered again."""
-    loop = Automaton(0, ((1, 0), (0, 1)), ((), ()))
-    assert shortest_trace(loop, lambda state: state == 0) == (1,)
-    assert shortest_trace(Automaton(0, ((1,), (1,)), ((), ())), lambda state: state == 0) is None
 
 
 def test_components_against_reachability() -> None:
