@@ -12,20 +12,20 @@ import appliance
 from appliance.api import (
     audit,
     console,
-    console_live,
-    console_session,
-    console_tests,
     enrol,
     explaining,
     graph,
     health,
     hosts,
+    live,
     metrics,
     monitor_changes,
     monitors,
     policy,
     policy_changes,
+    policy_tests,
     tokens,
+    whoami,
 )
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
@@ -61,7 +61,7 @@ def build_app(services: Services) -> FastAPI:
         policy,
         policy_changes,
         explaining,
-        console_tests,
+        policy_tests,
         hosts,
         enrol,
         monitors,
@@ -72,8 +72,8 @@ def build_app(services: Services) -> FastAPI:
         metrics,
     ):
         app.include_router(part.routes(services))
-    app.include_router(console_live.routes(services, services.history))
-    for page in (console_session, console):
+    app.include_router(live.routes(services, services.history))
+    for page in (whoami, console):
         app.include_router(page.routes())
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

@@ -19,9 +19,9 @@ import uvloop
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
 from appliance.api.certificate import pin_of, tls_context
-from appliance.api.console_history import History, measures_of
 from appliance.api.control import ControlLink
 from appliance.api.gate import Gate
+from appliance.api.history import History, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.services import Services

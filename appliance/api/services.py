@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.api.access import Doorkeeper
-from appliance.api.console_history import History
 from appliance.api.control import ControlLink
+from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.config import Settings
 

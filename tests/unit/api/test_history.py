@@ -1,12 +1,12 @@
-"""Tests of `appliance.api.console_history`."""
+"""Tests of `appliance.api.history`."""
 
 import asyncio
 import contextlib
 from typing import Any
 
-from appliance.api import console_history
-from appliance.api.console_history import History, sample_of
+from appliance.api import history
 from appliance.api.control import ControlAwayError
+from appliance.api.history import History, sample_of
 
 
 def body(allowed: int = 0) -> dict[str, Any]:
@@ -41,7 +41,7 @@ async def _running(history: History, until: int) -> None:
 
 def test_followers_are_told_and_the_hour_is_kept(monkeypatch: Any) -> None:
     """Each answer is a sample, in order; `samples` gives at most so many, the newest always among them."""
-    monkeypatch.setattr(console_history, "BUSY_SECONDS", 0.001)
+    monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
     count = 0
 
     async def measures() -> dict[str, Any]:
@@ -63,7 +63,7 @@ def test_followers_are_told_and_the_hour_is_kept(monkeypatch: Any) -> None:
 
 def test_without_control_followers_are_told_why(monkeypatch: Any) -> None:
     """While RVMaster is away there is no sample and no status, but the reason; then it goes on."""
-    monkeypatch.setattr(console_history, "BUSY_SECONDS", 0.001)
+    monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
     answers = [ControlAwayError("being restarted"), body(1)]
 
     async def measures() -> dict[str, Any]:
@@ -92,7 +92,7 @@ def test_without_control_followers_are_told_why(monkeypatch: Any) -> None:
 
 def test_who_begins_to_follow_does_not_wait(monkeypatch: Any) -> None:
     """A sleep that was begun while nobody followed ends when somebody does."""
-    monkeypatch.setattr(console_history, "IDLE_SECONDS", 3600.0)
+    monkeypatch.setattr(history, "IDLE_SECONDS", 3600.0)
 
     async def measures() -> dict[str, Any]:
         return body()

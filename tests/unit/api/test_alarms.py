@@ -1,10 +1,10 @@
-"""Tests of `appliance.api.console_alarms`."""
+"""Tests of `appliance.api.alarms`."""
 
 from typing import Any
 
 import pytest
 
-from appliance.api.console_alarms import open_alarms
+from appliance.api.alarms import open_alarms
 
 GOOD: dict[str, Any] = {
     "probe": "passed",

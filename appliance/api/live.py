@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from appliance.api.access import Bearer
-from appliance.api.console_alarms import open_alarms
-from appliance.api.console_history import BUSY_SECONDS, History, Sample, Seen
+from appliance.api.alarms import open_alarms
 from appliance.api.control import ControlAwayError
+from appliance.api.history import BUSY_SECONDS, History, Sample, Seen
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
