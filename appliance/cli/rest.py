@@ -15,17 +15,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 
-from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.rest_orders import carry_out
-
-if TYPE_CHECKING:
-    from appliance.cli.audit_source import AuditSource
 
 _SECONDS = 60.0
 _CONNECT_SECONDS = 10.0
@@ -161,27 +156,6 @@ class RestClient:
         if kind == "unknown-path":
             return NotRunningError(f"{self.url}: this appliance's version does not know that over REST")
         return ProblemError(answer.status_code, kind, detail.split("\n"))
-
-
-class RestWay:
-    """The appliance at a URL."""
-
-    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Raises ValueError when it is no place to send a token to."""
-        self.client = RestClient(url, token, authority)
-
-    def ask(self, request: AdminRequest) -> AdminAnswer:
-        """Ask one thing. Raises `NotRunningError`."""
-        try:
-            return AdminAnswer(True, carry_out(self.client, request))
-        except ProblemError as problem:
-            return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:])
-
-    def audit(self) -> "AuditSource":
-        """Its audit log."""
-        from appliance.cli.audit_rest import RestLog  # noqa: PLC0415  only for the verbs that read it
-
-        return RestLog(self.client)
 
 
 def _place_of(url: str) -> _Place:

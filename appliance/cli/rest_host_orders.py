@@ -1,30 +1,13 @@
 """What is asked about hosts, as calls of REST, and the answers as the admin socket gives them."""
 
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote
 
 from appliance.channel import admin
 from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.rest_calls import Calls
 
 _HOSTS = "/v1/hosts"
-
-
-class Calls(Protocol):
-    """Makes calls of REST."""
-
-    url: str
-
-    def call(
-        self,
-        method: str,
-        path: str,
-        *,
-        params: Any = None,
-        body: Any = None,
-        seconds: float | None = 60.0,
-        match: bool = False,
-    ) -> dict[str, Any]:
-        """The answer's body."""
 
 
 def carry_out_on_hosts(rest: Calls, request: admin.AdminRequest) -> dict[str, Any]:

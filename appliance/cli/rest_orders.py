@@ -1,29 +1,12 @@
 """What operators' tools ask, as calls of REST, and the answers as the admin socket gives them."""
 
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote
 
 from appliance.channel import admin
 from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.rest_calls import Calls
 from appliance.cli.rest_host_orders import carry_out_on_hosts
-
-
-class Calls(Protocol):
-    """Makes calls of REST."""
-
-    url: str
-
-    def call(
-        self,
-        method: str,
-        path: str,
-        *,
-        params: Any = None,
-        body: Any = None,
-        seconds: float | None = 60.0,
-        match: bool = False,
-    ) -> dict[str, Any]:
-        """The answer's body."""
 
 
 def carry_out(rest: Calls, request: admin.AdminRequest) -> dict[str, Any]:

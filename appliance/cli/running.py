@@ -136,7 +136,7 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
         if "api_ca" in typed:
             raise usage_error("--api-ca is for --api URL, which is not given")
         return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
-    from appliance.cli.rest import RestWay  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.rest_way import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
         return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True, place=api)
