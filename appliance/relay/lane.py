@@ -81,8 +81,8 @@ class Lane:
         if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:
             return self._through(batch, Passage(batch, self._place, now))
         assert self._walker is not None  # noqa: S101  `_prepare` has found one
-        assert self._prepared is not None  # noqa: S101
-        assert self._counts is not None  # noqa: S101
+        assert self._prepared is not None  # noqa: S101  and prepared it
+        assert self._counts is not None  # noqa: S101  and counts for it
         pieces: list[memoryview | bytes | bytearray] = []
         try:
             walked = self._walker.walk(batch.view, 0, 0, pieces, batch.stride, now, self._prepared)

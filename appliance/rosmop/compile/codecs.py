@@ -113,7 +113,7 @@ class Codecs:
             parts = [self._copied(slot.type, f"v[{slot.index}]") for slot in slots]
             body = f"[{', '.join(parts)}]"
         else:
-            assert isinstance(kind, kinds.Vector)  # noqa: S101  scalars are not copied
+            assert isinstance(kind, kinds.Vector)  # scalars are not copied
             width = self.width(kind.element)
             if kinds.is_scalar(kind.element):
                 body = f"l_copied(c, v, {width}, s)"

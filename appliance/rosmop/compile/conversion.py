@@ -62,7 +62,7 @@ def number(code: str, source: Type, target: Type) -> str:
         return f"({code} != 0)"
     if isinstance(target, kinds.Integer):
         return _to_integer(code, source, target)
-    assert isinstance(target, kinds.Floating)  # noqa: S101  numbers are one of the three
+    assert isinstance(target, kinds.Floating)  # numbers are one of the three
     if target.bits == 32:
         return f"c_f32({code})"
     return code if isinstance(source, kinds.Floating) else f"c_float({code})"
@@ -73,7 +73,7 @@ def _to_integer(code: str, source: Type, target: kinds.Integer) -> str:
         return f"(+{code})"
     if isinstance(source, kinds.Floating):
         return f"c_truncate({code}, {target.least}, {target.most})"
-    assert isinstance(source, kinds.Integer)  # noqa: S101
+    assert isinstance(source, kinds.Integer)
     return code if target.holds(source) else wrapped(code, target)
 
 

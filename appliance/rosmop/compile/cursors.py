@@ -96,7 +96,7 @@ def _sum(scope: Scope, values: Sequence[Value], span: str, at: tuple[Position, i
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
         )
     kind = values[2].type
-    assert isinstance(values[0].type, Cursor)  # noqa: S101  the caller has looked
+    assert isinstance(values[0].type, Cursor)  # the caller has looked
     element = _vector(values[0].type.vector, at[0]).element
     if not kinds.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")

@@ -75,7 +75,7 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
 
 
 def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, function: str) -> EventCode:
-    assert isinstance(event.trigger, tree.TimerTrigger)  # noqa: S101  the caller has looked
+    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller has looked
     if event.parameters:
         raise SpecificationError.at(
             event.parameters[0].position, "a timer has no message, so it takes no parameters"
@@ -143,7 +143,7 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
     field = type_of_path(scope.messages, kind, binding.path)
     if binding.constant is not None:
         return Bound(binding, field, constant=_constant(scope, binding, field))
-    assert binding.variable is not None  # noqa: S101  a binding has one of the two
+    assert binding.variable is not None  # a binding has one of the two
     parameter = parameters.get(binding.variable)
     if parameter is None:
         raise SpecificationError.at(
@@ -167,7 +167,7 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
 
 
 def _constant(scope: Scope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
-    assert binding.constant is not None  # noqa: S101  the caller has looked
+    assert binding.constant is not None  # the caller has looked
     constant = value_of(scope, binding.constant).constant
     held = None if constant is None else _held(constant, field)
     if held is None:
@@ -188,7 +188,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
         return None
     if isinstance(field, kinds.Bool):
         return bool(constant) if constant in (0, 1) else None
-    assert isinstance(field, kinds.Integer)  # noqa: S101  numbers are one of the three
+    assert isinstance(field, kinds.Integer)  # numbers are one of the three
     return int(constant) if field.least <= constant <= field.most else None
 
 
@@ -241,7 +241,7 @@ def _assemble(
     written = [each for each in bound if each.variable is not None and each.variable.assigned]
     check_overlaps(scope, bound, written)
     for each in written:
-        assert each.variable is not None  # noqa: S101
+        assert each.variable is not None
         lines.add(f"{each.variable.flag} = False")
     if scope.whole_asked is not None:
         lines.add(f"{scope.whole_asked} = lambda: {pending(scope, written)}")

@@ -81,24 +81,24 @@ def _integer(node: tree.Number, text: str, suffix: str) -> Value:
 
 def _number(scope: Scope, node: tree.Expression) -> Value:
     del scope
-    assert isinstance(node, tree.Number)  # noqa: S101  so says the table at the end
+    assert isinstance(node, tree.Number)  # so says the table at the end
     return literal_number(node)
 
 
 def _text(scope: Scope, node: tree.Expression) -> Value:
     del scope
-    assert isinstance(node, tree.Text)  # noqa: S101
+    assert isinstance(node, tree.Text)
     return constant_value(node.position, kinds.STRING, node.value)
 
 
 def _character(scope: Scope, node: tree.Expression) -> Value:
     del scope
-    assert isinstance(node, tree.Character)  # noqa: S101
+    assert isinstance(node, tree.Character)
     return constant_value(node.position, kinds.CHAR, node.value)
 
 
 def _name(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Name)  # noqa: S101
+    assert isinstance(node, tree.Name)
     parts = node.parts
     if parts == ("MESSAGE",):
         return _message(scope, node)
@@ -157,12 +157,12 @@ def _message_constant(scope: Scope, node: tree.Name) -> Value:
 
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Unary)  # noqa: S101
+    assert isinstance(node, tree.Unary)
     return operators.unary(node.operator, value_of(scope, node.operand), node.position, scope.site(node))
 
 
 def _step(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Step)  # noqa: S101
+    assert isinstance(node, tree.Step)
     target = value_of(scope, node.target)
     storing.require_place(target, f"`{node.operator}`")
     if not target.pure:
@@ -178,7 +178,7 @@ def _step(scope: Scope, node: tree.Expression) -> Value:
 
 
 def _binary(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Binary)  # noqa: S101
+    assert isinstance(node, tree.Binary)
     left, right = value_of(scope, node.left), value_of(scope, node.right)
     return operators.binary(
         node.operator, operators.Operands(scope, node.position, left, right, scope.site(node))
@@ -186,7 +186,7 @@ def _binary(scope: Scope, node: tree.Expression) -> Value:
 
 
 def _assign(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Assign)  # noqa: S101
+    assert isinstance(node, tree.Assign)
     target, code = assignment(scope, node)
     return Value(target.type, storing.store(scope, target, code), node.position, owned=False, pure=False)
 
@@ -221,7 +221,7 @@ def _character_or_text(scope: Scope, node: tree.Expression) -> str:
 
 
 def _conditional(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Conditional)  # noqa: S101
+    assert isinstance(node, tree.Conditional)
     test = condition(value_of(scope, node.condition))
     yes, no = value_of(scope, node.yes), value_of(scope, node.no)
     if kinds.is_number(yes.type) and kinds.is_number(no.type):
@@ -239,14 +239,14 @@ def _conditional(scope: Scope, node: tree.Expression) -> Value:
 
 
 def _sequence(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Sequence)  # noqa: S101
+    assert isinstance(node, tree.Sequence)
     values = [value_of(scope, item) for item in node.items]
     code = f"({', '.join(value.code for value in values)})[-1]"
     return Value(values[-1].type, code, node.position, owned=values[-1].owned, pure=False)
 
 
 def _index(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Index)  # noqa: S101
+    assert isinstance(node, tree.Index)
     base, index = value_of(scope, node.base), value_of(scope, node.index)
     site = scope.site(node)
     if isinstance(base.type, kinds.Vector):
@@ -260,36 +260,36 @@ def _index(scope: Scope, node: tree.Expression) -> Value:
 
 
 def _member(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Member)  # noqa: S101
+    assert isinstance(node, tree.Member)
     return members.field(scope, value_of(scope, node.base), node.name, node.position, scope.site(node))
 
 
 def _cast(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Cast)  # noqa: S101
+    assert isinstance(node, tree.Cast)
     target = resolve(node.type, scope.messages)
     value = value_of(scope, node.operand)
     return Value(target, convert(scope, value, target), node.position, pure=value.pure)
 
 
 def _call(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Call)  # noqa: S101
+    assert isinstance(node, tree.Call)
     return calls.call(scope, node, value_of)
 
 
 def _construct(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Construct)  # noqa: S101
+    assert isinstance(node, tree.Construct)
     return calls.construct(scope, node.position, resolve(node.type, scope.messages), node.arguments, value_of)
 
 
 def _new(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.NewCharacters)  # noqa: S101
+    assert isinstance(node, tree.NewCharacters)
     size = convert(scope, value_of(scope, node.size), kinds.ULONG)
     code = f"e_repeat({scope.context}, {size}, 0, {scope.site(node)})"
     return Value(kinds.CHARACTERS, code, node.position, pure=False)
 
 
 def _limit(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Limit)  # noqa: S101
+    assert isinstance(node, tree.Limit)
     kind = resolve(node.type, scope.messages)
     found = calls.limits_of(kind).get(node.name)
     if found is None:

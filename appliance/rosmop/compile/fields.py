@@ -37,7 +37,7 @@ def pending(scope: Scope, written: list[Bound]) -> str:
     """Code for the assigned fields, as (whether assigned, path, value)."""
     entries = []
     for each in written:
-        assert each.variable is not None  # noqa: S101
+        assert each.variable is not None
         path = tuple(_slots(scope, each))
         value = _as_field(scope, each)
         entries.append(f"({each.variable.flag}, {path!r}, {value})")
@@ -63,7 +63,7 @@ def _slots(scope: Scope, each: Bound) -> list[int | str]:
 
 def _as_field(scope: Scope, each: Bound) -> str:
     """Code for a variable's value as the field has it."""
-    assert each.variable is not None  # noqa: S101
+    assert each.variable is not None
     value = Value(each.variable.type, each.variable.code, each.binding.position, owned=False)
     return convert(scope, value, each.type)
 
@@ -99,7 +99,7 @@ def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
     """Read numbers; those at known distances from each other with one call."""
     groups: dict[str | None, list[Bound]] = {}
     for each in fixed:
-        assert each.spot is not None  # noqa: S101  a number is somewhere
+        assert each.spot is not None  # a number is somewhere
         groups.setdefault(each.spot.base, []).append(each)
     for group in groups.values():
         waiting = sorted(group, key=_offset)
@@ -131,7 +131,7 @@ def _read_together(scope: Scope, together: list[Bound]) -> None:
         names += [f"{each.read}_{index}" for index in range(2)] if len(code) == 2 else [each.read]
     unpack = scope.module.struct(codes, "unpack_from")
     spot = together[0].spot
-    assert spot is not None  # noqa: S101
+    assert spot is not None
     scope.lines.add(f"{', '.join(names)}, = {unpack}(b, {spot.code})")
     for each in together:
         if len(struct_code(each.type) or "") == 2:
@@ -155,16 +155,16 @@ def write_back(scope: Scope, written: list[Bound]) -> None:
     spliced = [each for each in written if struct_code(each.type) is None]
     for each in written:
         code = struct_code(each.type)
-        assert each.variable is not None  # noqa: S101
+        assert each.variable is not None
         if code is not None:
-            assert each.spot is not None  # noqa: S101
+            assert each.spot is not None
             packed = scope.codecs.pack([(each.type, _as_field(scope, each))])
             lines.add(f"if {each.variable.flag}: m.patch({each.spot.code}, {packed})")
     if not spliced:
         return
     lines.add(f"{edits} = []")
     for each in spliced:
-        assert each.variable is not None  # noqa: S101
+        assert each.variable is not None
         start = "0" if each.spot is None else each.spot.code
         lines.add(f"if {each.variable.flag}:")
         lines.add("    o = e_bytearray()")

@@ -101,7 +101,7 @@ class Inliner:
     def write(self, depth: int) -> None:
         """Write the event at this depth. Raises `NotInlineError`."""
         function = ast.parse(self._event.source).body[0]
-        assert isinstance(function, ast.FunctionDef)  # noqa: S101  it is the function of an event
+        assert isinstance(function, ast.FunctionDef)  # it is the function of an event
         statements = list(function.body)
         if isinstance(statements[0], ast.Global):
             self._globals = set(statements[0].names)

@@ -118,7 +118,7 @@ class Walk:
         step: tree.PathStep,
         rest: tuple[tree.PathStep, ...],
     ) -> Spot | None:
-        assert isinstance(item, Leaf | ArrayPart)  # noqa: S101  the types say that it is an array
+        assert isinstance(item, Leaf | ArrayPart)  # the types say that it is an array
         index = step.index or 0
         key = (part * 1_000_000 + start.offset, index)
         if key not in self._elements:

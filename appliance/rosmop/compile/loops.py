@@ -44,7 +44,7 @@ def weight(node: tree.Node) -> int:
 
 def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`while` and `do … while`."""
-    assert isinstance(node, tree.While)  # noqa: S101  so says the table in statements.py
+    assert isinstance(node, tree.While)  # so says the table in statements.py
     _enter(scope, node, Loop(False))
     scope.lines.add("while True:")
     with scope.indented():
@@ -62,7 +62,7 @@ def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
 
 def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`for (start; condition; step)`."""
-    assert isinstance(node, tree.For)  # noqa: S101
+    assert isinstance(node, tree.For)
     with scope.block():
         if node.start is not None:
             write(scope, node.start)
@@ -82,7 +82,7 @@ def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
 
 def write_range_for(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`for (type name : values)`."""
-    assert isinstance(node, tree.RangeFor)  # noqa: S101
+    assert isinstance(node, tree.RangeFor)
     values = value_of(scope, node.values)
     if not isinstance(values.type, kinds.Vector | kinds.String):
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
@@ -130,7 +130,7 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) 
 
 def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`switch`: the index of the first case, then every block from there on until a `break`."""
-    assert isinstance(node, tree.Switch)  # noqa: S101
+    assert isinstance(node, tree.Switch)
     value = value_of(scope, node.value)
     kind = kinds.promoted(value.type)
     if not isinstance(kind, kinds.Integer):

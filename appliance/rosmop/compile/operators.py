@@ -115,7 +115,7 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
         elif kind.bits == 64:
             right = _mixed(operands.right, right)
         return operands.value(kind, _floating(operator, operands, left, right, kind))
-    assert isinstance(kind, kinds.Integer)  # noqa: S101  the common type of two numbers
+    assert isinstance(kind, kinds.Integer)  # the common type of two numbers
     if operator in ("/", "%"):
         return operands.value(kind, _division(operator, operands, left, right, kind))
     code = (

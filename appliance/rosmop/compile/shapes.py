@@ -197,7 +197,7 @@ class Reader:
         for code, gap in codes_of(self._structs[function.id][0]):
             spot = spot.plus(Spot((), gap))
             own = next(names)
-            assert isinstance(own, ast.Name)  # noqa: S101  so `fields._read_together` writes it
+            assert isinstance(own, ast.Name)  # so `fields._read_together` writes it
             self.names[spot, code] = own.id
             given.append((own.id, self._shape.name(spot, code)))
             spot = spot.plus(Spot((), struct_size(code)))

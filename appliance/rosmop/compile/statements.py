@@ -38,7 +38,7 @@ def write(scope: Scope, node: tree.Statement) -> None:
 
 
 def _declaration(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Declaration)  # noqa: S101  so says the table at the end
+    assert isinstance(node, tree.Declaration)  # so says the table at the end
     if node.type.static:
         raise SpecificationError.at(
             node.position, "there are no static variables in functions; declare it before the events"
@@ -117,7 +117,7 @@ def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple
             return kinds.CHARACTERS, f"({text} + b'\\0')"
         return kinds.CHARACTERS, f"e_filled({zeros}, {text}, {scope.lines.site})"
     if size is None:
-        assert isinstance(declarator.value, tree.Elements)  # noqa: S101  _array_size has looked
+        assert isinstance(declarator.value, tree.Elements)  # _array_size has looked
         size = len(declarator.value.items)
     array = kinds.Vector(kind, size)
     if declarator.value is None:
@@ -146,7 +146,7 @@ def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
 
 
 def _evaluate(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Evaluate)  # noqa: S101
+    assert isinstance(node, tree.Evaluate)
     expression = node.expression
     level = calls.stream_of(expression)
     if level is not None:
@@ -162,14 +162,14 @@ def _evaluate(scope: Scope, node: tree.Statement) -> None:
 
 
 def _block(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Block)  # noqa: S101
+    assert isinstance(node, tree.Block)
     with scope.block():
         for statement in node.statements:
             write(scope, statement)
 
 
 def _if(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.If)  # noqa: S101
+    assert isinstance(node, tree.If)
     with scope.at(node.condition):
         scope.lines.add(f"if {condition(value_of(scope, node.condition))}:")
     loops.write_body(scope, [node.yes], write)
@@ -189,7 +189,7 @@ def _continue(scope: Scope, node: tree.Statement) -> None:
 
 
 def _return(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Return)  # noqa: S101
+    assert isinstance(node, tree.Return)
     if scope.role == "function":
         _return_value(scope, node)
         return
@@ -229,14 +229,14 @@ def _reset(scope: Scope, node: tree.Statement) -> None:
 
 
 def _delete(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Delete)  # noqa: S101
+    assert isinstance(node, tree.Delete)
     value = value_of(scope, node.target)
     if not isinstance(value.type, kinds.Characters):
         raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
 
 
 def _publish(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Publish)  # noqa: S101
+    assert isinstance(node, tree.Publish)
     check_topic(node.topic, node.position)
     kind = record(node.type_position, node.type, scope.messages)
     value = value_of(scope, node.value)

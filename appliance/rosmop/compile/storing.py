@@ -80,7 +80,7 @@ def _store(scope: Scope, place: Place, code: str) -> str:
 
 def _store_part(scope: Scope, place: Place, code: str) -> str:
     """Strings and times do not change in place: the whole is stored anew."""
-    assert isinstance(place, CharacterPlace | PartPlace)  # noqa: S101  the last kinds of places
+    assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner = require_place(place.base, "an assignment")
     if not place.base.pure:
         raise SpecificationError.at(

@@ -26,7 +26,7 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
 
 def element_value(scope: Scope, base: Value, index: Value, position: Position, site: int) -> Value:
     """`base[index]` of a vector."""
-    assert isinstance(base.type, kinds.Vector)  # noqa: S101  the caller has looked
+    assert isinstance(base.type, kinds.Vector)  # the caller has looked
     kind = base.type
     if not kinds.is_number(index.type):
         raise SpecificationError.at(index.position, f"an index is a number; this is {index.type}")
@@ -43,7 +43,7 @@ def element_value(scope: Scope, base: Value, index: Value, position: Position, s
 
 
 def _vector(call: Invocation) -> kinds.Vector:
-    assert isinstance(call.base.type, kinds.Vector)  # noqa: S101  methods_of has looked
+    assert isinstance(call.base.type, kinds.Vector)  # methods_of has looked
     return call.base.type
 
 

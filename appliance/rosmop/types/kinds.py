@@ -166,7 +166,7 @@ def common(left: Type, right: Type) -> Type:
         wide = [kind.bits for kind in (left, right) if isinstance(kind, Floating)]
         return Floating(max(wide))
     assert isinstance(left, Integer)  # noqa: S101  for mypy: numbers that are not floating are integers by now
-    assert isinstance(right, Integer)  # noqa: S101
+    assert isinstance(right, Integer)  # noqa: S101  as the left one
     if left.signed == right.signed:
         return left if left.bits >= right.bits else right
     signed, unsigned = (left, right) if left.signed else (right, left)
