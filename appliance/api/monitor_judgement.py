@@ -36,7 +36,7 @@ def judge(
     before: Mapping[str, dict[str, str]], files: dict[str, str], definitions: dict[str, str], revision: int
 ) -> Draft:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
-    from appliance.master.specifications import Sources, SpecificationsRefusedError, check  # noqa: PLC0415
+    from appliance.master.specifications import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  as said above
 
     present = Sources(before["files"], before["definitions"])
     following = present.with_files(files, definitions)
@@ -91,9 +91,9 @@ class Compiler:
 
 
 def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
-    from appliance.ros.definitions import Definitions  # noqa: PLC0415
-    from appliance.ros.standard import standard_definitions  # noqa: PLC0415
-    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415
+    from appliance.ros.definitions import Definitions  # noqa: PLC0415  as said above
+    from appliance.ros.standard import standard_definitions  # noqa: PLC0415  as said above
+    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415  as said above
 
     return MonitorSet.load(files, standard_definitions().extended(Definitions.from_files(definitions)))
 
@@ -115,7 +115,7 @@ def events_of(monitor: Monitor) -> list[EventShown]:
 
 def properties_of(monitor: Monitor) -> list[PropertyShown]:
     """The properties of a monitor."""
-    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415
+    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415  as said above
 
     return [
         PropertyShown(
@@ -131,6 +131,6 @@ def properties_of(monitor: Monitor) -> list[PropertyShown]:
 
 def picture_of(monitor: Monitor) -> str | None:
     """The automata of a monitor's properties (SVG); None when none is finite."""
-    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415
+    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415  as said above
 
     return svg_of([each.property for each in monitor.code.properties])

@@ -148,7 +148,7 @@ def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
         gaps = robot.flows_again()
         if "rosout" in fault:
             _wait_for_another_rosout(robot, rosout)
-        print(f"{fault}: " + ", ".join(f"{kind} after {seconds:.2f} s" for kind, seconds in gaps.items()))  # noqa: T201
+        print(f"{fault}: " + ", ".join(f"{kind} after {seconds:.2f} s" for kind, seconds in gaps.items()))  # noqa: T201  figures for whoever reads the run
         _wait_for_state(robot, before[0])
         after = robot.state()
         assert after[0] == before[0], "registrations"

@@ -290,7 +290,7 @@ def test_nodes_are_told_alike(both: BothMasters) -> None:
 
     assert both.appliance.nodes.wait_until(settled) or settled(), both.calls_made(lambda _call: True)
     for side in (both.plain, both.appliance):
-        assert side.nodes.wait_until(lambda side=side: side.last_list(EAR, "/chatter") == ["<second>"])  # type: ignore[misc]
+        assert side.nodes.wait_until(lambda side=side: side.last_list(EAR, "/chatter") == ["<second>"])  # type: ignore[misc]  # mypy does not infer a lambda with defaults
 
 
 def test_own_address(both: BothMasters) -> None:

@@ -168,7 +168,7 @@ def test_watchers_are_told_alike(both: BothMasters, watched: str) -> None:
         # A plain master sends a tree as it is when it comes to it: let it come to it before the next change.
         compare(both, step, ("setParam", TESTER, "/settled", number))
         for side in (both.plain, both.appliance):
-            assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]
+            assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]  # mypy does not infer a lambda with defaults
     told = both.calls_made(lambda call: call.method == "paramUpdate")
     assert told.plain == told.appliance
 

@@ -35,7 +35,7 @@ def test_a_line_is_a_log_message() -> None:
     assert {name: said[name] for name in ("level", "name", "msg", "file", "function", "topics")} == {
         "level": 4, "name": "/rosrv", "msg": "ünsafe", "file": "gate.rv", "function": "gate", "topics": [],
     }  # fmt: skip
-    assert said["header"]["stamp"] == 1_700_000_000.25  # type: ignore[index]
+    assert said["header"]["stamp"] == 1_700_000_000.25  # type: ignore[index]  # a message is read as nested dicts
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ class World:
             self.records.append((event, reason))
             return happened(event, reason, **fields)
 
-        recorder.happened = noted  # type: ignore[method-assign]
+        recorder.happened = noted  # type: ignore[method-assign]  # listens in
         self.stating = Stating(Allocation(2), recorder, "drop", lambda _name: True)
         self.fleet = Fleet(self.stating)
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}

@@ -263,10 +263,10 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(world: Moni
     publisher, subscriber = world.typed()
     monitors = world.engine._middle.monitors
     assert monitors is not None
-    process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]
+    process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]  # a defect, put there
     publisher.send(string("a"))
     assert "a defect of rosrv" in world.event("fault").text
-    monitors.process = process  # type: ignore[method-assign]
+    monitors.process = process  # type: ignore[method-assign]  # and taken away
     publisher.send(string("b"))
     world.gets(subscriber, string("b"))
 

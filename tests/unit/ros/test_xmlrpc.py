@@ -129,7 +129,7 @@ def test_doubles_keep_every_bit(number: float) -> None:
 def test_nan_survives() -> None:
     """Not-a-number is a parameter that robots use."""
     for text in ("nan", "NaN", "-nan", "NAN"):
-        assert math.isnan(read(f"<value><double>{text}</double></value>"))  # type: ignore[arg-type]
+        assert math.isnan(read(f"<value><double>{text}</double></value>"))  # type: ignore[arg-type]  # it is a double
     assert b"<double>nan</double>" in build_response(math.nan)
     assert math.isnan(python_loads(build_response(math.nan))[0][0])
 
@@ -526,9 +526,9 @@ def test_random_bytes_are_refused(data: bytes) -> None:
 def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
     """What ROS's XML-RPC cannot say is an error of the program that wants to send it, never bad XML."""
     with pytest.raises(EncodingError, match=text):
-        build_response(value)  # type: ignore[arg-type]
+        build_response(value)  # type: ignore[arg-type]  # what is no value of its type is the test
     with pytest.raises(EncodingError, match=text):
-        build_call("m", [value])  # type: ignore[list-item]
+        build_call("m", [value])  # type: ignore[list-item]  # as above
 
 
 def test_endless_values_are_errors() -> None:

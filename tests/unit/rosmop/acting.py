@@ -42,7 +42,7 @@ def _tree(flat: Mapping[str, object]) -> dict[str, object]:
         at = nested
         *above, last = path.split("__")
         for step in above:
-            at = at.setdefault(step, {})  # type: ignore[assignment]
+            at = at.setdefault(step, {})  # type: ignore[assignment]  # the dicts are nested
         at[last] = value
     return nested
 
