@@ -8,16 +8,22 @@ Invariants:
 3. The file has keys in it: only its owner may read it. Nothing is written over: neither the file nor a state directory
    that is in use.
 4. A file that is put back is only what `back_up` makes: regular files of the parts of a state directory.
+5. Root reads, and gives away, in folders of users whose processes may have fallen to a stranger: a link is never
+   followed, a file that is not the user's own is an error, and what is in a folder is given away before the folder.
 """
 
+import errno
 import os
+import shutil
 import sqlite3
+import stat
 import tarfile
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of
@@ -25,9 +31,13 @@ from appliance.supervisor.users import account_of
 
 _HEADER, _HASH = 8, 32
 _LOG = "control/audit.db"
+_DATABASES = "control/"  # the only part that has any
+_LARGEST = 1 << 30  # bytes of a file that is no database
 # Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid")
 _LOGS_OF_ROS = ("rosmaster",)
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe is not waited for
 _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/upgrade-and-backup.md)"
 
 
@@ -57,6 +67,9 @@ def back_up(state: Path, file: Path) -> list[str]:
     except (OSError, sqlite3.Error) as error:
         file.unlink()
         raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
+    except BackupError:
+        file.unlink()
+        raise
     return names
 
 
@@ -65,18 +78,17 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
     with TemporaryDirectory(prefix=".rosrv-backup-", dir=beside) as folder:
         copy = Path(folder) / "copy.db"
         last: dict[str, int] = {}
-        for path in _files(state):
-            name = path.relative_to(state).as_posix()
-            if path.suffix == ".db":
-                _copy_database(path, copy)
-                if name == _LOG:
-                    last = _last_checkpoint(copy)
-            else:
-                data = path.read_bytes()
-                copy.write_bytes(_as_far_as(data, last.get(path.stem)) if path.suffix == ".signed" else data)
+        for name, descriptor in _files(state):
+            with os.fdopen(descriptor, "rb") as file:
+                mode = os.fstat(descriptor).st_mode & 0o777
+                if name.startswith(_DATABASES) and name.endswith(".db"):
+                    _copy_database(state / name, copy)
+                else:
+                    _copy_file(name, file, copy, last)
+            if name == _LOG:
+                last = _last_checkpoint(copy)
             entry = tarfile.TarInfo(name)
-            entry.size, entry.mtime = copy.stat().st_size, int(time.time())
-            entry.mode = path.stat().st_mode & 0o777
+            entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(time.time()), mode
             with copy.open("rb") as content:
                 archive.addfile(entry, content)
             copy.unlink()
@@ -84,20 +96,67 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
     return names
 
 
-def _files(state: Path) -> Iterator[Path]:
-    """What is kept: the log first, for the signer's memory is cut to it."""
+def _files(state: Path) -> Iterator[tuple[str, int]]:
+    """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it."""
     parts = {role.part for role in roles_of(syslog=True)} - set(_LOGS_OF_ROS)
-    yield state / _LOG
-    for part in sorted(parts):
-        if not (state / part).exists():
-            continue  # a role that never ran here
-        # A folder that cannot be looked into is an error: a backup without the keys would be none.
-        for folder, folders, names in os.walk(state / part, onerror=_raise):
-            folders.sort()
-            for path in (Path(folder) / name for name in sorted(names)):
-                kept = path.is_file() and not path.is_symlink() and not path.name.endswith(_PASSING)
-                if kept and path != state / _LOG:
-                    yield path
+    names = [
+        name
+        for part in sorted(parts)
+        if (state / part).exists()  # else a role that never ran here
+        for name in _names(state, part)
+    ]
+    for name in sorted(names, key=lambda one: one != _LOG):
+        descriptor = _opened(state, name)
+        if descriptor is not None:
+            yield name, descriptor
+
+
+def _names(state: Path, part: str) -> Iterator[str]:
+    # A folder that cannot be looked into is an error: a backup without the keys would be none.
+    for folder, folders, names in os.walk(state / part, onerror=_raise):
+        folders.sort()
+        for name in sorted(names):
+            if not name.endswith(_PASSING):
+                yield (Path(folder) / name).relative_to(state).as_posix()
+
+
+def _opened(state: Path, name: str) -> int | None:
+    """A file of a part, None for what is no regular file; no link is followed on the way."""
+    part, *folders, last = PurePosixPath(name).parts
+    here = os.open(state / part, _FOLDER)
+    owner = os.fstat(here).st_uid
+    try:
+        for folder in folders:
+            outer, here = here, os.open(folder, _FOLDER, dir_fd=here)
+            os.close(outer)
+        descriptor = os.open(last, _FILE, dir_fd=here)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+            return None
+        raise
+    finally:
+        os.close(here)
+    found = os.fstat(descriptor)
+    if stat.S_ISREG(found.st_mode) and found.st_uid == owner:
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISREG(found.st_mode):
+        raise BackupError(
+            f"{state / name} belongs to user id {found.st_uid}, and its part to {owner}: see who put it there, and take"
+            " it away"
+        )
+    return None
+
+
+def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> None:
+    size = os.fstat(file.fileno()).st_size
+    if size > _LARGEST:
+        raise BackupError(f"{name} has {size} bytes: see who put it there, and take it away")
+    if name.endswith(".signed"):
+        copy.write_bytes(_as_far_as(file.read(_LARGEST), last.get(PurePosixPath(name).stem)))
+        return
+    with copy.open("wb") as written:
+        shutil.copyfileobj(file, written)
 
 
 def _raise(error: OSError) -> None:
@@ -185,5 +244,6 @@ def _hand_over(state: Path) -> None:
         account = account_of(role.user)
         group = account.gid if role.readable_by is None else account_of(role.readable_by).gid
         part = state / role.part
-        for path in (part, *part.rglob("*")) if part.exists() else ():
+        # The innermost first: whoever has a folder could put a link in the place of what is in it.
+        for path in (*sorted(part.rglob("*"), reverse=True), part) if part.exists() else ():
             os.chown(path, account.uid, account.gid if path.is_dir() else group, follow_symlinks=False)

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.log import AuditLog
 from appliance.audit.verify import verify
 from appliance.ipsec.checkpoints import SignedCheckpoints
+from appliance.supervisor import backup
 from appliance.supervisor.backup import BackupError, back_up, restore
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
@@ -151,3 +152,74 @@ def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
     assert "signer" in done.stderr
     assert list(file.iterdir()) == []
     file.rmdir()
+
+
+def test_what_a_process_planted_is_not_taken_for_its_own(state: Path, tmp_path: Path) -> None:
+    """Links, pipes and folders that are links, put into a part by its user, lead a backup that root makes nowhere."""
+    secret = tmp_path / "shadow"
+    secret.write_text("root's")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "inner").write_text("root's")
+    (state / "api" / "link").symlink_to(secret)
+    (state / "api" / "link.db").symlink_to(state / "control" / "state.db")
+    (state / "api" / "folder").symlink_to(tmp_path / "outside")
+    os.mkfifo(state / "api" / "pipe")
+    (state / "api" / "garbage.db").write_text("no database")
+    back_up(state, tmp_path / "backup.tar.gz")
+    with tarfile.open(tmp_path / "backup.tar.gz") as archive:
+        assert [one for one in archive.getnames() if one.startswith("api/")] == ["api/garbage.db"]
+
+
+@pytest.mark.parametrize("name", ["api/key.pem", "api/folder/shadow"])
+def test_a_link_that_is_put_there_at_the_last_moment_is_not_followed(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A file, or a folder on the way to it, that becomes a link after it was seen gives nothing of its target away."""
+    (tmp_path / "shadow").write_text("root's")
+    (state / "api" / "key.pem").symlink_to(tmp_path / "shadow")
+    (state / "api" / "folder").symlink_to(tmp_path)
+    seen = {"control": ["control/audit.db"], "api": [name]}
+    monkeypatch.setattr(backup, "_names", lambda _state, part: seen.get(part, []))
+    file = tmp_path / "backup.tar.gz"
+    if name == "api/key.pem":
+        assert back_up(state, file) == ["control/audit.db"]
+    else:
+        with pytest.raises(BackupError, match="Not a directory"):
+            back_up(state, file)
+        assert not file.exists()
+
+
+def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
+    """A hard link that a process made to a file of somebody else is told, and no backup is left."""
+    need_root()
+    for path in (state / "api", *(state / "api").iterdir()):
+        os.chown(path, 61014, 61014)
+    (tmp_path / "shadow").write_text("root's")
+    os.link(tmp_path / "shadow", state / "api" / "mine")
+    with pytest.raises(BackupError, match="api/mine belongs to user id 0"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_a_file_without_end_is_refused(state: Path, tmp_path: Path) -> None:
+    """A process cannot fill the disk, or the memory, of whoever makes the backup with a file full of holes."""
+    with (state / "api" / "hole").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_a_folder_is_given_away_after_what_is_in_it(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While `restore` hands a part over, its user cannot put a link in the place of what is still to be given away."""
+    need_root()
+    (state / "api" / "inner").mkdir()
+    (state / "api" / "inner" / "file").write_text("x")
+    given: list[str] = []
+    monkeypatch.setattr(os, "chown", lambda path, *_ids, **_more: given.append(str(path)))
+    back_up(state, tmp_path / "backup.tar.gz")
+    restore(tmp_path / "backup.tar.gz", tmp_path / "other")
+    order = [given.index(str(tmp_path / "other" / name)) for name in ("api/inner/file", "api/inner", "api")]
+    assert order == sorted(order)
