@@ -1,13 +1,31 @@
 """Bodies that are a text as it is, or JSON that has more to say: parsed here, and told what is wrong with them."""
 
 import json
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar
 
+from fastapi import Query
 from pydantic import BaseModel, ValidationError
 
 from appliance.api.problems import BadInput, ProblemError
 
 _Model = TypeVar("_Model", bound=BaseModel)
+DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
+WRONG_TYPE: dict[int | str, dict[str, Any]] = {
+    415: {"description": "The body is neither text/plain nor JSON."}
+}
+
+
+def text_or(model: type[BaseModel]) -> dict[str, Any]:
+    """How the contract describes a body that `read_body` reads."""
+    return {
+        "requestBody": {
+            "required": True,
+            "content": {
+                "application/json": {"schema": model.model_json_schema()},
+                "text/plain": {"schema": {"type": "string", "minLength": 1}},
+            },
+        }
+    }
 
 
 def read_body(content_type: str, body: bytes, model: type[_Model], what: str) -> _Model:

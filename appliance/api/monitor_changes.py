@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from appliance.api.access import Bearer, Role
-from appliance.api.bodies import read_body
+from appliance.api.bodies import WRONG_TYPE, DryRun, read_body, text_or
 from appliance.api.control import ControlLink
 from appliance.api.monitor_judgement import Draft, findings_of, judge, refusal
 from appliance.api.monitor_models import (
@@ -43,17 +43,6 @@ _CHANGES: dict[int | str, dict[str, Any]] = {
     412: {"description": "Other specifications are in force than If-Match names."},
     428: {"description": "If-Match is missing."},
 }
-_NEW_TEXT: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "application/json": {"schema": NewText.model_json_schema()},
-            "text/plain": {"schema": {"type": "string", "minLength": 1}},
-        },
-    }
-}
-_TOO: dict[int | str, dict[str, Any]] = {415: {"description": "The body is neither text/plain nor JSON."}}
-DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
 
 
 def routes(services: Services) -> APIRouter:
@@ -85,8 +74,8 @@ def _add_texts(router: APIRouter, changing: "_Changing") -> None:
     @router.put(
         "/{name}",
         operation_id="replace_monitor",
-        responses=_CHANGES | UNKNOWN | _TOO,
-        openapi_extra=_NEW_TEXT,
+        responses=_CHANGES | UNKNOWN | WRONG_TYPE,
+        openapi_extra=text_or(NewText),
     )
     async def replace_monitor(
         *,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from appliance.api.access import Bearer, Role
-from appliance.api.bodies import read_body
+from appliance.api.bodies import WRONG_TYPE, DryRun, read_body, text_or
 from appliance.api.judgement import Judgement, judge, word_of
 from appliance.api.policy import TAGGED
 from appliance.api.policy_models import Change, Confirmed, Loaded, PolicyText, Report, Rollback
@@ -32,16 +32,6 @@ _CHANGES: dict[int | str, dict[str, Any]] = {
     412: {"description": "Another policy is in force than If-Match names."},
     428: {"description": "If-Match is missing."},
 }
-_TOO: dict[int | str, dict[str, Any]] = {415: {"description": "The body is neither text/plain nor JSON."}}
-_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "application/json": {"schema": PolicyText.model_json_schema()},
-            "text/plain": {"schema": {"type": "string", "minLength": 1}},
-        },
-    }
-}
 Confirm = Annotated[
     float | None,
     Query(
@@ -51,7 +41,6 @@ Confirm = Annotated[
         description="seconds after which it goes back by itself unless confirmed",
     ),
 ]
-DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
 
 
 def routes(services: Services) -> APIRouter:
@@ -59,7 +48,9 @@ def routes(services: Services) -> APIRouter:
     router = APIRouter(prefix="/v1/policy", tags=["policy"])
     changing = _Changing(services)
 
-    @router.post("", operation_id="load_policy", responses=_CHANGES | _TOO, openapi_extra=_BODY)
+    @router.post(
+        "", operation_id="load_policy", responses=_CHANGES | WRONG_TYPE, openapi_extra=text_or(PolicyText)
+    )
     async def load_policy(
         *,
         request: Request,

@@ -77,12 +77,6 @@ def drive(forward, turn, seconds):
     report("drove", x=round(position.x, 2), y=round(position.y, 2))
 
 
-def pose_of(odometry):
-    """Where the robot is and where it looks."""
-    position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
-    return physics.Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
-
-
 def reach(x, y):
     """Drive to a place at top speed, straight; give up when the robot comes no nearer."""
     display = Display("/landshark/odom", Odometry)
@@ -90,7 +84,7 @@ def reach(x, y):
     display.wait(lambda _odometry: True)
     rate, way, nearest, stuck = rospy.Rate(HERTZ), [], math.inf, 0
     for _ in range(int(UNDER_WAY * HERTZ)):
-        pose = pose_of(display.message)
+        pose = physics.pose_of(display.message)
         way.append(pose)
         away = math.hypot(x - pose.x, y - pose.y)
         off = physics.normal_angle(math.atan2(y - pose.y, x - pose.x) - pose.heading)

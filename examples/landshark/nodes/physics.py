@@ -6,6 +6,7 @@ a second. The world is a flat yard around ORIGIN with one round obstacle in it.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 ORIGIN = (37.4567, -122.1733)  # degrees north, degrees east
 EARTH_RADIUS = 6_371_000.0
@@ -61,6 +62,12 @@ def limit(value: float, low: float, high: float) -> float:
     if math.isnan(value):
         return (low + high) / 2
     return min(max(value, low), high)
+
+
+def pose_of(odometry: Any) -> Pose:
+    """The pose in a `nav_msgs/Odometry`."""
+    position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
+    return Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
 
 
 def normal_angle(angle: float) -> float:

@@ -17,12 +17,6 @@ BEAMS = 61
 FIELD_OF_VIEW = math.radians(120)
 
 
-def pose_of(odometry):
-    """The pose in an odometry message."""
-    position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
-    return physics.Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
-
-
 class Gps:
     """Satellite navigation: latitude and longitude."""
 
@@ -33,7 +27,7 @@ class Gps:
         message = NavSatFix()
         message.header.stamp, message.header.frame_id = odometry.header.stamp, "gps"
         message.status.status, message.status.service = NavSatStatus.STATUS_FIX, NavSatStatus.SERVICE_GPS
-        message.latitude, message.longitude = physics.position_on_earth(pose_of(odometry))
+        message.latitude, message.longitude = physics.position_on_earth(physics.pose_of(odometry))
         return message
 
 
@@ -50,7 +44,7 @@ class Laser:
         message.header.stamp, message.header.frame_id = odometry.header.stamp, "laser"
         message.angle_min, message.angle_max, message.angle_increment = directions[0], directions[-1], step
         message.range_min, message.range_max = 0.05, 30.0
-        message.ranges = physics.scan(pose_of(odometry), directions)
+        message.ranges = physics.scan(physics.pose_of(odometry), directions)
         return message
 
 

@@ -12,19 +12,11 @@ import pytest
 
 from appliance.channel.admin import PolicyReload
 from appliance.cli.running import ask
+from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT
 
-POLICY = """\
-[Nodes]
-default = *
-[Publishers]
-default = *
-[Subscribers]
-default = *
-[Commands]
-default = *
-"""
+POLICY = OPEN_POLICY
 BURST = 60
 
 

@@ -12,19 +12,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering, whole
 from tests.support.processes import LIMIT
 
-POLICY = """\
-[Nodes]
-default = *
-[Publishers]
-default = *
-[Subscribers]
-default = *
-[Commands]
-default = *
-"""
+POLICY = OPEN_POLICY
 HOST = "10.77.0.66"
 SLOW = 2.0  # seconds for one call of the victim's in a flood, on a machine with two busy cores
 GROWTH = 160 << 20  # bytes that control may grow by under attack: buffers within their limits
