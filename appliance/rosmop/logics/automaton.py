@@ -11,6 +11,8 @@ from typing import TypeVar
 
 MAX_STATES = 10_000
 """How many states a monitor may have before it is minimised."""
+MAX_TRANSITIONS = 500_000
+"""How many ways out all of them may have together: minimising takes some 300 bytes for each."""
 
 State = TypeVar("State", bound=Hashable)
 
@@ -18,8 +20,8 @@ State = TypeVar("State", bound=Hashable)
 class TooManyStatesError(Exception):
     """An automaton outgrew its limit."""
 
-    def __init__(self, limit: int) -> None:
-        super().__init__(f"more than {limit} states")
+    def __init__(self, limit: int, what: str = "states") -> None:
+        super().__init__(f"more than {limit} {what}")
         self.limit = limit
 
 
@@ -63,6 +65,8 @@ def explore(
                     raise TooManyStatesError(limit)
             row.append(number)
         table.append(tuple(row))
+        if len(table) * letters > MAX_TRANSITIONS:
+            raise TooManyStatesError(MAX_TRANSITIONS, "transitions")
     return minimise(Automaton(0, tuple(table), tuple(verdict(state) for state in states)))
 
 

@@ -6,6 +6,7 @@ The definitions are those of `appliance.ros`. A name that does not exist is refu
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 from types import MappingProxyType
 
 from appliance.ros.definitions import Definitions
@@ -13,6 +14,8 @@ from appliance.ros.errors import DefinitionError
 from appliance.ros.message_text import Constant, Field, MessageDefinition
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
+
+_COMPARED = 600  # names that a wrong one is compared with
 
 PRIMITIVES = MappingProxyType(
     {
@@ -122,8 +125,8 @@ def field_type(field: Field) -> Type:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What else could have been meant, as the tail of a message."""
-    known = list(known)
+    """What else could have been meant, as the tail of a message; of very many names, among the first."""
+    known = list(islice(known, _COMPARED))  # a file can have thousands of names, and of mistakes
     near = difflib.get_close_matches(name[:100], known, 1, 0.5)
     if near:
         return f"; did you mean `{near[0]}`?"

@@ -96,3 +96,9 @@ def test_components_against_reachability() -> None:
             for other in edges:
                 assert (place[one] == place[other]) == (other in leads[one] and one in leads[other])
                 assert other not in leads[one] or place[other] <= place[one]
+
+
+def test_many_states_with_many_ways_out_are_refused() -> None:
+    """Memory is bounded by the transitions, not by the states alone: each takes room while minimising."""
+    with pytest.raises(TooManyStatesError, match="more than 500000 transitions"):
+        explore(0, 1000, lambda state, _letter: min(state + 1, 9_000), lambda _state: ())
