@@ -40,6 +40,7 @@ _PROBLEMS = {
     "refused": (422, "refused"),
     "conflict": (412, "changed-meanwhile"),
     "unknown": (404, "unknown"),
+    "forbidden": (403, "not-for-this-role"),
     "busy": (503, "busy"),
     "failed": (503, "not-available"),
 }

@@ -6,6 +6,7 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
    nodes. Those that wait for charon or the signer (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
+4. A change is made only in the name of a token that can be used now and whose role may (`rest_rights.py`).
 """
 
 import asyncio
@@ -35,6 +36,7 @@ from appliance.channel.admin import (
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.master.administration import Administration
 from appliance.master.recorder import Recorder
+from appliance.master.rest_rights import obstacle
 from appliance.master.tokens import Tokens
 
 _log = structlog.get_logger()
@@ -128,6 +130,9 @@ class RestLink:
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
         if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
             return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
+        wrong = obstacle(made.request, made.who, self._tokens.usable())
+        if wrong is not None:
+            return AdminAnswer(False, error=wrong, trouble="forbidden")
         try:
             return await self._administration.carry_out(made.request, who=made.who)
         except Exception as error:  # noqa: BLE001  a defect of one request is that request's failure

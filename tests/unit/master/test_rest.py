@@ -14,6 +14,7 @@ from appliance.channel.messages import TokenKept
 from appliance.master.rest import RestLink
 
 TOKEN = TokenKept("0123456789ab", "alice", "viewer", b"s", b"h", 1e12)
+ADMIN = TokenKept("0123456789ac", "w", "admin", b"s", b"h", 1e12)
 
 
 class Everything:
@@ -39,8 +40,8 @@ class Everything:
         return AdminAnswer(True, {"number": len(self.asked)})
 
     def usable(self) -> list[TokenKept]:
-        """One token."""
-        return [TOKEN]
+        """Two tokens."""
+        return [TOKEN, ADMIN]
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
         """Note a record."""
@@ -96,7 +97,7 @@ def test_tokens_are_told_at_once_and_after_every_change() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        assert await api.until(1) == [messages.TokensStated([TOKEN])]
+        assert await api.until(1) == [messages.TokensStated([TOKEN, ADMIN])]
         world.changed()
         assert len(await api.until(2)) == 2
 
@@ -201,6 +202,22 @@ def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
         assert (refused.answer.trouble, refused.answer.error) == ("failed", world.obstacle)
         assert served.answer.ok
         assert [request for request, _who in world.asked] == [StatusWanted()]
+
+    run(play)
+
+
+def test_a_change_in_a_name_that_may_not_is_refused() -> None:
+    """An api that says a name of its own, or of a token with another role, changes nothing; looking goes on."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        for number, who in enumerate(("operator", "disk", "", "alice")):
+            api.channel.send(messages.RequestMade(number, who, PolicyLoad("[Nodes]")))
+        api.channel.send(messages.RequestMade(8, "alice", StatusWanted()))
+        api.channel.send(messages.RequestMade(9, "w", PolicyLoad("[Nodes]")))
+        answers = (await api.until(7))[1:]
+        assert [one.answer.trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
+        assert [who for _request, who in world.asked] == ["alice", "w"]
 
     run(play)
 
