@@ -58,7 +58,7 @@ METRICS = (
         "rosrv_monitor_events_total",
         "counter",
         ("kind", "monitor"),
-        "what monitors did: verdict, drop, change, fault, log, publish",
+        "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each",
     ),
     Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),

@@ -38,9 +38,10 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
         "callers", "resources", "calls", "hosts", "recovered",
     ),
     **dict.fromkeys(
-        ("monitor verdict", "message dropped", "message changed", "monitor fault", "monitor log", "monitor published"),
+        ("monitor verdict", "message dropped", "monitor fault", "monitor log", "monitor published"),
         _MONITOR,
     ),
+    "message changed": (*_MONITOR, "changed_by"),
 }  # fmt: skip
 
 _HEAD = """\

@@ -41,7 +41,8 @@ EVENTS: dict[str, str] = {
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
     "monitor verdict": "A property of a monitor is in a category that is handled; `detail` has logic and category.",
     "message dropped": "A monitor dropped a message; the first of a second in full, the rest as `detail.count`.",
-    "message changed": "A monitor changed a message; `detail` has the bytes before and after.",
+    "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
+    " that did, in order, `monitor` whose the last is. A `count` has `changed_by` if it was more than one monitor.",
     "monitor fault": "An action of a monitor could not go on; `detail` has file, line and values.",
     "monitor log": "A monitor wrote a line.",
     "monitor published": "A monitor published a message.",

@@ -24,7 +24,8 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 class MonitorRecords:
     """Makes records of reports; `fields(topic, data)` reads a message.
 
-    `counts` has how often each kind happened, by monitor; `at` how often messages of a topic were dropped or changed.
+    `counts` has how often each kind happened, by monitor: a change that several made, for each of them. `at` has how
+    often messages of a topic were dropped or changed.
     `told(event)` hears of every event.
     """
 
@@ -42,7 +43,8 @@ class MonitorRecords:
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
         """A batch of the relay."""
         for event in events:
-            self.counts[event.kind, event.monitor] += event.count or 1
+            for monitor in _monitors(event):
+                self.counts[event.kind, monitor] += event.count or 1
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
@@ -78,3 +80,9 @@ class MonitorRecords:
             more=event.detail,
             **detail,
         )
+
+
+def _monitors(event: MonitorEvent) -> set[str]:
+    """Whose doing it was."""
+    together = event.detail.get("changed_by", ())
+    return {event.monitor, *(str(one).partition(".")[0] for one in together)}

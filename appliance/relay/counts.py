@@ -6,11 +6,10 @@ from appliance.rosmop.batch import Walked, Walker
 
 
 class Count(NamedTuple):
-    """How often an event happened, and dropped or changed a message; when it dropped one last (nanoseconds)."""
+    """How often an event happened, and dropped a message; when it dropped one last (nanoseconds)."""
 
     happened: int
     dropped: int
-    changed: int
     last_drop: int
 
 
@@ -31,10 +30,10 @@ class Counts:
         happened = self._happened
         for number, count in enumerate(walked.happened):
             happened[number] += count
-        if self.walker.changes:
+        if walked.changed:
             changed = self._changed
-            for number, count in enumerate(walked.changed):
-                changed[number] += count
+            for who, count in walked.changed:
+                changed[who] = changed.get(who, 0) + count
         if not self.walker.drops:
             return 0
         gone = 0
@@ -45,18 +44,16 @@ class Counts:
                 self._last_drop[number] = time
         return gone
 
-    def take(self) -> list[Count]:
-        """The counts of all events; they begin anew."""
-        counts = [
-            Count(*each)
-            for each in zip(self._happened, self._dropped, self._changed, self._last_drop, strict=True)
-        ]
+    def take(self) -> tuple[list[Count], dict[tuple[str, ...], int]]:
+        """The counts of all events, and of changed messages by the events that changed them; they begin anew."""
+        counts = [Count(*each) for each in zip(self._happened, self._dropped, self._last_drop, strict=True)]
+        changed = {self.walker.writers(who): count for who, count in self._changed.items()}
         self._clear()
-        return counts
+        return counts, changed
 
     def _clear(self) -> None:
         self.begun = False
         self._happened = [0] * self._events
         self._dropped = [0] * self._events
-        self._changed = [0] * self._events
+        self._changed: dict[int, int] = {}
         self._last_drop = [0] * self._events

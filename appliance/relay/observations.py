@@ -2,14 +2,15 @@
 
 Invariants:
 - Of each monitor, kind and distinction (the category of a verdict, the text of a log line) one event a second is
-  told in full; the others of that second are one event with a count. Nothing that happened is left out of the
-  counts.
+  told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
+  happened is left out of the counts.
 - Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
 - While there is no control, at most `_KEPT` events wait; how many more there were is said.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
@@ -27,6 +28,8 @@ _FLUSH_SECONDS = 0.05
 _VALUES = 32
 _INTEGERS = range(-(1 << 63), 1 << 64)
 
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
 _Key = tuple[str, str, str, str, str]
 
 
@@ -40,6 +43,7 @@ class Observations:
         self._told: dict[_Key, int] = {}
         self._distinct: dict[tuple[str, str], int] = {}
         self._last: dict[_Key, int] = {}
+        self._shared: dict[_Key, Mapping[str, Any]] = {}
         self._waiting: deque[MonitorEvent] = deque()
         self._lost = 0
         self._timer: Timer | None = None
@@ -54,14 +58,18 @@ class Observations:
         text: str,
         *,
         distinction: str = "",
+        shared: Mapping[str, Any] = _NOTHING,
         detail: Mapping[str, Any] | None = None,
         before: bytes = b"",
         after: bytes = b"",
         size: int = 0,
     ) -> None:
-        """Something happened at `place` (key of the incarnation, topic or service)."""
+        """Something happened at `place` (key of the incarnation, topic or service).
+
+        `shared` is the detail of the count of all that have this distinction.
+        """
         text = text[:_TEXT]
-        key = self._key(kind, monitor, place, distinction)
+        key = self._key(kind, monitor, place, distinction, shared)
         if key in self._told:
             self._told[key] += 1
             self._last[key] = time
@@ -73,9 +81,19 @@ class Observations:
             )
         )
 
-    def add(self, kind: str, monitor: str, place: tuple[str, str], time: int, count: int) -> None:
+    def add(
+        self,
+        kind: str,
+        monitor: str,
+        place: tuple[str, str],
+        time: int,
+        count: int,
+        *,
+        distinction: str = "",
+        shared: Mapping[str, Any] = _NOTHING,
+    ) -> None:
         """So many more happened at `place`, the last at this time; they are told as a count."""
-        key = (kind, monitor, *place, "")
+        key = self._key(kind, monitor, place, distinction, shared)
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
@@ -88,13 +106,15 @@ class Observations:
         for key, count in self._told.items():
             if count:
                 kind, monitor, owner, resource, distinction = key
+                shared = _plain(self._shared.get(key, _NOTHING))
                 self._add(
                     MonitorEvent(
-                        kind, monitor, owner, resource, self._last[key], distinction, {}, count=count
+                        kind, monitor, owner, resource, self._last[key], distinction, shared, count=count
                     )
                 )
         self._told.clear()
         self._last.clear()
+        self._shared.clear()
         self._distinct.clear()
         if self._reporter.attached:
             rows = list(self._rows())
@@ -107,7 +127,9 @@ class Observations:
         self._counted = []
         self._flush()
 
-    def _key(self, kind: str, monitor: str, place: tuple[str, str], distinction: str) -> _Key:
+    def _key(
+        self, kind: str, monitor: str, place: tuple[str, str], distinction: str, shared: Mapping[str, Any]
+    ) -> _Key:
         key = (kind, monitor, *place, distinction[:_TEXT])
         if key in self._told or not distinction:
             return key
@@ -115,6 +137,8 @@ class Observations:
         if known >= _DISTINCT:
             return (kind, monitor, *place, "")
         self._distinct[kind, monitor] = known + 1
+        if shared:
+            self._shared[key] = shared
         return key
 
     def _add(self, event: MonitorEvent) -> None:

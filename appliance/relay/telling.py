@@ -1,6 +1,11 @@
-"""What monitors did, counted and put into words for control: from outcomes to `observations`."""
+"""What monitors did, counted and put into words for control: from outcomes to `observations`.
 
-from collections.abc import Callable
+Who did it is exact: a drop is the monitor's that dropped the message, a change is that of each monitor whose action
+made its bytes others. A change that several made is one record, under the last of them, that names all; it counts once
+for each of them, and once for the topic.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorRow
@@ -75,7 +80,7 @@ class Telling:
         for published in outcome.published:
             self._observations.note(
                 "publish",
-                monitor_of(outcome),
+                published.monitor,
                 ("", published.topic),
                 outcome.time,
                 f"{published.type} on {published.topic}",
@@ -87,21 +92,23 @@ class Telling:
 
     def changed_again(self, outcome: Outcome, place: Place) -> None:
         """A change at a place where one has been shown in this second: it is counted."""
-        key = (tuple(outcome.events), place)
+        key = (tuple(outcome.changed_by), place)
         self._again[key] = self._again.get(key, 0) + 1
 
     def changed(self, outcome: Outcome, place: Place, before: bytes, size: int) -> None:
         """Tell a change with the bytes before and after."""
         self._shown.add(place)
-        monitor = monitor_of(outcome)
-        self._counter(monitor).changes += 1
+        monitors = self._count_change(outcome.changed_by, 1)
+        together = _together(outcome.changed_by)
         self._observations.note(
             "change",
-            monitor,
+            monitors[-1],
             place,
             outcome.time,
-            f"{monitor} changed a message",
-            detail={"events": list(outcome.events)},
+            f"{' and '.join(monitors)} changed a message",
+            distinction=", ".join(together),
+            shared={"changed_by": together} if together else {},
+            detail={"events": list(outcome.events), "changed_by": list(outcome.changed_by)},
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
@@ -109,11 +116,10 @@ class Telling:
 
     def dropped(self, outcome: Outcome, place: Place, body: memoryview) -> None:
         """Tell a drop."""
-        monitor = monitor_of(outcome)
-        self._counter(monitor).drops += 1
+        self._counter(outcome.dropped_by).drops += 1
         self._observations.note(
             "drop",
-            monitor,
+            outcome.dropped_by,
             place,
             outcome.time,
             outcome.reason or _why(outcome),
@@ -137,26 +143,42 @@ class Telling:
         self._settle()
         for events, count in self._happened.items():
             for event in events:
-                self._counter(event.partition(".")[0]).events += count
+                self._counter(_monitor(event)).events += count
         self._happened.clear()
         for (events, place), count in self._again.items():
-            monitor = events[-1].partition(".")[0] if events else ""
-            self._counter(monitor).changes += count
-            self._observations.add("change", monitor, place, time, count)
+            monitors = self._count_change(events, count)
+            together = _together(events)
+            self._observations.add(
+                "change",
+                monitors[-1],
+                place,
+                time,
+                count,
+                distinction=", ".join(together),
+                shared={"changed_by": together} if together else {},
+            )
         self._again.clear()
+
+    def _count_change(self, events: Sequence[str], count: int) -> list[str]:
+        """Count messages that these events changed, once for each of their monitors; the monitors, in order."""
+        monitors = list(dict.fromkeys(_monitor(event) for event in events))
+        for monitor in monitors:
+            self._counter(monitor).changes += count
+        return monitors
 
     def _settle(self) -> None:
         """Take what lanes have counted: events, and drops and changes beyond the first."""
         for owed in self._owed:
             walker, place = owed.walker, owed.place
-            for number, count in enumerate(owed.take()):
+            counts, changed = owed.take()
+            for number, count in enumerate(counts):
                 events, monitor = walker.events[number], walker.monitors[number]
                 self._happened[events] = self._happened.get(events, 0) + count.happened
-                if count.changed:
-                    self._again[events, place] = self._again.get((events, place), 0) + count.changed
                 if count.dropped:
                     self._counter(monitor).drops += count.dropped
                     self._observations.add("drop", monitor, place, count.last_drop, count.dropped)
+            for writers, messages in changed.items():
+                self._again[writers, place] = self._again.get((writers, place), 0) + messages
         self._owed.clear()
 
     def row(self, monitor: Monitor) -> MonitorRow:
@@ -222,28 +244,31 @@ class Telling:
         return self._counters.setdefault(monitor, _Counters())
 
 
-def monitor_of(outcome: Outcome) -> str:
-    """The monitor that had the last word on a message."""
-    if outcome.faults:
-        return outcome.faults[-1].monitor
-    if outcome.events:
-        return outcome.events[-1].partition(".")[0]
-    if outcome.timer:
-        return outcome.timer.partition(".")[0]
-    return outcome.reason.partition(" ")[0] if outcome.reason and " holds " in outcome.reason else ""
-
-
 def refusal(outcome: Outcome, part: str) -> str:
     """What the client of a service reads."""
     if outcome.reason:
         return outcome.reason
-    said = f": {outcome.log[-1].text}" if outcome.log and not outcome.faults else ""
-    return f"the {part} is refused by the monitor {monitor_of(outcome) or 'of this service'}{said}"
+    said = "" if outcome.fatal is not None else _said(outcome)
+    return f"the {part} is refused by the monitor {outcome.dropped_by}{said}"
 
 
 def _why(outcome: Outcome) -> str:
-    if outcome.faults:
-        return f"fault in {outcome.faults[-1].monitor}: {outcome.faults[-1].text}"
-    event = outcome.events[-1] if outcome.events else "a monitor"
-    said = f": {outcome.log[-1].text}" if outcome.log else ""
-    return f"{event} dropped it{said}"
+    if outcome.fatal is not None:
+        return f"fault in {outcome.fatal.monitor}: {outcome.fatal.text}"
+    return f"{outcome.events[-1]} dropped it{_said(outcome)}"
+
+
+def _said(outcome: Outcome) -> str:
+    """What the monitor that dropped a message said last on it."""
+    said = [line.text for line in outcome.log if line.monitor == outcome.dropped_by]
+    return f": {said[-1]}" if said else ""
+
+
+def _monitor(event: str) -> str:
+    """The monitor of an event."""
+    return event.partition(".")[0]
+
+
+def _together(events: Sequence[str]) -> list[str]:
+    """The events that changed a message, if it was more than one monitor."""
+    return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []

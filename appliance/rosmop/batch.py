@@ -7,6 +7,7 @@ Invariants:
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from appliance.rosmop.compile.batch import BatchCode, batches
@@ -25,18 +26,18 @@ class Walked(NamedTuple):
     """What a walk has done.
 
     `position` is where the first message begins that is left; `run` where what goes on unchanged begins (behind the
-    last dropped message). `happened`, `dropped` and `changed` are counts for each of the walker's events: `dropped` by
-    it, and changed messages of which it was the last event.
+    last dropped message). `happened` and `dropped` are counts for each of the walker's events; `changed` has a set of
+    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages.
     """
 
     position: int
     run: int
     happened: Sequence[int]
     dropped: Sequence[int]
-    changed: Sequence[int]
+    changed: Sequence[tuple[int, int]]
 
 
-_Loop = Callable[..., tuple[int, int, Sequence[int], Sequence[int], Sequence[int]]]
+_Loop = Callable[..., tuple[int, int, Sequence[int], Sequence[int], Sequence[tuple[int, int]]]]
 
 
 class Prepared(NamedTuple):
@@ -74,6 +75,10 @@ class Walker:
         self._alike: _Loop | None = compiled.namespace[code.alike] if code.alike is not None else None
         self._shape: Shape | None = code.shape
         self._layouts: dict[tuple[int, tuple[int, ...]], Layout | None] = {}
+
+    def writers(self, who: int) -> tuple[str, ...]:
+        """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
+        return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
 
     def ready(self) -> bool:
         """Whether no monitor waits for its first message, or holds its topics."""
@@ -156,7 +161,7 @@ def _together(one: Walked, other: Walked) -> Walked:
         other.run,
         [a + b for a, b in zip(one.happened, other.happened, strict=True)],
         [a + b for a, b in zip(one.dropped, other.dropped, strict=True)],
-        [a + b for a, b in zip(one.changed, other.changed, strict=True)],
+        (*one.changed, *other.changed),
     )
 
 
@@ -165,6 +170,7 @@ def _put(buffer: memoryview, at: int, old: bytes) -> None:
     buffer[at : at + len(old)] = old
 
 
-def _repeated(undo: Sequence[tuple[object, memoryview, int, object]]) -> bool:
-    """Whether a field was written more than once, so that it may be as it was."""
-    return len({at for _, _, at, _ in undo}) < len(undo)
+def _repeated(undo: Sequence[tuple[object, memoryview, int, object, int]]) -> bool:
+    """Whether a byte was written more than once, so that the message may be as it was."""
+    areas = sorted((at, at + size) for _, _, at, _, size in undo)
+    return any(end > start for (_, end), (start, _) in pairwise(areas))

@@ -264,15 +264,21 @@ class MonitorSet:
             return outcome
         self._turn.now = time_ns
         message = Message(buffer, time_ns)
+        writers: tuple[str, ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
                 monitor.context.budget = BUDGET
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
+                    outcome.dropped_by = monitor.name
                     break
             if self._happen(step, message, outcome):
+                outcome.dropped_by = step.monitor.name
                 break
-        self._finish(message, outcome)
+            if message.touched:
+                message.touched = False
+                writers = (*writers, step.name)
+        self._finish(message, writers, outcome)
         return outcome
 
     def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
@@ -283,7 +289,7 @@ class MonitorSet:
             if line_of(error) >= step.event.action_line:
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
-            self._block(message)
+            self._block(message, outcome)
             return message.dropped
         if not happened:
             if message.past:
@@ -297,7 +303,7 @@ class MonitorSet:
             return message.dropped
         return False
 
-    def _finish(self, message: Message, outcome: Outcome) -> None:
+    def _finish(self, message: Message, writers: tuple[str, ...], outcome: Outcome) -> None:
         turn = self._turn
         if turn.log or turn.published:
             self._collect(outcome)
@@ -306,6 +312,7 @@ class MonitorSet:
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
+            outcome.changed_by = writers
         if self._timed:
             self._schedule()
 
@@ -331,7 +338,7 @@ class MonitorSet:
                 categories = running.run.step(step.index, time_ns)
             except RunFaultError as error:
                 self._fault(error, step.monitor, running.code.property.source.origin, outcome)
-                self._block(message)
+                self._block(message, outcome)
                 continue
             if categories:
                 self._tell(step.monitor, running, categories, message, outcome)
@@ -370,12 +377,13 @@ class MonitorSet:
             handler(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this handler and is recorded
             self._fault(error, monitor, running.code.property.source.origin, outcome)
-            self._block(message)
+            self._block(message, outcome)
 
-    def _block(self, message: Message | None) -> None:
-        """What a fault does to the message."""
+    def _block(self, message: Message | None, outcome: Outcome) -> None:
+        """What the last fault does to the message."""
         if message is not None and self._on_fault == "drop":
             message.dropped = True
+            outcome.fatal = outcome.faults[-1]
 
     def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
         fault: Fault = explain(error, self._compiled.module, monitor.name, otherwise)

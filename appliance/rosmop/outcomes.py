@@ -37,8 +37,12 @@ class Outcome:
     `buffer` is what to relay: the buffer that came in (changed in place where that was possible), or another.
     `events` are named `specification.event`. `timer` names what a tick or deadline belongs to
     (`specification.tick`, `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before`
-    are ticks and deadlines that were due before this message. `reason` says why the messages of a held
-    specification are dropped.
+    are ticks and deadlines that were due before this message.
+
+    `changed_by` are the events whose actions made its bytes others than they found them, in order; empty unless the
+    result is `changed`. An event that happened without a change, or assigned what was there, is not among them.
+    `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
+    `reason` (it is held, or could not begin).
 
     Most messages have nothing to tell; so there is nothing to make for them but the object itself.
     """
@@ -52,6 +56,9 @@ class Outcome:
     faults: Sequence[Fault] = ()
     before: Sequence["Outcome"] = ()
     reason: str | None = None
+    changed_by: Sequence[str] = ()
+    dropped_by: str = ""
+    fatal: Fault | None = None
 
     def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
         self.buffer = buffer

@@ -270,7 +270,8 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
     `kind` is verdict, drop, change, fault, log or publish; `time` is nanoseconds since the epoch; `before` and
     `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
-    else how many more there were.
+    else how many more there were. `monitor` is who did it, of a change the last who did; `changed_by` in the detail
+    names the events of all (in a count: if it was more than one monitor).
     """
 
     kind: str

@@ -149,7 +149,7 @@ class _Writer:
         """The function around the lines of the events."""
         name = self._module.fresh("b")
         states = [f"s_{number}" for number in range(len(self._properties))]
-        kept = ["undo = ()"] if self._undone(body) else []
+        kept = ["undo = ()", "who = 0"] if self._undone(body) else []
         before = {**{f"z_{one}": one for one in sorted(body.shared)}}
         if body.several:
             counted = [f"n_{number}" for number in range(len(self._events))]
@@ -157,7 +157,7 @@ class _Writer:
         snapshot = [*(f"{copy} = {one}" for copy, one in before.items()), *kept]
         restore = [f"{one} = {copy}" for copy, one in before.items()]
         if self._undone(body):
-            restore.append("for i, t, a, o in undo[::-1]: i(t, a, o)")
+            restore.append("for i, t, a, o, _ in undo[::-1]: i(t, a, o)")
         lines = [
             *self._head(name, body, states),
             *(f"    {line}" for line in snapshot),
@@ -175,7 +175,8 @@ class _Writer:
             *(["    if stopped:", *(f"        {line}" for line in restore)] if restore else []),
             *(["    n_0 = (position - start) // stride"] if body.always else []),
             *(f"    p_{number}.state = {state}" for number, state in enumerate(states)),
-            f"    return {self._result()}",
+            *(["    if again: changes.append((same, again))"] if self._undone(body) else []),
+            f"    return {self._result(body)}",
         ]
         self.sources += lines
         return name
@@ -200,10 +201,12 @@ class _Writer:
                 lines.append(f"    {_names('o', len(body.shape.written))} = places")
         if body.always:
             lines.append("    start = position")
-        lines += [f"    n_{number} = x_{number} = y_{number} = 0" for number in numbers]
-        if body.several:
-            lines.append(f"    changes = [0] * {len(numbers)}")
-            lines.append("    last = 0")
+        lines += [f"    n_{number} = x_{number} = 0" for number in numbers]
+        if not body.several:
+            lines.append("    y_0 = 0")
+        if self._undone(body):
+            lines.append("    changes = []")
+            lines.append("    same = again = 0")
         lines.append("    following = position" if body.shape is None else "    position -= stride")
         return lines
 
@@ -233,20 +236,27 @@ class _Writer:
 
     def _tail(self, body: Body) -> list[str]:
         """The message has met all events and goes on."""
-        lines = []
-        if self._undone(body):
-            if len(body.writers) > 1:
-                lines.append("if x_repeated(undo): break")
-            lines.append("if undo: changes[last] += 1")
-        return lines
+        if not self._undone(body):
+            return []
+        return [
+            "if who:",
+            *(["    if who & who - 1 and x_repeated(undo): break"] if len(body.writers) > 1 else []),
+            "    if who == same: again += 1",
+            "    else:",
+            "        if again: changes.append((same, again))",
+            "        same = who",
+            "        again = 1",
+        ]
 
     def _undone(self, body: Body) -> bool:
         return body.several and bool(body.writers)
 
-    def _result(self) -> str:
+    def _result(self, body: Body) -> str:
         numbers = range(len(self._events))
-        counts = [", ".join(f"{letter}_{number}" for number in numbers) for letter in "nxy"]
-        changes = "changes" if len(numbers) > 1 else f"({counts[2]},)"
+        counts = [", ".join(f"{letter}_{number}" for number in numbers) for letter in "nx"]
+        changes = "()"
+        if body.writers:
+            changes = "changes" if body.several else "((1, y_0),) if y_0 else ()"
         return f"position, run, ({counts[0]},), ({counts[1]},), {changes}"
 
 

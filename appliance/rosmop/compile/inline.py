@@ -9,8 +9,9 @@ An event does nothing that cannot be taken back before its last line is certain:
 states of the properties, and only then (`_commit`) both.
 
 Names of the loop: `view`, `position` and `following` (the frame), `b` (the message, where it is looked at alone),
-`run` and `pieces` (what goes on), `loud` (changes are told in full) and `k_N` (drops of event N are), `n_N`, `x_N` and
-`y_N` (how often event N happened, dropped, changed), `undo`, `last`.
+`run` and `pieces` (what goes on), `loud` (changes are told in full) and `k_N` (drops of event N are), `n_N` and `x_N`
+(how often event N happened, dropped), `y_0` (how often the only event changed something); of several events `undo`, and
+`who` has changed this message (bit N for event N).
 """
 
 import ast
@@ -286,8 +287,9 @@ class Inliner:
                     body.add(depth, f"if {target} < 0: break")
                 steps.append(f"{column.variable} = {target}")
         again = body.several and body.shape is not None
+        writer = number if body.several else None
         for patch in self._patches:
-            body.add_all(depth, written(patch, body.module, undone=body.several, read_again=again))
+            body.add_all(depth, written(patch, body.module, writer=writer, read_again=again))
         if len(self._patches) == 1 and not body.several:
             body.add(depth + 1, f"y_{number} += 1")
         elif self._patches and not body.several:
@@ -296,8 +298,6 @@ class Inliner:
         body.add(depth, *steps)
         if not body.always:
             body.add(depth, f"n_{number} += 1")
-        if body.several:
-            body.add(depth, f"last = {number}")
         return True
 
     # Names

@@ -74,17 +74,21 @@ def foreseen(patch: Patch, module: Module) -> list[Line]:
     ]
 
 
-def written(patch: Patch, module: Module, *, undone: bool, read_again: bool) -> list[Line]:
-    """Write it. With `undone`, note how to take it back; with `read_again`, later events see the new value."""
+def written(patch: Patch, module: Module, *, writer: int | None, read_again: bool) -> list[Line]:
+    """Write it. With a `writer`, note that it was this event and how to take it back; with `read_again`, later events
+    see the new value."""
     lines = [(0, f"if {patch.differs}:")]
     if patch.before is None:
-        if undone:
-            lines.append((1, f"undo += ((w_put, {patch.buffer}, {patch.at}, e_bytes({patch.area})),)"))
-        return [*lines, (1, f"{patch.area} = {patch.new}")]
-    into = module.struct(f"<{patch.code}", "pack_into")
-    if undone:
-        lines.append((1, f"undo += (({into}, {patch.buffer}, {patch.at}, {patch.before}),)"))
-    lines.append((1, f"{into}({patch.buffer}, {patch.at}, {patch.new})"))
-    if read_again:
+        put, old = "w_put", f"e_bytes({patch.area})"
+        change = f"{patch.area} = {patch.new}"
+    else:
+        put, old = module.struct(f"<{patch.code}", "pack_into"), patch.before
+        change = f"{put}({patch.buffer}, {patch.at}, {patch.new})"
+    if writer is not None:
+        size = struct_size(patch.code)
+        lines.append((1, f"who |= {1 << writer}"))
+        lines.append((1, f"undo += (({put}, {patch.buffer}, {patch.at}, {old}, {size}),)"))
+    lines.append((1, change))
+    if read_again and patch.before is not None:
         lines.append((1, f"{patch.before} = {patch.new}"))
     return lines

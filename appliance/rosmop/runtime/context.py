@@ -56,8 +56,9 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A message to be published."""
+    """A message to be published by a monitor."""
 
+    monitor: str
     topic: str
     type: str
     data: bytes
@@ -128,7 +129,7 @@ class Context:
         self.spend(OUTPUT_COST, site)
         self.allocate(len(data), site)
         self._pending += len(data)
-        self.turn.published.append(Published(topic, kind, data))
+        self.turn.published.append(Published(self.monitor, topic, kind, data))
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)

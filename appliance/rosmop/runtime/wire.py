@@ -95,10 +95,11 @@ class Message:
     """The message that events look at: its bytes as changed so far, and what has become of it.
 
     Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
-    copied for a changed stamp.
+    copied for a changed stamp. `touched` is set by whatever writes other bytes than were there; who wants to know
+    which event did clears it after each.
     """
 
-    __slots__ = ("_replaced", "_written", "buffer", "dropped", "past", "time")
+    __slots__ = ("_replaced", "_written", "buffer", "dropped", "past", "time", "touched")
 
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
@@ -106,6 +107,7 @@ class Message:
         self._written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
         self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
+        self.touched = False
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
 
     @property
@@ -128,6 +130,7 @@ class Message:
         old = self.buffer[start:end]
         if old == new:
             return
+        self.touched = True
         if self._replaced is None:
             if self._written is None:
                 self._written = []
@@ -146,6 +149,7 @@ class Message:
             return
         if self._replaced is None:
             self._replaced = self._original()
+        self.touched = True  # an encoding says how long it is, so one of another length has other bytes
         pieces = []
         last = 0
         for start, end, new in sorted(edits):

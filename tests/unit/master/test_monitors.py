@@ -203,8 +203,17 @@ async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
         messages.MonitorEvent("change", "a", "k", "/chatter", 2, "", {}, count=41),
         messages.MonitorEvent("fault", "a", "k", "/chatter", 3, "a.rv:1:2: division by zero", {"line": 1}),
     ]
+    together = {"changed_by": ["a.e", "b.e", "b.f"]}
+    told += [
+        messages.MonitorEvent(
+            "change", "b", "k", "/cmd", 4, "a and b changed a message", together, b"\x01", b"\x02", 1
+        ),
+        messages.MonitorEvent("change", "b", "k", "/cmd", 5, "a.e, b.e, b.f", together, count=9),
+    ]
     monitors.received(messages.MonitorsReported(told, 5))
     changed = [fields for event, fields in desk.events if event == "message changed"]
     assert (changed[0]["before"], changed[0]["after"], changed[1]["count"]) == ("01", "02", 41)
-    assert monitors.records.counts["change", "a"] == 42
+    assert changed[3]["more"] == together
+    assert (monitors.records.counts["change", "a"], monitors.records.counts["change", "b"]) == (52, 10)
+    assert (monitors.records.at["change", "/chatter"], monitors.records.at["change", "/cmd"]) == (42, 10)
     assert [fields["lost"] for event, fields in desk.events if event == "records lost"] == [5]

@@ -161,6 +161,20 @@ HARD = {
     "back to what it was": """
         there() { event e(int count) /plain own/Plain '{count:count}' { count = count + 1; } }
         back() { event e(int count) /plain own/Plain '{count:count}' { count = count - 1; } }""",
+    "back to what it was, written in pieces": """
+        s() { ros::Time saved; event a(ros::Time t) /plain own/Plain '{when:t}' { saved = t; }
+              event part(unsigned int n) /plain own/Plain '{when.nsec:n}' { n = n + 1; }
+              event whole(ros::Time t) /plain own/Plain '{when:t}' { t = saved; } }""",
+    "who changes it differs": """
+        one() { event e(int count, int kind) /plain own/Plain '{count:count, kind:kind}' {
+            if (kind != 1) { count = 17; } } }
+        two() { event e(double x) /plain own/Plain '{x:x}' { if (x > 2) { x = 2; } }
+                event f(bool on) /plain own/Plain '{on:on}' { on = false; } }
+        three() { event e(float y) /plain own/Plain '{y:y}' { if (y == 2.5) { y = 3; } }
+                  event last() /plain own/Plain '{}' { } }""",
+    "what is written stands side by side": """
+        one() { event e(double x) /plain own/Plain '{x:x}' { x = 7; } }
+        two() { event e(float y) /plain own/Plain '{y:y}' { y = 8; } }""",
     "a drop after a change": """
         change() { event e(float y) /plain own/Plain '{y:y}' { y = y * 2; } }
         drop() { event e(int kind) /plain own/Plain '{kind:kind}' { if (kind == 1) { return; } } }""",
@@ -265,6 +279,18 @@ def test_most_messages_are_taken_together() -> None:
     assert single == 1
     assert [(row.events, row.changes) for row in monitored.rows()] == [(5000, 5000)]
     monitored.close()
+
+
+def test_what_several_change_is_counted_for_each_of_them() -> None:
+    """Taken together, by bits and runs, as one by one: a message counts for each monitor that changed it."""
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    frames = b"".join(struct.pack("<I", len(one)) + one for one in (far, body, body, quiet, far, quiet))
+    monitored = agree(
+        {"x.rv": HARD["who changes it differs"]}, definitions(), [Traffic("/plain", frames, 6)] * 50
+    )
+    assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
 
 
 def test_a_defect_of_the_loops_is_told_once_and_the_engine_goes_on() -> None:

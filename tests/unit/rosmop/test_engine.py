@@ -2,13 +2,18 @@
 
 # ruff: noqa: E501  the rows of tables
 
+from collections.abc import Callable
+
 import pytest
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MAX_TICKS, MonitorSet
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.unit.rosmop.acting import definitions, load, message, refused
+from tests.unit.rosmop.random_specifications import Messages, Specifications
+from tests.unit.rosmop.random_specifications import definitions as random_definitions
 
 SECOND = 10**9
 
@@ -117,6 +122,133 @@ def test_a_monitor_whose_init_faults_lets_nothing_pass() -> None:
         "dropped",
         "a could not begin: its first values or `init` faulted",
     )
+
+
+# Who did it
+
+
+@pytest.mark.parametrize(
+    ("bodies", "given", "result", "changed_by"),
+    [
+        (("x = 0;", ""), 5, "changed", ["a.e"]),
+        (("", "x = 0;"), 5, "changed", ["b.e"]),
+        (("x = 5;", "x = 6;"), 5, "changed", ["b.e"]),
+        (("x = x + 1;", "x = x + 1;"), 5, "changed", ["a.e", "b.e"]),
+        (("x = x + 1;", "x = x - 1;"), 5, "passed", []),
+        (("x = 0;", "return;"), 5, "dropped", []),
+        (("x = 5;", ""), 5, "passed", []),
+        (("x = 7; DROP;", ""), 5, "dropped", []),
+        (("x = 7; x = 1 / (x - 7);", "x = 3;"), 5, "changed", ["b.e"]),
+    ],
+)
+def test_a_change_is_by_the_events_that_made_the_bytes_others(
+    bodies: tuple[str, str], given: int, result: str, changed_by: list[str]
+) -> None:
+    """Not by one that happened later, assigned what was there, or faulted before it was written."""
+    texts = {
+        f"{name}.rv": f"{name}() {{" + on("/t", "e", body) + "}"
+        for name, body in zip("ab", bodies, strict=True)
+    }
+    monitors = MonitorSet.load(texts, definitions(), "pass")
+    monitors.start(0)
+    outcome = monitors.process("/t", bytearray(number(given)), 0)
+    assert (outcome.result, list(outcome.changed_by)) == (result, changed_by)
+
+
+DROPS = {
+    "the event itself": ("a() {" + on("/t", "e", "x = 9;") + "} b() {" + on("/t", "e", "return;") + "}", "b", None),
+    "a handler": ("a() {" + on("/t") + "} b() {" + on("/t") + "ere: e @match { DROP; } } c() {" + on("/t") + "}", "b", None),
+    "a handler, the next one goes on": ("a() {" + on("/t") + "ere: e @match { DROP; } ptltl: e @validation { } } b() {" + on("/t") + "}", "a", None),
+    "a fault": ("a() {" + on("/t") + "} b() {" + on("/t", "e", "x = 1 / (x - 5);") + "}", "b", "b"),
+    "a fault in a condition": ("a() {" + on("/t") + "} b() { event e(int x) /t std_msgs/Int32 '{data:x}' when (1 / (x - 5) > 0) { } }", "b", "b"),
+    "a fault in a handler": ("a() {" + on("/t") + "} b() { int n;" + on("/t") + "ere: e @match { n = 1 / n; } }", "b", "b"),
+    "first values": ("a() {" + on("/t") + "} b() { int n; init() { n = 1 / n; }" + on("/t") + "}", "b", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DROPS)
+def test_a_drop_is_by_the_monitor_that_dropped(name: str) -> None:
+    """By its event, a handler of its property, or its fault, whichever events happened before."""
+    text, by, faulty = DROPS[name]
+    outcome = load(text).process("/t", bytearray(number(5)), 0)
+    fatal = outcome.fatal.monitor if outcome.fatal is not None else None
+    assert (outcome.result, outcome.dropped_by, fatal) == ("dropped", by, faulty)
+    assert not outcome.events or outcome.events[-1] in ("a.e", "b.e")
+
+
+def test_a_fault_that_is_passed_over_has_dropped_nothing() -> None:
+    """With `on_fault: pass` the drop is of who dropped, not of who faulted before it."""
+    text = "a() {" + on("/t", "e", "x = 1 / (x - 5);") + "} b() {" + on("/t", "e", "return;") + "}"
+    monitors = MonitorSet.load({"x.rv": text}, definitions(), "pass")
+    monitors.start(0)
+    outcome = monitors.process("/t", bytearray(number(5)), 0)
+    assert [fault.monitor for fault in outcome.faults] == ["a"]
+    assert (outcome.result, outcome.dropped_by, outcome.fatal) == ("dropped", "b", None)
+
+
+def test_a_held_monitor_drops_what_others_let_pass() -> None:
+    """It is named although the events of another happened."""
+    monitors = load("a() {" + on("/t") + "} hold b() {" + on("/t") + "}")
+    monitors.start(0, restarted=True)
+    outcome = monitors.process("/t", bytearray(number(5)), 0)
+    assert (outcome.dropped_by, list(outcome.events)) == ("b", ["a.e"])
+
+
+def test_what_is_published_is_of_who_published_it() -> None:
+    """Not of the monitor whose event comes after."""
+    text = (
+        "a() { std_msgs::Int32 n;"
+        + on("/t", "e", "PUBLISH(/n, std_msgs/Int32, n);")
+        + "} b() {"
+        + on("/t")
+        + "}"
+    )
+    assert [one.monitor for one in load(text).process("/t", number(1), 0).published] == ["a"]
+
+
+def test_changes_are_by_whom_a_comparison_of_all_bytes_finds() -> None:
+    """Random monitors: the bytes before and after each event say who changed what, and whether anything is changed."""
+    most = 0
+    for seed in range(60):
+        try:
+            monitors = MonitorSet.load(
+                {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())},
+                random_definitions(),
+                ("drop", "pass")[seed % 2],
+            )
+        except SpecificationError:
+            continue
+        found: list[str] = []
+        for step in (step for monitor in monitors.monitors for step in monitor.steps):
+            step.function = _compared(step.name, step.function, found)
+        monitors.start(0)
+        messages = Messages(seed)
+        for traffic in (messages.traffic() for _ in range(20)):
+            for body in traffic.bodies():
+                found.clear()
+                outcome = monitors.process(traffic.topic, bytearray(body), 5)
+                changed = outcome.result != "dropped" and bytes(outcome.buffer) != body
+                assert (outcome.result == "changed") == changed
+                assert list(outcome.changed_by) == (found if changed else [])
+                most = max(most, len(outcome.changed_by))
+    assert most > 1
+
+
+def _compared(
+    name: str, function: Callable[[Message | None], bool], found: list[str]
+) -> Callable[[Message | None], bool]:
+    """The function of an event; its name is added to `found` when all bytes are not what they were."""
+
+    def compared(seen: Message | None) -> bool:
+        assert seen is not None
+        before = bytes(seen.buffer)
+        try:
+            return function(seen)
+        finally:
+            if bytes(seen.buffer) != before:
+                found.append(name)
+
+    return compared
 
 
 # Properties

@@ -20,6 +20,17 @@ def test_what_is_written_twice_can_be_as_it_was() -> None:
     assert bytes(message.buffer) == b"abcdef"
 
 
+def test_what_is_written_as_it_was_touches_nothing() -> None:
+    """`touched` is set by other bytes only, in place or of another length, until it is cleared."""
+    message = Message(bytearray(b"abcdef"), 0)
+    found = []
+    for start, end, new in ((1, 3, b"bc"), (1, 3, b"bx"), (0, 2, b"abc"), (0, 3, b"abc"), (0, 1, b"z")):
+        message.touched = False
+        message.splice([(start, end, new)])
+        found.append(message.touched)
+    assert found == [False, True, True, False, True]
+
+
 def test_a_received_buffer_that_cannot_be_written_is_left_alone() -> None:
     """Bytes and read-only views are copied before the first change."""
     received = b"abcdef"
