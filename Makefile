@@ -6,7 +6,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := appliance tests examples
+CHECKED := appliance tests examples benchmarks
 
 .PHONY: help setup demo check test test-system bench clean
 
@@ -23,7 +23,7 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/mypy
-	$(BIN)/mypy tests/conftest.py tests/support/*.py
+	$(BIN)/mypy tests benchmarks
 	$(BIN)/lint-imports
 	$(PYTEST) tests/unit -n 2 --quiet
 

@@ -41,7 +41,7 @@ class Running:
         policy = home / "policy.ini"
         policy.write_text(POLICY)
         rosrv = Path(sys.executable).with_name("rosrv")
-        command = [
+        command: list[str | Path] = [
             rosrv, "up", "--json", "--config", config, "--policy", policy, "--state", home / "state", "--listen",
             "127.0.0.1:0", "--rosmaster-port", "0", "--isolation", "none", "--api", "off",
         ]  # fmt: skip

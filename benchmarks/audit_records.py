@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from appliance.audit.folding import FoldSettings
@@ -229,7 +230,7 @@ def measure_search(directory: Path, count: int) -> None:
         "text that nothing matches": Filter(text="qqqqqq"),
         "text of two letters that nothing matches": Filter(text="qq"),
     }.items():
-        timed(f"search {count:,}: {name}", lambda wanted=wanted: search(path, wanted))
+        timed(f"search {count:,}: {name}", partial(search, path, wanted))
     start = time.perf_counter()
     result = verify(path)
     row(f"verify {count:,}", f"{time.perf_counter() - start:.1f} s, ok={result.ok}")

@@ -196,7 +196,15 @@ def main() -> None:
         rosmaster = subprocess.Popen(
             ["/usr/bin/rosmaster", "--core", "-p", str(port)], env=environment, stdout=subprocess.DEVNULL
         )
-        command = ["up", "--policy", policy, "--state", f"{folder}/state", "--listen", "127.0.0.1:0"]
+        command: list[str | Path] = [
+            "up",
+            "--policy",
+            policy,
+            "--state",
+            f"{folder}/state",
+            "--listen",
+            "127.0.0.1:0",
+        ]
         appliance = subprocess.Popen(
             [
                 Path(sys.executable).with_name("rosrv"),

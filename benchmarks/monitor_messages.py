@@ -10,6 +10,7 @@ import statistics
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
@@ -80,7 +81,7 @@ def main() -> None:
     rows.append(("reference, ten other monitors", lambda: many.process("/cmd", bytearray(COMMAND), 1)))
     for name, text in (("a string grows", GROWING), ("a copy of all", WHOLE)):
         loaded = monitors(text)
-        rows.append((name, lambda loaded=loaded: loaded.process("/cmd", COMMAND, 1)))
+        rows.append((name, partial(loaded.process, "/cmd", COMMAND, 1)))
     for name, action in rows:
         print(f"{name:32} {microseconds(action, MESSAGES):8.2f} µs")
     for name, messages, alike in (

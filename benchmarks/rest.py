@@ -20,6 +20,7 @@ import time
 import urllib.parse
 import xmlrpc.client
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -204,7 +205,7 @@ def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str,
         for _ in range(rounds):
             quiet += appliance.delays(seconds)
             loaded += beside(
-                lambda path=path: load(appliance.port, path, appliance.token, 16, seconds + 0.5),
+                partial(load, appliance.port, path, appliance.token, 16, seconds + 0.5),
                 lambda: appliance.delays(seconds),
             )
         rows.append(

@@ -4,11 +4,11 @@ import contextlib
 import json
 import subprocess
 import threading
-import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
 
 from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.rosmaster import master_at
 from tests.support.syslog import eventually
 
 LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
@@ -20,7 +20,7 @@ def busy(uri: str) -> Iterator[None]:
     ending = threading.Event()
 
     def work() -> None:
-        with xmlrpc.client.ServerProxy(uri) as master:
+        with master_at(uri) as master:
             number = 0
             while not ending.is_set():
                 number += 1
@@ -44,7 +44,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
     config.write_text(json.dumps({"audit": {"checkpoint_records": 20, "checkpoint_seconds": 1}}))
     file = tmp_path / "backup.tar.gz"
     with Appliance(options=("--config", str(config))) as old:
-        with xmlrpc.client.ServerProxy(old.master_uri) as master:
+        with master_at(old.master_uri) as master:
             assert master.setParam("/robot", "/arm", {"joints": [1.5, -2.0], "name": "left"})[0] == 1
         old.reload(LOADED)
         token = old.ready["token"]
@@ -65,7 +65,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
         before = json.loads(new.rosrv("audit", "verify", "--json").stdout)
         assert before["ok"], before
         new.start()
-        with xmlrpc.client.ServerProxy(new.master_uri) as master:
+        with master_at(new.master_uri) as master:
             assert master.getParam("/robot", "/arm")[2] == {"joints": [1.5, -2.0], "name": "left"}
             assert master.getParam("/robot", "/counter")[2] > 0
         assert new.status()["policy"]["revision"] == 2

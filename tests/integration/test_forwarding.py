@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import time
-import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from tests.support.appliance import Appliance
 from tests.support.forgery import write_anew
+from tests.support.rosmaster import master_at
 from tests.support.syslog import Message, StreamCollector, eventually
 
 
@@ -30,9 +30,14 @@ def forwarding(port: int, tmp_path: Path, **syslog: Any) -> Iterator[Appliance]:
 
 def work(appliance: Appliance, count: int) -> None:
     """Calls of a node: each is a record."""
-    with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+    with master_at(appliance.master_uri) as master:
         for number in range(count):
             assert master.setParam("/worker", f"/value{number}", number)[0] == 1
+
+
+def another_life(appliance: Appliance, role: str, before: list[int]) -> None:
+    """Return once the process was started again."""
+    eventually(lambda: appliance.pids(role) not in ([], before))
 
 
 def all_sequences(appliance: Appliance) -> set[int]:
@@ -97,7 +102,7 @@ def test_deaths(tmp_path: Path) -> None:
             work(appliance, 60)
             before = appliance.pids(role)
             os.kill(before[0], signal.SIGKILL)
-            eventually(lambda role=role, before=before: appliance.pids(role) not in ([], before))
+            another_life(appliance, role, before)
         work(appliance, 60)
         assert appliance.stop() == 0
         appliance.start()
@@ -114,7 +119,7 @@ def test_only_denials(tmp_path: Path) -> None:
         forwarding(collector.port, tmp_path, send="denials", facility=10) as appliance,
     ):
         work(appliance, 20)
-        with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/rogue\u202e]\n")[0] == 0
         (denial,) = collector.wait_for(lambda messages: [one for one in messages if one.event == "decision"])[
             :1
@@ -128,7 +133,7 @@ def test_only_denials(tmp_path: Path) -> None:
 def test_history_written_anew_by_root(tmp_path: Path) -> None:
     """Root rewrites the log with the real key: here all is right, and the other machine's file knows better."""
     with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
-        with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/thief")[0] == 0
         work(appliance, 20)
         (theft,) = appliance.audit("--caller", "/thief")

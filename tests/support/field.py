@@ -163,7 +163,7 @@ class Impostor:
     """A TCP server on a host that answers as `behave(connection, request)` says; counts who came."""
 
     def __init__(
-        self, host: Host, behave: Callable[[socket.socket, bytes], None], address: str | None = None
+        self, host: Host, behave: Callable[[socket.socket, bytes], object], address: str | None = None
     ) -> None:
         self.requests: list[bytes] = []
         self.peers: list[str] = []

@@ -8,7 +8,7 @@ import http.client
 import json
 import ssl
 import urllib.parse
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ class Rest:
         headers["Content-Type"] = "application/json"
         return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
 
-    def events(self, path: str, timeout: float = 30, **headers: str) -> Iterator[dict[str, str]]:
+    def events(self, path: str, timeout: float = 30, **headers: str) -> Generator[dict[str, str], None, None]:
         """Server-sent events, one dict of its fields each; the first, `{}`, says that the stream is open."""
         connection = self.connect(timeout)
         try:

@@ -52,12 +52,17 @@ class PlainMaster:
         self.stop()
 
 
+def master_at(uri: str) -> Any:
+    """The API of a master, for a `with` (the stubs of `xmlrpc.client` know no answers that are lists)."""
+    return xmlrpc.client.ServerProxy(uri, allow_none=True)
+
+
 def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
     """One XML-RPC call, made from that host: the answer as it came."""
     run = getattr(host, "run", None)
 
     def call() -> Any:
-        with xmlrpc.client.ServerProxy(uri, allow_none=True) as server:
+        with master_at(uri) as server:
             return getattr(server, method)(*parameters)
 
     return run(call) if run is not None else call()

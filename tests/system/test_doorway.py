@@ -57,7 +57,12 @@ def test_bytes_pass_both_ways(host: Host, echo: tuple[str, int]) -> None:
     """A megabyte goes in and comes back; the end of one direction is the end at the other side."""
     sent = bytes(range(256)) * 4096
     with Doorway(host, echo) as door, socket.create_connection(("127.0.0.1", door.port), LIMIT) as client:
-        writer = threading.Thread(target=lambda: (client.sendall(sent), client.shutdown(socket.SHUT_WR)))
+
+        def write() -> None:
+            client.sendall(sent)
+            client.shutdown(socket.SHUT_WR)
+
+        writer = threading.Thread(target=write)
         writer.start()
         assert receive_all(client) == sent
         writer.join(LIMIT)

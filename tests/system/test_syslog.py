@@ -5,7 +5,6 @@ import os
 import shutil
 import socket
 import sys
-import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -18,6 +17,7 @@ from tests.support.appliance import Appliance
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import Process
 from tests.support.requirements import need_root
+from tests.support.rosmaster import master_at
 from tests.support.syslog import eventually, parse
 
 KEEPER = "10.83.0.9"
@@ -112,7 +112,7 @@ def configure(folder: Path, tls: Certificates, to: str, backend: str = "auto") -
 
 def set_parameters(uri: str, count: int) -> None:
     """A node's calls, and one of somebody with a name that is meant for terminals."""
-    with xmlrpc.client.ServerProxy(uri) as master:
+    with master_at(uri) as master:
         for number in range(count):
             assert master.setParam("/worker", f"/value{number}", number)[0] == 1
         master.noSuchCall('/rogue"] \u202e')

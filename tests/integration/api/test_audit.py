@@ -2,7 +2,7 @@
 
 import json
 import xmlrpc.client
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any
 
 import pytest
@@ -159,7 +159,7 @@ def test_a_filter_that_makes_no_sense_is_told(rest: Rest, query: str) -> None:
 
 def test_followers_are_bounded(rest: Rest) -> None:
     """Beyond `api_limits.streams` a follower is told to come back; when one leaves there is room again."""
-    open_ones: list[Iterator[dict[str, str]]] = []
+    open_ones: list[Generator[dict[str, str], None, None]] = []
     with pytest.raises(AssertionError, match="too many clients"):
         while len(open_ones) <= 16:
             one = rest.events("/v1/audit/stream?event=nothing")
@@ -169,7 +169,7 @@ def test_followers_are_bounded(rest: Rest) -> None:
     assert refused.status == 503
     assert int(refused.headers["retry-after"]) > 0
     for one in open_ones:
-        one.close()  # type: ignore[attr-defined]  # a generator
+        one.close()
     for _ in range(100):
         try:
             next(rest.events("/v1/audit/stream?event=nothing"))

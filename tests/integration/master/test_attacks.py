@@ -9,6 +9,7 @@ import re
 import socket
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -763,7 +764,7 @@ def test_inner_face_and_own_listener_from_outside(field: Field) -> None:
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
     for port in hidden:
         with pytest.raises(OSError, match=r"timed out|refused|unreachable"):
-            field.attacker.run(lambda port=port: socket.create_connection(("10.77.0.2", port), 0.5))
+            field.attacker.run(partial(socket.create_connection, ("10.77.0.2", port), 0.5))
 
 
 # --- peers that lie ---

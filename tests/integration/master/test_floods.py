@@ -9,12 +9,14 @@ import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering, whole
 from tests.support.processes import LIMIT
+from tests.support.rosmaster import master_at
 
 POLICY = OPEN_POLICY
 HOST = "10.77.0.66"
@@ -22,7 +24,7 @@ SLOW = 2.0  # seconds for one call of the victim's in a flood, on a machine with
 GROWTH = 160 << 20  # bytes that control may grow by under attack: buffers within their limits
 
 
-def request(method: str, *parameters: object) -> bytes:
+def request(method: str, *parameters: Any) -> bytes:
     """A call as bytes."""
     body = xmlrpc.client.dumps(parameters, method).encode()
     return b"POST / HTTP/1.1\r\nHost: m\r\nContent-Length: %d\r\n\r\n" % len(body) + body
@@ -201,16 +203,16 @@ def test_values_for_a_node_that_never_answers(calm: Field) -> None:
 
 def test_registrations(calm: Field) -> None:
     """Nodes and topics of one host have a limit (the rogue is at it from here on); others still get ports and names."""
-    refused = []
+    refused: list[Any] = []
 
     def act(number: int, turn: int) -> None:
         name = f"/many_{number}_{turn}"
-        with xmlrpc.client.ServerProxy(calm.master) as server:
+        with master_at(calm.master) as server:
             answer = server.registerPublisher(
                 name, f"/t{name[1:]}", "std_msgs/String", f"http://{HOST}:{40000 + turn}/"
             )
         if answer[0] != 1:
-            refused.append(answer)  # type: ignore[arg-type]  # the stubs do not know lists
+            refused.append(answer)
 
     with Flood(calm, 4, act):
         deadline = time.monotonic() + LIMIT
@@ -224,7 +226,7 @@ def test_registrations(calm: Field) -> None:
 
 def test_registrations_of_one_node(calm: Field) -> None:
     """Topics of one node count as well."""
-    answer = [1]
+    answer: list[Any] = [1]
     with Impostor(calm.stranger, answering([1, "", 0])) as node:
         for number in range(60):
             parts = [

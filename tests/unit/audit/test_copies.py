@@ -22,10 +22,11 @@ from appliance.audit.retention import Retention
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
+from tests.unit.audit.conftest import MakeLog
 
 
 @pytest.fixture
-def log(make_log, path: Path) -> Path:
+def log(make_log: MakeLog, path: Path) -> Path:
     """A closed log of two hundred records with signed checkpoints."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(200):
@@ -95,7 +96,7 @@ def test_the_end_cut_off_by_root(log: Path, key: Ed25519PrivateKey, tmp_path: Pa
     assert [(one.first, one.last) for one in cut] == [(91, copies[1].sequence)]
 
 
-def test_another_log_in_its_place(log: Path, make_log, path: Path) -> None:
+def test_another_log_in_its_place(log: Path, make_log: MakeLog, path: Path) -> None:
     """A new log, however well signed, is not the one that the other machine's checkpoints are of."""
     copies = signed_checkpoints(log)
     for one in path.parent.glob("audit.db*"):
@@ -127,7 +128,7 @@ def test_all_signed_with_a_new_key(log: Path, tmp_path: Path) -> None:
     assert kinds(verify(log, public, tmp_path / "signer", copies)) == {Kind.WRONG_KEY}
 
 
-def test_records_that_retention_removed(make_log, path: Path) -> None:
+def test_records_that_retention_removed(make_log: MakeLog, path: Path) -> None:
     """Checkpoints of records that retention removed since are no contradiction."""
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):

@@ -22,6 +22,7 @@ from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
+from tests.unit.audit.conftest import MakeLog
 
 _LIMIT_SECONDS = 30
 
@@ -40,7 +41,7 @@ def await_state(log: AuditLog, *, failed: bool) -> None:
 
 
 @pytest.mark.parametrize("durability", ["strict", "batched"])
-def test_what_was_waited_for_is_on_disk(make_log, path, durability) -> None:
+def test_what_was_waited_for_is_on_disk(make_log: MakeLog, path: Path, durability: str) -> None:
     """After `wait_durable` a reader finds the records, in the order they were recorded."""
     log = make_log(durability=durability)
     sent = [decision(log, number) for number in range(500)]
@@ -52,7 +53,7 @@ def test_what_was_waited_for_is_on_disk(make_log, path, durability) -> None:
     assert log.lag.records == 0
 
 
-def test_batched_is_on_disk_soon_without_being_asked(make_log, path) -> None:
+def test_batched_is_on_disk_soon_without_being_asked(make_log: MakeLog, path: Path) -> None:
     """A record is on disk soon after it was recorded though nobody waits for it."""
     log = make_log()
     log.record(decision(log))
@@ -62,18 +63,23 @@ def test_batched_is_on_disk_soon_without_being_asked(make_log, path) -> None:
         tick.wait(0.01)
 
 
-def test_flushed_calls_back(make_log) -> None:
+def test_flushed_calls_back(make_log: MakeLog) -> None:
     """`flushed` calls its function with None once the records are on disk."""
     log = make_log()
     called: list[str | None] = []
     done = threading.Event()
     log.record(decision(log))
-    log.flushed(lambda reason: (called.append(reason), done.set()))
+
+    def heard(reason: str | None) -> None:
+        called.append(reason)
+        done.set()
+
+    log.flushed(heard)
     assert done.wait(_LIMIT_SECONDS)
     assert called == [None]
 
 
-def test_many_waiters_share_commits(make_log, path) -> None:
+def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
     """A hundred concurrent requests in strict mode are each answered after their own record is on disk."""
     log = make_log(durability="strict")
 
@@ -89,7 +95,7 @@ def test_many_waiters_share_commits(make_log, path) -> None:
     assert events(path)["decision"] == 100
 
 
-def test_log_goes_on_after_a_clean_stop(make_log, path) -> None:
+def test_log_goes_on_after_a_clean_stop(make_log: MakeLog, path: Path) -> None:
     """A log that is opened again continues its chain, and its ids, though the clock was set back."""
     first = make_log(clock=lambda: 2_000_000_000_000_000_000)
     first.record(decision(first))
@@ -104,7 +110,7 @@ def test_log_goes_on_after_a_clean_stop(make_log, path) -> None:
     assert events(path)["log begun"] == 1
 
 
-def test_killed_writer(path) -> None:
+def test_killed_writer(path: Path) -> None:
     """After SIGKILL in the middle of writing the chain goes on, and all that was confirmed is there."""
     script = (
         "import asyncio, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
@@ -139,7 +145,7 @@ def test_killed_writer(path) -> None:
     assert verify(path).ok
 
 
-def test_counted_denials_survive_a_kill(path) -> None:
+def test_counted_denials_survive_a_kill(path: Path) -> None:
     """Repetitions that were counted but not summarised when the process was killed are not forgotten."""
     script = (
         "import asyncio, os, signal, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
@@ -155,7 +161,7 @@ def test_counted_denials_survive_a_kill(path) -> None:
     assert entry.record.detail["recovered"] is True
 
 
-def test_flood_of_denials(make_log, path) -> None:
+def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
     """A hundred thousand identical denials leave a handful of records that count every one of them."""
     log = make_log(fold=FoldSettings(seconds=0.2), queue_limit=200_000)
     before = decision(log, decision="deny", resource="/evidence")
@@ -289,7 +295,7 @@ def test_another_kind_of_database_is_an_error(path: Path) -> None:
     log.close()
 
 
-def test_changed_end_stops_writing(make_log, path) -> None:
+def test_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
     """A log whose last records were changed while it was closed is not continued."""
     log = make_log()
     log.record(decision(log))
@@ -304,7 +310,7 @@ def test_changed_end_stops_writing(make_log, path) -> None:
     log.close()
 
 
-def test_removed_file_is_noticed(make_log, path) -> None:
+def test_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
     """A log file that is removed or replaced while it is written stops the log, and is told."""
     log = make_log()
     assert settle(log) is None
@@ -313,7 +319,7 @@ def test_removed_file_is_noticed(make_log, path) -> None:
     assert "removed or replaced" in (settle(log) or "")
 
 
-def test_second_writer_is_refused(make_log, path) -> None:
+def test_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
     """Two processes cannot write one log; the second says why and takes over when the first ends."""
     first = make_log()
     second = AuditLog(path)
@@ -339,7 +345,7 @@ def test_no_state_directory(tmp_path: Path) -> None:
     assert events(path)["decision"] == 1
 
 
-def test_missing_earlier_log_is_an_alarm(make_log, path) -> None:
+def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
     """If a signed log was here before and is gone, the first record of the new one says so."""
     log = make_log(checkpoint_every=1)
     log.record(decision(log))
@@ -354,7 +360,7 @@ def test_missing_earlier_log_is_an_alarm(make_log, path) -> None:
     assert begun.record.detail["earlier_log_missing"] is True
 
 
-def test_closed_log_answers(make_log) -> None:
+def test_closed_log_answers(make_log: MakeLog) -> None:
     """Whoever waits on a closed log is told so instead of waiting for ever."""
     log = make_log()
     log.close()
@@ -362,7 +368,7 @@ def test_closed_log_answers(make_log) -> None:
     assert "closed" in (settle(log) or "")
 
 
-def test_recovery_counts_denials_once(make_log, path) -> None:
+def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
     """Denials that were being counted when the log failed for a while are counted once, not twice."""
     log = make_log(fold=FoldSettings(seconds=3600))
     for _ in range(50):

@@ -6,6 +6,7 @@ import threading
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from appliance.audit.retention import Retention
 from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog
 
 _DAY = 86_400_000_000_000
 _LIMIT_SECONDS = 30
@@ -28,7 +30,7 @@ def await_removal(path: Path, through: int = 1) -> None:
         tick.wait(0.02)
 
 
-def make_old(make_log, path: Path) -> None:
+def make_old(make_log: MakeLog, path: Path) -> None:
     """A log of 2000 records that are a week old."""
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock))
@@ -40,7 +42,7 @@ def make_old(make_log, path: Path) -> None:
     log.close()
 
 
-def test_old_records_go_and_that_is_recorded(make_log, path) -> None:
+def test_old_records_go_and_that_is_recorded(make_log: MakeLog, path: Path) -> None:
     """Records past the limit are removed, the log says which, and verification proves the rest."""
     make_old(make_log, path)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
@@ -63,7 +65,7 @@ def test_old_records_go_and_that_is_recorded(make_log, path) -> None:
     assert result.removed == removed
 
 
-def test_nothing_young_goes(make_log, path) -> None:
+def test_nothing_young_goes(make_log: MakeLog, path: Path) -> None:
     """Records within the limits stay, all of them."""
     log = make_log(checkpoint_every=10, retention=Retention(days=1, size=1 << 30))
     for number in range(500):
@@ -74,7 +76,7 @@ def test_nothing_young_goes(make_log, path) -> None:
     assert search(path, Filter()).entries[-1].sequence
 
 
-def test_size(make_log, path) -> None:
+def test_size(make_log: MakeLog, path: Path) -> None:
     """A log that grows past its size loses its oldest records, and stays near the limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     for number in range(12_000):
@@ -94,7 +96,7 @@ def test_size(make_log, path) -> None:
     assert "larger than" in search(path, Filter(event="records removed")).entries[0].record.reason
 
 
-def test_unsigned_records_stay(make_log, path) -> None:
+def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     """What the signer has not signed yet is not removed, however old it is."""
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock), signer=lambda number, text: None)
@@ -109,7 +111,7 @@ def test_unsigned_records_stay(make_log, path) -> None:
     assert next(export(path, Filter())).sequence == 1
 
 
-def test_removal_by_hand_is_not_retention(make_log, path) -> None:
+def test_removal_by_hand_is_not_retention(make_log: MakeLog, path: Path) -> None:
     """Removing more than retention said it removed is found."""
     make_old(make_log, path)
     log = make_log(retention=Retention(days=1))
@@ -124,7 +126,7 @@ def test_removal_by_hand_is_not_retention(make_log, path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"days": 0}, {"days": -1}, {"size": 100}])
-def test_limits_that_make_no_sense(wrong: dict[str, float]) -> None:
+def test_limits_that_make_no_sense(wrong: dict[str, Any]) -> None:
     """Limits that would remove everything are refused."""
     with pytest.raises(ValueError, match="retention needs"):
         Retention(**wrong)

@@ -2,27 +2,30 @@
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from appliance.audit.database import LogUnreadableError
+from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import RuleReference, Severity
 from appliance.audit.search import Follower, export, search, show
 from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog
 
 _SECOND = 1_000_000_000
 _BEGIN = 1_700_000_000 * _SECOND
 
 
 @pytest.fixture
-def log(make_log):
+def log(make_log: MakeLog) -> AuditLog:
     """An open log: a hundred ordinary decisions a second apart, and some that differ."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(100):
         log.record(decision(log, number, time=_BEGIN + number * _SECOND))
     other = RuleReference("Clients", "/reset/**", "robot.ini", 30)
-    odd = [
+    odd: list[dict[str, Any]] = [
         {"decision": "deny", "host": "10.66.0.1", "caller_id": "/evil", "resource": "/arm/joint_1"},
         {"decision": "would deny", "resource": "/arm/joint_2", "rule": other, "category": "call"},
         {
@@ -39,7 +42,7 @@ def log(make_log):
     return log
 
 
-def sequences(path: Path, wanted: Filter, **arguments: object) -> list[int]:
+def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
     """Which records are found, by their sequences less two (the log's own first record is 1)."""
     return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
 
@@ -77,14 +80,14 @@ def sequences(path: Path, wanted: Filter, **arguments: object) -> list[int]:
     ],
     ids=str,
 )
-def test_filters(log, path: Path, wanted: Filter, expected: list[int]) -> None:
+def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int]) -> None:
     """Each filter finds exactly what it says, newest first, also combined, in a running and a closed log."""
     assert sequences(path, wanted) == expected
     log.close()
     assert sequences(path, wanted) == expected
 
 
-def test_text_is_found_at_once_and_after_indexing(log, path: Path) -> None:
+def test_text_is_found_at_once_and_after_indexing(log: AuditLog, path: Path) -> None:
     """A text is found as soon as its record is on disk, whether it is in the full-text index yet or not."""
     for number in range(600):
         log.record(decision(log, number, reason=f"needle {number}"))
@@ -97,7 +100,7 @@ def test_text_is_found_at_once_and_after_indexing(log, path: Path) -> None:
 
 @pytest.mark.parametrize("newest_first", [True, False])
 @pytest.mark.parametrize("wanted", [Filter(), Filter(resource="/cmd_*"), Filter(text="lets it")])
-def test_paging(log, path: Path, wanted: Filter, newest_first: bool) -> None:
+def test_paging(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -> None:
     """Pages in a row give every record once, in order, though records are added meanwhile."""
     everything = [entry.record.id for entry in search(path, wanted, limit=1000).entries]
     found: list[str] = []
@@ -114,14 +117,14 @@ def test_paging(log, path: Path, wanted: Filter, newest_first: bool) -> None:
     assert found == (everything if newest_first else everything[::-1])
 
 
-def test_export_is_everything_oldest_first(log, path: Path) -> None:
+def test_export_is_everything_oldest_first(log: AuditLog, path: Path) -> None:
     """The export has every record once, oldest first, whatever the size of its pages."""
     entries = list(export(path, Filter(), page=9))
     assert [entry.sequence for entry in entries] == list(range(1, len(entries) + 1))
     assert len(entries) >= 105
 
 
-def test_show_with_neighbours(log, path: Path) -> None:
+def test_show_with_neighbours(log: AuditLog, path: Path) -> None:
     """One record by its id or its sequence, with what the same host or caller did before and after."""
     entry = search(path, Filter(resource="/cmd_7", host="10.0.0.2")).entries[2]
     shown = show(path, entry.record.id, neighbours=2)
@@ -134,7 +137,7 @@ def test_show_with_neighbours(log, path: Path) -> None:
         assert show(path, unknown) is None
 
 
-def test_follow(log, path: Path) -> None:
+def test_follow(log: AuditLog, path: Path) -> None:
     """A follower gives what is recorded after it began, once, in order, and only what is asked for."""
     follower = Follower(path, Filter(decision=("deny",)))
     assert follower.poll() == []
@@ -157,7 +160,7 @@ def test_follow(log, path: Path) -> None:
         (Filter(text="y" * 300), "text: longer"),
     ],
 )
-def test_filters_that_cannot_be_used(log, path: Path, wanted: Filter, message: str) -> None:
+def test_filters_that_cannot_be_used(log: AuditLog, path: Path, wanted: Filter, message: str) -> None:
     """A filter past its limits is an error that says which part and why."""
     with pytest.raises(FilterError, match=message):
         search(path, wanted)
@@ -166,7 +169,7 @@ def test_filters_that_cannot_be_used(log, path: Path, wanted: Filter, message: s
 @pytest.mark.parametrize(
     "arguments", [{"limit": 0}, {"limit": 10_001}, {"cursor": "x"}, {"cursor": "-1"}, {"cursor": "9" * 30}]
 )
-def test_page_that_cannot_be_asked_for(log, path: Path, arguments: dict[str, object]) -> None:
+def test_page_that_cannot_be_asked_for(log: AuditLog, path: Path, arguments: dict[str, Any]) -> None:
     """A wrong limit or cursor is an error."""
     with pytest.raises(FilterError):
         search(path, Filter(), **arguments)
@@ -187,7 +190,7 @@ def test_damaged_log(path: Path) -> None:
         search(path, Filter())
 
 
-def test_reading_leaves_no_trace(log, path: Path) -> None:
+def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
     """Searching a stopped log does not change its file."""
     log.close()
     before = path.read_bytes()

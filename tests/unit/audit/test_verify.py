@@ -5,6 +5,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -14,6 +15,7 @@ from appliance.audit.database import COLUMNS, LogUnreadableError
 from appliance.audit.findings import Kind
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog
 
 # ruff: noqa: S608  the attacker's statements are put together from names of columns
 
@@ -22,7 +24,7 @@ _UNCOVERED = 5
 
 
 @pytest.fixture
-def log(make_log, path: Path) -> Path:
+def log(make_log: MakeLog, path: Path) -> Path:
     """A closed log of some hundred records with four signed checkpoints, and some records after the last."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(_RECORDS):
@@ -47,7 +49,7 @@ def attack(path: Path, *statements: str) -> None:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
-def found(path: Path, **arguments: object) -> list[tuple[Kind, int, int]]:
+def found(path: Path, **arguments: Any) -> list[tuple[Kind, int, int]]:
     """What verification finds."""
     result = verify(path, **arguments)
     assert result.ok == (not result.findings)
@@ -376,7 +378,7 @@ def test_altered_byte_by_byte(log: Path) -> None:
     assert found_out > 50
 
 
-def test_a_clock_that_was_set_back(make_log, path: Path) -> None:
+def test_a_clock_that_was_set_back(make_log: MakeLog, path: Path) -> None:
     """Records of a clock that jumped into the past are in the order they were made, and the log is whole."""
     now = [2_000_000_000_000_000_000]
     log = make_log(clock=lambda: now[0], checkpoint_every=10)

@@ -152,10 +152,16 @@ def test_diff_reads_the_audit_log(policy: Path, tmp_path: Path) -> None:
     new.write_text(POLICY.replace("/cmd = ocu", "/cmd = 10.0.0.6"))
     (tmp_path / "control").mkdir()
     log = AuditLog(tmp_path / "control" / "audit.db")
-    seen = {"host": "10.0.0.5", "caller_id": "/ocu", "category": "publish"}
     for number, resource in enumerate(["/cmd", "/cmd", "/other"]):
         record = Record(
-            id=f"r{number}", time=number, event="decision", decision="allow", resource=resource, **seen
+            id=f"r{number}",
+            time=number,
+            event="decision",
+            decision="allow",
+            host="10.0.0.5",
+            caller_id="/ocu",
+            category="publish",
+            resource=resource,
         )
         log.record(record)
     log.record(Record(id="r9", time=9, event="policy reloaded"))
@@ -172,8 +178,8 @@ def test_diff_reads_the_audit_log(policy: Path, tmp_path: Path) -> None:
 def test_policy_with_errors_is_refused_by_every_verb(policy: Path) -> None:
     """explain, test and diff print the errors with their places and end with status 1."""
     policy.write_text("[Nodes]\nx = *\n")
-    for arguments in (["explain", policy, "--host", "::1", "--call", "/a"], ["test", policy]):
-        result = rosrv(*arguments)
+    for verb, *arguments in (["explain", "--host", "::1", "--call", "/a"], ["test"]):
+        result = rosrv(verb, policy, *arguments)
         assert result.exit_code == 1
         assert ":2:1: error: " in result.stderr
 

@@ -16,6 +16,7 @@ from appliance.forwarding.forwarder import Chosen, Forwarder
 from appliance.forwarding.syslog import Formatter
 from tests.support.audit import decision, settle
 from tests.support.syslog import Message, parse
+from tests.unit.forwarding.conftest import MakeLog
 
 
 class Kept:
@@ -87,7 +88,7 @@ def everything(path: Path) -> list[int]:
     return found
 
 
-def test_the_whole_log_in_order(make_log, path: Path, kept: Kept) -> None:
+def test_the_whole_log_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """Every record is sent once and in order, also what was there before; then it waits for more."""
     log = make_log()
     record(log, 700)
@@ -100,7 +101,7 @@ def test_the_whole_log_in_order(make_log, path: Path, kept: Kept) -> None:
     assert one.progress.trouble == ""
 
 
-def test_a_receiver_that_is_away(make_log, path: Path, kept: Kept) -> None:
+def test_a_receiver_that_is_away(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """Nothing is passed over: after a failure the same batch is sent again, at growing distances."""
     log = make_log()
     record(log, 10)
@@ -117,7 +118,7 @@ def test_a_receiver_that_is_away(make_log, path: Path, kept: Kept) -> None:
     assert one.progress.trouble == ""
 
 
-def test_the_distance_is_bounded(make_log, path: Path, kept: Kept) -> None:
+def test_the_distance_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """However long the receiver is away, it is asked for again within half a minute."""
     record(make_log(), 1)
     kept.failing = 50
@@ -125,7 +126,7 @@ def test_the_distance_is_bounded(make_log, path: Path, kept: Kept) -> None:
     assert max(one.step() for _ in range(50)) == 30.0
 
 
-def test_over_a_restart(make_log, path: Path, kept: Kept) -> None:
+def test_over_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """A forwarder that is started again goes on where the one before ended."""
     log = make_log()
     record(log, 300)
@@ -138,7 +139,7 @@ def test_over_a_restart(make_log, path: Path, kept: Kept) -> None:
     assert kept.sequences() == everything(path)
 
 
-def test_a_forwarder_that_was_killed(make_log, path: Path, kept: Kept) -> None:
+def test_a_forwarder_that_was_killed(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """After a death in the middle of a batch the batch is sent again: nothing is missing, some is there twice."""
     log = make_log()
     record(log, 300)
@@ -153,7 +154,7 @@ def test_a_forwarder_that_was_killed(make_log, path: Path, kept: Kept) -> None:
     assert len(sequences) > len(set(sequences))
 
 
-def test_only_denials(make_log, path: Path, kept: Kept) -> None:
+def test_only_denials(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """With `denials`, what was refused, warnings and alarms are sent, and every checkpoint; nothing else."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
@@ -170,7 +171,9 @@ def test_only_denials(make_log, path: Path, kept: Kept) -> None:
     assert one.progress.behind == 0
 
 
-def test_checkpoints_at_the_receiver_are_proof(make_log, path: Path, kept: Kept, tmp_path: Path) -> None:
+def test_checkpoints_at_the_receiver_are_proof(
+    make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path
+) -> None:
     """The receiver's file is what `verify --checkpoints` takes: each checkpoint comes after the records it seals."""
     log = make_log(checkpoint_every=50)
     for _ in range(10):
@@ -193,7 +196,7 @@ def test_checkpoints_at_the_receiver_are_proof(make_log, path: Path, kept: Kept,
             seen = int(message.fields["sequence"])
 
 
-def test_what_retention_took_before(make_log, path: Path, kept: Kept) -> None:
+def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """Records that were removed before they could be sent are counted, not passed over in silence."""
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -216,7 +219,7 @@ def test_what_retention_took_before(make_log, path: Path, kept: Kept) -> None:
     assert one.progress.behind == 0
 
 
-def test_a_log_that_was_there_long_before(make_log, path: Path, kept: Kept) -> None:
+def test_a_log_that_was_there_long_before(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """What retention removed before forwarding was ever asked for is not missed."""
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -232,7 +235,7 @@ def test_a_log_that_was_there_long_before(make_log, path: Path, kept: Kept) -> N
     assert one.progress.missed == 0
 
 
-def test_another_log(make_log, path: Path, kept: Kept) -> None:
+def test_another_log(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """A new log in the place of the old one is forwarded from its beginning."""
     log = make_log()
     record(log, 20)
@@ -255,7 +258,7 @@ def test_no_log_yet(path: Path, kept: Kept) -> None:
     assert "no audit log yet" in one.progress.trouble
 
 
-def test_a_position_that_cannot_be_read(make_log, path: Path, kept: Kept) -> None:
+def test_a_position_that_cannot_be_read(make_log: MakeLog, path: Path, kept: Kept) -> None:
     """A damaged position stops the forwarding with the reason; nothing is sent twice or not at all in silence."""
     record(make_log(), 3)
     path.with_name("position.json").write_text("rubbish")

@@ -3,6 +3,7 @@
 import socket
 import ssl
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -101,7 +102,7 @@ def test_tls_with_the_wrong_receiver(certificates: Certificates, tmp_path: Path)
     other = make_certificates(tmp_path / "other")
     with StreamCollector(context=server_context(certificates)) as collector:
         for ca, name in ((other.ca, None), (certificates.ca, "evil.example")):
-            receiver = StreamReceiver(HOST, collector.port, lambda ca=ca: tls_context(ca, None, None), name)
+            receiver = StreamReceiver(HOST, collector.port, partial(tls_context, ca, None, None), name)
             with pytest.raises(ssl.SSLCertVerificationError):
                 receiver.send([message(1)])
             receiver.close()

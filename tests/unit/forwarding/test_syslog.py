@@ -18,7 +18,8 @@ _TIME = 1_700_000_000_123_456_789
 
 def entry(**fields: Any) -> Entry:
     """A record at place 7."""
-    return Entry(7, Record(**{"id": "0" * 20, "time": _TIME, "event": "decision"} | fields))
+    all_fields: dict[str, Any] = {"id": "0" * 20, "time": _TIME, "event": "decision"} | fields
+    return Entry(7, Record(**all_fields))
 
 
 def formatter(longest: int = 8192) -> Formatter:

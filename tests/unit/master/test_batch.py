@@ -105,6 +105,6 @@ def test_what_cannot_be_written_is_the_callers_error() -> None:
         raise EncodingError("no notation")
 
     server = Server()
-    server.call = call  # type: ignore[method-assign]  # a peer that cannot be written to
+    server.call = call  # type: ignore[method-assign, assignment]  # a peer that cannot be written to
     outcomes = run(server, ("hasParam", None), ("lookupNode", None), ("setParam", None))
     assert [type(one) for one in outcomes] == [EncodingError] * 3

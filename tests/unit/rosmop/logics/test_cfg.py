@@ -102,7 +102,7 @@ def test_random_grammars_on_short_traces() -> None:
             assert told(monitor, word)[-1] == expected(rules, word), (text, word)
 
 
-LONG = {
+LONG: dict[str, dict[str, list[tuple[str, ...]]]] = {
     "S -> a S b | epsilon": {"S": [("a", "S", "b"), ()]},
     "S -> S S | a S b | epsilon": {"S": [("S", "S"), ("a", "S", "b"), ()]},
     "S -> a S b S | c": {"S": [("a", "S", "b", "S"), ("c",)]},

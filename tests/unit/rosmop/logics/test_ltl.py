@@ -1,5 +1,6 @@
 """``ltl``: verdicts against the meaning of the formula on ultimately periodic traces."""
 
+from collections.abc import Callable
 from itertools import product
 
 import pytest
@@ -56,7 +57,7 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:
                 else:
                     truth[i] = values[1][i] and (values[0][i] or truth[after[i]])
         return truth
-    table = {
+    table: dict[str, Callable[..., bool]] = {
         "not": lambda x: not x,
         "and": lambda x, y: x and y,
         "or": lambda x, y: x or y,

@@ -54,9 +54,9 @@ def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  
     past = range(i + 1)
     match operator:
         case "event":
-            return trace[i][1] == rest[0]
+            return bool(trace[i][1] == rest[0])
         case "true" | "false":
-            return operator == "true"
+            return bool(operator == "true")
         case "not":
             return not at(0, i)
         case "and":

@@ -33,9 +33,9 @@ def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911,
     past = range(i + 1)
     match operator:
         case "event":
-            return trace[i] == operands[0]
+            return bool(trace[i] == operands[0])
         case "true" | "false":
-            return operator == "true"
+            return bool(operator == "true")
         case "not":
             return not at(0, i)
         case "and":

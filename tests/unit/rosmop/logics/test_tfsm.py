@@ -37,7 +37,8 @@ class Ticking:
 
     def play(self, trace: list[tuple[int, str]], start: int, end: int) -> list[tuple[int, tuple[str, ...]]]:
         """What is told when, of the instants from ``start`` to before ``end``."""
-        state, entered, record = self.states[0], start, []
+        state, entered = self.states[0], start
+        record: list[tuple[int, tuple[str, ...]]] = []
         for instant in range(start, end):
             for time, event in trace:
                 if time == instant:
