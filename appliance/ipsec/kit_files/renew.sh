@@ -18,8 +18,9 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 umask 077
 
-if ask --fail -o "$work/crl.pem" "$rest/v1/revocations" && openssl crl -in "$work/crl.pem" -noout \
-    -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>/dev/null; then
+# What openssl finds out about the signature of a list it says, and does not tell by its exit status.
+if ask --fail -o "$work/crl.pem" "$rest/v1/revocations" && LC_ALL=C openssl crl -in "$work/crl.pem" -noout \
+    -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>&1 | grep -qx "verify OK"; then
     install -D -m 0644 "$work/crl.pem" "$swanctl/x509crl/rosrv-crl.pem"
 fi
 
@@ -55,6 +56,8 @@ status=$(call -o "$work/answer" -w '%{http_code}' -H 'Content-Type: application/
 [ "$status" = 200 ] || die "the appliance refused ($status): $(cat "$work/answer")"
 printf '%b' "$(field certificate "$work/answer")" > "$work/new.pem"
 openssl verify -CAfile "$swanctl/x509ca/rosrv-ca.pem" "$work/new.pem" >/dev/null || die "what the appliance answered is not a certificate of its authority"
+[ "$(openssl x509 -in "$work/new.pem" -noout -pubkey)" = "$(openssl pkey -in "$work/new.key" -pubout)" ] \
+    || die "what the appliance answered is a certificate for another key"
 
 install -m 0600 "$swanctl/private/rosrv.key" "$swanctl/private/rosrv.key.unconfirmed"
 install -m 0600 "$work/new.key" "$swanctl/private/rosrv.key"
