@@ -237,13 +237,15 @@ class InNamespace(Contained):
 
     kind = "netns"
 
-    def __init__(self, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> None:
+    def __init__(
+        self, ports: Ports, backend: Literal["auto", "iptables", "nft"], isolation: Isolation | None = None
+    ) -> None:
         super().__init__(ports, backend)
         nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
         forwarded = [PortRange.one(ports.master), nodes]
         if ports.api is not None:
             forwarded.append(PortRange.one(ports.api))
-        self._isolation = Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
+        self._isolation = isolation or Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
         self._namespace = self._isolation.namespace
 
     @contextlib.contextmanager
@@ -288,8 +290,14 @@ class InNamespace(Contained):
         return self._isolation.host_address_for(host)
 
     def report(self) -> dict[str, Any]:
-        """As in a container, and the rules on the host."""
-        return super().report() | {"forwarding": [asdict(rule) for rule in self._isolation.rules()]}
+        """As in a container, and the rules on the host; those that are gone are put back, too."""
+        rules = self._isolation.rules()
+        gone = [rule.purpose for rule in rules if not rule.in_force]
+        if gone:
+            log.critical("rules on the host were taken away and are put back", rules=gone)
+            self._isolation.put_rules_back()
+            rules = self._isolation.rules()
+        return super().report() | {"forwarding": [asdict(rule) for rule in rules]}
 
 
 def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:

@@ -1,12 +1,16 @@
 """Tests of `appliance.supervisor.enclosure` on a host of the lab: the real kernel, the real firewall."""
 
+import os
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from appliance.network.firewall.rules import PortRange
+from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.lab import Host, Lab
-from appliance.supervisor.enclosure import Contained, Ports
+from appliance.supervisor.enclosure import Contained, InNamespace, Ports
 from tests.support.requirements import need_program, need_root
 
 NODES = range(19001, 19101)
@@ -81,6 +85,23 @@ def test_rules_that_are_taken_away_come_back(host: Host, enclosure: Contained, h
     report = enclosure.report()
     assert all(rule["in_force"] for rule in report["rules"])
     assert not reachable(host, hidden)
+
+
+def test_rules_on_the_host_come_back(host: Host, tmp_path: Path) -> None:
+    """A bare host's firewall is loaded anew, the appliance's way in with it: the next look puts that back."""
+    forwarded = IsolationSettings(
+        ports=(PortRange.one(11311),), name=f"renc{os.getpid()}", directory=tmp_path
+    )
+    ports = Ports(master=11311, rosmaster=11411, nodes=NODES)
+    enclosure = InNamespace(ports, "auto", Isolation(host.namespace, forwarded))
+    enclosure.build()
+    try:
+        assert host.popen(["nft", "flush", "ruleset"]).wait() == 0
+        report = enclosure.report()
+        assert report["forwarding"]
+        assert all(rule["in_force"] for rule in report["forwarding"] + report["rules"])
+    finally:
+        enclosure.remove()
 
 
 def test_what_listens_on_more_than_loopback_is_not_hidden(host: Host, enclosure: Contained) -> None:
