@@ -85,10 +85,6 @@ class Engine:
         arguments = ("--network", "host", "--build-arg", f"BASE={BASE}", "--target", target, "--tag", tag)
         self.docker("build", *arguments, str(context), timeout=BUILD_SECONDS)
 
-    def has_image(self, name: str) -> bool:
-        """Whether there is an image of this name."""
-        return self.docker("image", "inspect", name, check=False).returncode == 0
-
     def clear(self) -> None:
         """Remove every container, network and volume that an earlier run may have left; images stay."""
         left = self.docker("ps", "--all", "--quiet").stdout.split()

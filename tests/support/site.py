@@ -12,15 +12,12 @@ from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.rosmaster import PlainMaster
 
 
-class Site:
-    """A master of one mode on 10.77.0.2, and hosts for nodes: `robot` (10.77.0.10), `ocu` (10.77.0.20)."""
+class MasterSite:
+    """A place with a master of one mode, `plain` or `appliance`, for the length of a `with`."""
 
-    def __init__(self, lab: Lab, mode: str, home: Path, policy: str = OPEN_POLICY) -> None:
+    def __init__(self, mode: str, master: PlainMaster | Appliance) -> None:
         self.mode = mode
-        self.robot = lab.host("robot", "10.77.0.10/24")
-        self.ocu = lab.host("ocu", "10.77.0.20/24")
-        middle = lab.host("master", "10.77.0.2/24")
-        self.master = PlainMaster(home, middle) if mode == "plain" else Appliance(middle, policy=policy)
+        self.master = master
 
     @property
     def master_uri(self) -> str:
@@ -37,3 +34,15 @@ class Site:
 
     def __exit__(self, *exc: object) -> None:
         self.master.__exit__(*exc)
+
+
+class Site(MasterSite):
+    """A master of one mode on 10.77.0.2, and hosts for nodes: `robot` (10.77.0.10), `ocu` (10.77.0.20)."""
+
+    def __init__(self, lab: Lab, mode: str, home: Path, policy: str = OPEN_POLICY) -> None:
+        self.robot = lab.host("robot", "10.77.0.10/24")
+        self.ocu = lab.host("ocu", "10.77.0.20/24")
+        middle = lab.host("master", "10.77.0.2/24")
+        super().__init__(
+            mode, PlainMaster(home, middle) if mode == "plain" else Appliance(middle, policy=policy)
+        )

@@ -13,31 +13,19 @@ from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster, await_node
+from tests.support.site import MasterSite
 
 
-class LocalSite:
+class LocalSite(MasterSite):
     """A master of one mode on 127.0.0.1."""
 
     def __init__(self, mode: str, home: Path) -> None:
-        self.mode = mode
-        self.master = PlainMaster(home) if mode == "plain" else Appliance(policy=OPEN_POLICY)
-
-    @property
-    def master_uri(self) -> str:
-        """What ROS_MASTER_URI says."""
-        return self.master.master_uri
-
-    def story(self) -> str:
-        """What the master said, for the message of a failure."""
-        return self.master.story()
+        super().__init__(mode, PlainMaster(home) if mode == "plain" else Appliance(policy=OPEN_POLICY))
 
     def __enter__(self) -> Self:
-        self.master.__enter__()
+        super().__enter__()
         await_node(self.master_uri, self.master.host, "/rosout")
         return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.master.__exit__(*exc)
 
 
 def need_ros() -> None:

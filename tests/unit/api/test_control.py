@@ -12,6 +12,7 @@ from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, StatusWanted
 from appliance.channel.channel import Channel
 from appliance.channel.messages import RestCalled, TokenKept
+from tests.support.heard import Heard
 
 
 class Control:
@@ -21,22 +22,13 @@ class Control:
         here, there = socket.socketpair()
         api, self.channel = Channel(here, messages.ApiLink), Channel(there, messages.ApiLink)
         ends += [api, self.channel]
-        self.heard: list[Any] = []
-        self._changed = asyncio.Event()
         link.attach(api)
-        self.channel.attach(asyncio.get_running_loop(), self._received, lambda: None)
-
-    def _received(self, message: Any, _descriptors: tuple[int, ...]) -> None:
-        self.heard.append(message)
-        self._changed.set()
+        self._ear = Heard(self.channel)
+        self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
         """What was heard, once it is so much."""
-        async with asyncio.timeout(20):
-            while len(self.heard) < count:
-                self._changed.clear()
-                await self._changed.wait()
-        return self.heard
+        return await self._ear.until(count)
 
 
 def run(play: Callable[[ControlLink, Callable[[], Control], list[TokenKept]], Awaitable[None]]) -> None:

@@ -12,6 +12,7 @@ from appliance.channel.admin import AdminAnswer, AnyRequest, HostAdd, PolicyLoad
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import TokenKept
 from appliance.master.rest import RestLink
+from tests.support.heard import Heard
 
 TOKEN = TokenKept("0123456789ab", "alice", "viewer", b"s", b"h", 1e12)
 ADMIN = TokenKept("0123456789ac", "w", "admin", b"s", b"h", 1e12)
@@ -58,23 +59,14 @@ class Api:
         self.channel = Channel(there, messages.ApiLink)
         control = Channel(here, messages.ApiLink)
         world.ends += [self.channel, control]
-        self.heard: list[Any] = []
         self.closed = asyncio.Event()
-        self._changed = asyncio.Event()
         link.attach(control)
-        self.channel.attach(asyncio.get_running_loop(), self._received, self.closed.set)
-
-    def _received(self, message: Any, _descriptors: tuple[int, ...]) -> None:
-        self.heard.append(message)
-        self._changed.set()
+        self._ear = Heard(self.channel, self.closed.set)
+        self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
         """What was heard, once it is so much."""
-        async with asyncio.timeout(20):
-            while len(self.heard) < count:
-                self._changed.clear()
-                await self._changed.wait()
-        return self.heard
+        return await self._ear.until(count)
 
 
 def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:

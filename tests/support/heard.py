@@ -1,0 +1,28 @@
+"""One end of a channel in a test: keeps what it hears, and waits for so much of it."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from appliance.channel.channel import Channel
+
+
+class Heard:
+    """What a channel heard, in order; attached to the running loop."""
+
+    def __init__(self, channel: Channel, closed: Callable[[], None] = lambda: None) -> None:
+        self.messages: list[Any] = []
+        self._changed = asyncio.Event()
+        channel.attach(asyncio.get_running_loop(), self._received, closed)
+
+    def _received(self, message: Any, _descriptors: tuple[int, ...]) -> None:
+        self.messages.append(message)
+        self._changed.set()
+
+    async def until(self, count: int) -> list[Any]:
+        """The messages, once there are so many."""
+        async with asyncio.timeout(20):
+            while len(self.messages) < count:
+                self._changed.clear()
+                await self._changed.wait()
+        return self.messages
