@@ -3,7 +3,8 @@
 Invariants:
 
 1. Enrolment takes a one-time token and nothing else for who asks; a host that brings wrong ones has to wait, and
-   all hosts together may bring only so many a minute.
+   all hosts together may bring only so many a minute. Whoever brought no wrong one is not made to wait for those who
+   did: a stranger with many addresses cannot keep a host with a good token out.
 2. Renewal is only for a host in its tunnel: control holds the peer's address against the virtual address of the
    name, which the firewall lets come through IPsec alone, and the signer checks the signature of its present key.
 3. Signing requests are not parsed here.
@@ -127,13 +128,15 @@ class _Patience:
     def require(self, peer: str) -> None:
         """Raises `ProblemError` (429)."""
         now = time.monotonic()
-        seconds = max(self._one.wait(peer, now), self._all.wait(_ALL, now))
+        seconds = self._one.wait(peer, now)
+        if self._one.touched(peer, now):
+            seconds = max(seconds, self._all.wait(_ALL, now))
         if seconds:
             raise ProblemError(
                 429,
                 "too-many-failures",
                 "too many wrong enrolment tokens were brought",
-                headers={"Retry-After": str(int(seconds) + 1)},
+                retry_after=int(seconds) + 1,
             )
 
     def failed(self, peer: str) -> None:

@@ -49,6 +49,10 @@ class Buckets:
         left = self._left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 
+    def touched(self, host: str, now: float) -> bool:
+        """Whether the peer has taken some that have not come back yet."""
+        return self._left(host, now) < self._burst
+
     def _left(self, host: str, now: float) -> float:
         left, then = self._buckets.get(peer_key(host), (self._burst, now))
         return min(self._burst, left + max(0.0, now - then) * self._per_second)
