@@ -1,0 +1,64 @@
+"""What each process's user may read and write of the state directory, tried as that user."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.supervisor.users import account_of
+from tests.support.appliance import Appliance
+from tests.support.requirements import need_root
+
+LOG = {"control/audit.db", "control/audit.db-wal", "control/audit.db-shm"}
+NO_SECRET = {"run/config.json", "control/audit.pub"}
+READS = {  # besides what is its own
+    "api": LOG,
+    "syslog": LOG,
+    "relay": set(),
+    "rosmaster": set(),
+    "signer": set(),
+    "ipsec": set(),
+    "control": set(),
+    "nobody": set(),
+}
+USERS = {"control": "rosrv", "rosmaster": "rosmaster"}
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """An appliance that was started by root, and has written everything that it writes at a start."""
+    need_root()
+    with Appliance(options=("--api", "127.0.0.1:0")) as running:
+        assert running.rest().get("/v1/audit").status == 200
+        yield running
+
+
+@pytest.mark.parametrize("role", READS)
+def test_a_process_reads_its_own_and_little_else(appliance: Appliance, role: str) -> None:
+    """A process that fell to a stranger finds no key and no token of another, and writes its own only."""
+    user, group = 65534, 65534
+    if role != "nobody":
+        name = USERS.get(role, f"rosrv-{role}")
+        account = account_of(name, "rosrv-api" if role == "syslog" else None)
+        user, group = account.uid, account.gid
+
+    def found(flag: str) -> set[str]:
+        """All files that `test` says this user may read, or write; those of the role's own part are left out."""
+        files = [path for path in appliance.state.rglob("*") if path.is_file()]
+        program = 'for one; do [ "$FLAG" "$one" ] && echo "$one"; done; true'
+        command = ["/bin/sh", "-c", program.replace("$FLAG", flag), "sh", *map(str, files)]
+        done = subprocess.run(
+            command, user=user, group=group, extra_groups=[], capture_output=True, text=True, check=True
+        )
+        names = {str(Path(line).relative_to(appliance.state)) for line in done.stdout.splitlines()}
+        return {name for name in names if not name.startswith(f"{role}/")}
+
+    assert found("-w") == set()
+    assert found("-r") - NO_SECRET == READS[role]
+
+
+def test_there_is_something_to_find(appliance: Appliance) -> None:
+    """The keys and tables that must not be found are there, so that not finding them says something."""
+    for name in ("signer/ca.key", "signer/audit.key", "api/key.pem", "control/state.db", *LOG):
+        assert (appliance.state / name).is_file(), name
