@@ -109,5 +109,5 @@ def _require_patience(failures: Buckets, host: str) -> None:
             429,
             "too-many-failures",
             "too many requests of this host came without a good token",
-            headers={"Retry-After": str(int(seconds) + 1)},
+            retry_after=int(seconds) + 1,
         )

@@ -96,7 +96,7 @@ async def _of_problem(request: Request, error: Exception) -> Response:
 
 
 async def _away(request: Request, error: Exception) -> Response:
-    return _answer(request, ProblemError(503, "not-available", str(error), headers={"Retry-After": "1"}))
+    return _answer(request, ProblemError(503, "not-available", str(error), retry_after=1))
 
 
 async def _defect(request: Request, error: Exception) -> Response:

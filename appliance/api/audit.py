@@ -195,9 +195,7 @@ class Desk:
             async with asyncio.timeout(_PATIENCE_SECONDS):
                 await turns.acquire()
         except TimeoutError:
-            raise ProblemError(
-                503, "busy", f"too many {what} at once: try again", headers={"Retry-After": "5"}
-            ) from None
+            raise ProblemError(503, "busy", f"too many {what} at once: try again", retry_after=5) from None
         try:
             yield
         finally:
@@ -237,9 +235,7 @@ def routes(services: Services) -> APIRouter:
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(Follower, desk.path, wanted, start)
         if desk.streams.locked():
-            raise ProblemError(
-                503, "busy", "too many clients follow the audit log", headers={"Retry-After": "10"}
-            )
+            raise ProblemError(503, "busy", "too many clients follow the audit log", retry_after=10)
         return EventSourceResponse(_follow(services, desk, follower, bearer), ping=_PING_SECONDS)
 
     @router.get("/verify", operation_id="verify_audit", response_model=Verified)
@@ -268,7 +264,7 @@ def routes(services: Services) -> APIRouter:
         """All records that match, oldest first, one JSON object a line."""
         entries = await desk.read(lambda: _begun(export(desk.path, wanted)))
         if desk.exports.locked():
-            raise ProblemError(503, "busy", "too many exports at once", headers={"Retry-After": "10"})
+            raise ProblemError(503, "busy", "too many exports at once", retry_after=10)
         return StreamingResponse(_lines(entries, desk.exports), media_type="application/x-ndjson")
 
     @router.get("/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN)

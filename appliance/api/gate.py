@@ -106,7 +106,7 @@ class Gate:
                 429,
                 "too-many-requests",
                 "too many requests of this host",
-                headers={"Retry-After": str(int(wait) + 1)},
+                retry_after=int(wait) + 1,
             )
         headers = Headers(scope=scope)
         self._check_host(headers)

@@ -86,9 +86,7 @@ def routes(services: Services) -> APIRouter:
     async def ready() -> Health:
         """Whether the appliance is in service: 503 while it is not; no token needed."""
         if not services.control.connected:
-            raise ProblemError(
-                503, "not-available", "RVMaster is being restarted", headers={"Retry-After": "1"}
-            )
+            raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
         return Health(status="ready")
 
     unready: dict[int | str, dict[str, Any]] = {503: {"description": "Not in service."}}

@@ -72,7 +72,7 @@ def routes(services: Services, history: History) -> APIRouter:
         Ends when the token does.
         """
         if streams.locked():
-            raise ProblemError(503, "busy", "too many clients follow already", headers={"Retry-After": "10"})
+            raise ProblemError(503, "busy", "too many clients follow already", retry_after=10)
         return EventSourceResponse(_follow(services, history, streams, bearer, graph), ping=_PING_SECONDS)
 
     return router

@@ -47,7 +47,7 @@ class Problem(BaseModel):
 
 
 class ProblemError(Exception):
-    """Answers the request with a problem. `kind` is the end of its type."""
+    """Answers the request with a problem. `kind` is the end of its type, `retry_after` seconds."""
 
     def __init__(
         self,
@@ -56,6 +56,7 @@ class ProblemError(Exception):
         detail: str,
         *,
         headers: Mapping[str, str] | None = None,
+        retry_after: int | None = None,
         findings: list[Finding] | None = None,
         errors: list[BadInput] | None = None,
         line: int | None = None,
@@ -66,6 +67,8 @@ class ProblemError(Exception):
         self.kind = kind
         self.detail = detail
         self.headers = dict(headers or {})
+        if retry_after is not None:
+            self.headers["Retry-After"] = str(retry_after)
         self.findings = findings
         self.errors = errors
         self.line = findings[0].line if findings else line
