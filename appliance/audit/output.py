@@ -63,6 +63,11 @@ def as_json(entry: Entry) -> str:
     return json.dumps(as_object(entry), separators=(",", ":"))
 
 
+def rule_text(rule: RuleReference | None) -> str | None:
+    """A rule and where it stands, as one word of a line; None for none."""
+    return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
+
+
 def printable(text: str) -> str:
     """Text that no terminal acts on: what is not printable is written as an escape, a backslash as two."""
     if text.isprintable() and "\\" not in text:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.audit.findings import Elsewhere, Verification
-from appliance.audit.output import Entry, printable, rfc3339
+from appliance.audit.output import Entry, printable, rfc3339, rule_text
 from appliance.audit.record import Record, Severity
 from appliance.audit.search import Shown
 
@@ -61,7 +61,7 @@ def print_shown(shown: Shown) -> None:
         "caller_id": record.caller_id,
         "category": record.category,
         "resource": record.resource,
-        "rule": _rule(record),
+        "rule": rule_text(record.rule),
         "revision": None if record.revision is None else str(record.revision),
         "reason": record.reason,
         "duration": None if record.duration_us is None else f"{record.duration_us} us",
@@ -142,11 +142,6 @@ def _why(record: Record) -> str:
     """The reason; the rule unless the reason names its place; how often, where one record stands for many."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
-    why = record.reason if named else f"{record.reason} ({_rule(record)})"
+    why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"
     count = record.detail.get("count") if record.event == "denials folded" else None
     return printable(f"{count} more: {why}" if count else why)
-
-
-def _rule(record: Record) -> str | None:
-    rule = record.rule
-    return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"

@@ -14,8 +14,8 @@ import socket
 from datetime import UTC, datetime
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.output import Entry, printable
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.output import Entry, printable, rule_text
+from appliance.audit.record import Record, Severity
 
 ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
 LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1
@@ -82,13 +82,9 @@ def _parameters(entry: Entry) -> dict[str, str | None]:
         "caller_id": record.caller_id,
         "category": record.category,
         "resource": record.resource,
-        "rule": _rule(record.rule),
+        "rule": rule_text(record.rule),
         "revision": None if record.revision is None else str(record.revision),
     }
-
-
-def _rule(rule: RuleReference | None) -> str | None:
-    return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
 
 
 def _message(head: str, element: str, fields: dict[str, str], text: str) -> bytes:
