@@ -9,7 +9,7 @@ import json
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-from appliance.audit.record import SCHEMA_VERSION, Record
+from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference
 
 _SECOND = 1_000_000_000
 
