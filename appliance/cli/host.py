@@ -7,13 +7,12 @@ import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.cli.host_kit import KitWriter, new_file, usage_error, wishes_of, write_script
-from appliance.cli.output import moment, say, say_json
+from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import seconds_of
 
 app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
 
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _Name = Annotated[str, typer.Argument(help="The host's name: `host:NAME` in the policy", show_default=False)]
 _Endpoint = Annotated[
     str,
@@ -50,7 +49,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
 
@@ -86,7 +85,7 @@ def kit(  # noqa: PLR0917  as above
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
 
@@ -108,7 +107,7 @@ def kit(  # noqa: PLR0917  as above
 def list_hosts(
     running: Appliance,
     group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """List the hosts that are enrolled, awaited or declared, with their tunnels; and machines in clear text.
 
@@ -133,7 +132,7 @@ def list_hosts(
 
 @app.command()
 @speaks
-def reload(running: Appliance, as_json: _Json = False) -> None:
+def reload(running: Appliance, as_json: Json = False) -> None:
     """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
 
     Example: rosrv host reload
@@ -152,7 +151,7 @@ def reload(running: Appliance, as_json: _Json = False) -> None:
 
 @app.command()
 @speaks
-def revoke(running: Appliance, name: _Name, as_json: _Json = False) -> None:
+def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
     """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.
 
     Example: rosrv host revoke ocu-1

@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Reader
 from appliance.cli.monitor_bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor_input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor_output import lines, record, say_finding
-from appliance.cli.output import counted, printable, say, say_json
+from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
@@ -35,14 +35,13 @@ _Folders = Annotated[
     list[Path] | None,
     typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
 ]
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 @app.command()
 def check(
     files: _Files,
     *,
-    as_json: _Json = False,
+    as_json: Json = False,
     msg: _Folders = None,
     dot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz")] = None,
     svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture")] = None,
@@ -73,7 +72,7 @@ def run(
     files: _Files,
     *,
     bag: Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)],
-    as_json: _Json = False,
+    as_json: Json = False,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write what subscribers would have received")
     ] = None,

@@ -16,17 +16,16 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
-from appliance.cli.output import counted, say, say_json
+from appliance.cli.output import Json, counted, say, say_json
 from appliance.cli.running import Appliance, speaks
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 _Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
 
 
 @speaks
-def list_monitors(appliance: Appliance, as_json: _Json = False) -> None:
+def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
     """Show every monitor: enabled or not, what it listens to, what it did.
 
     Example: rosrv monitor list --json
@@ -56,7 +55,7 @@ def list_monitors(appliance: Appliance, as_json: _Json = False) -> None:
 
 
 @speaks
-def enable(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
+def enable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
     """Let the events of these monitors happen again.
 
     Example: rosrv monitor enable safeTrigger
@@ -65,7 +64,7 @@ def enable(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
 
 
 @speaks
-def disable(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
+def disable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
     """Let messages pass these monitors untouched; their variables stay.
 
     Example: rosrv monitor disable safeTrigger
@@ -82,7 +81,7 @@ def load(
         typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
     ] = None,
     note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Load specifications while the robot runs; a file of the same name is replaced.
 
@@ -105,7 +104,7 @@ def load(
 
 
 @speaks
-def remove(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
+def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
     """Remove specifications, by the names of their monitors or files.
 
     Example: rosrv monitor remove safeTrigger
@@ -114,7 +113,7 @@ def remove(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
 
 
 @speaks
-def reload(appliance: Appliance, as_json: _Json = False) -> None:
+def reload(appliance: Appliance, as_json: Json = False) -> None:
     """Take what the folder of specifications has now, in the place of what is in force.
 
     Example: rosrv monitor reload
@@ -123,7 +122,7 @@ def reload(appliance: Appliance, as_json: _Json = False) -> None:
 
 
 @speaks
-def resume(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
+def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
     """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
 
     Example: rosrv monitor resume safeTrigger
@@ -136,7 +135,7 @@ def resume(appliance: Appliance, names: _Names, as_json: _Json = False) -> None:
 
 
 @speaks
-def rv_state(appliance: Appliance, as_json: _Json = False) -> None:
+def rv_state(appliance: Appliance, as_json: Json = False) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
     body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     real, port, rows = body["rv_state"]

@@ -8,10 +8,13 @@ import datetime
 import json
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.console import Console
 from rich.text import Text
+
+Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 def printable(text: str) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from appliance.cli.output import counted, printable, say, say_json
+from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.policy_input import (
     Enrolled,
     Robot,
@@ -49,11 +49,10 @@ for _verb in (reload, rollback, confirm, revisions):
     app.command()(_verb)
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 @app.command()
-def check(file: _File, robot: Robot = None, enrolled: Enrolled = None, as_json: _Json = False) -> None:
+def check(file: _File, robot: Robot = None, enrolled: Enrolled = None, as_json: Json = False) -> None:
     """Report every error and warning with its place; exit status 1 if there is an error.
 
     Example: rosrv policy check policies/landshark.ini
@@ -91,7 +90,7 @@ def explain_request(
     use_node: Annotated[str | None, typer.Option(metavar="NODE", help="use a node name")] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Say whether a request is allowed, by which rule, and which rules lost; exit status 1 if it is denied.
 
@@ -157,7 +156,7 @@ def test(
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Run the cases beside a policy; exit status 1 if one of them is decided otherwise.
 
@@ -198,7 +197,7 @@ def compare(
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Show the requests that were seen and would be decided differently; exit status 1 if there are any.
 

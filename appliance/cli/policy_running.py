@@ -6,12 +6,10 @@ from typing import Annotated, Any
 import typer
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
-from appliance.cli.output import counted, say, say_json
+from appliance.cli.output import Json, counted, say, say_json
 from appliance.cli.policy_input import usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import seconds_of
-
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 @speaks
@@ -23,7 +21,7 @@ def reload(
             help="Go back by itself after this time (30s, 5m, 1h) unless `rosrv policy confirm` comes"
         ),
     ] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Read the policy file again: check, test, swap at once, and take back what it no longer allows.
 
@@ -42,7 +40,7 @@ def rollback(
     revision: Annotated[
         int | None, typer.Argument(help="A kept revision; without it, the one before")
     ] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Bring a kept revision into force again.
 
@@ -52,7 +50,7 @@ def rollback(
 
 
 @speaks
-def confirm(appliance: Appliance, as_json: _Json = False) -> None:
+def confirm(appliance: Appliance, as_json: Json = False) -> None:
     """Keep a policy that was loaded with --confirm-within; exit status 1 when there is nothing to confirm.
 
     Example: rosrv policy confirm
@@ -67,7 +65,7 @@ def confirm(appliance: Appliance, as_json: _Json = False) -> None:
 
 
 @speaks
-def revisions(appliance: Appliance, as_json: _Json = False) -> None:
+def revisions(appliance: Appliance, as_json: Json = False) -> None:
     """List the kept revisions, the newest first.
 
     Example: rosrv policy revisions

@@ -6,13 +6,11 @@ from typing import Annotated
 import typer
 
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRole
-from appliance.cli.output import moment, say, say_json
+from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks, usage_error
 from appliance.cli.spans import seconds_of
 
 app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
-
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 @app.command()
@@ -27,7 +25,7 @@ def add(
         typer.Option(help="viewer: look; operator: also reload and roll back; admin: also load new policies"),
     ] = "viewer",
     expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Make a token. Its text is printed once, here, and kept nowhere.
 
@@ -47,7 +45,7 @@ def add(
 
 @app.command("list")
 @speaks
-def list_tokens(appliance: Appliance, as_json: _Json = False) -> None:
+def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
     """List all tokens that were made, without their secrets.
 
     Example: rosrv token list
@@ -69,7 +67,7 @@ def list_tokens(appliance: Appliance, as_json: _Json = False) -> None:
 def revoke(
     appliance: Appliance,
     name: Annotated[str, typer.Argument(help="The name it was made with", show_default=False)],
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """End a token now; exit status 1 when there is none of this name.
 
