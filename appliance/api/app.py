@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
@@ -29,6 +29,7 @@ from appliance.api import (
 )
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
+from appliance.api.parameters import only_known
 from appliance.api.problems import REASON, BadInput, ProblemError, defect
 from appliance.api.services import Services
 
@@ -48,6 +49,7 @@ def build_app(services: Services) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        dependencies=[Depends(only_known)],
         exception_handlers={
             RequestValidationError: _invalid,
             HTTPException: _of_http,

@@ -140,16 +140,20 @@ def _wanted(
     text: Annotated[
         str | None, Query(max_length=256, description="anywhere in names, reason, details")
     ] = None,
+    deny: Annotated[bool, Query(description="only what was denied: the same as decision=deny")] = False,
+    topic: Annotated[str | None, Query(max_length=256, description="another word for resource")] = None,
 ) -> Filter:
     now = time.time_ns()
+    if resource is not None and topic is not None:
+        raise ProblemError(422, "bad-input", "resource and topic are two words for one thing: give one")
     try:
         return Filter(
-            decision=tuple(decision or ()),
+            decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
             since=None if since is None else parse_moment(since, now),
             until=None if until is None else parse_moment(until, now),
             host=host,
             caller_id=caller_id,
-            resource=resource,
+            resource=resource if topic is None else topic,
             category=category,
             event=event,
             severity=severity,

@@ -157,6 +157,28 @@ def test_a_filter_that_makes_no_sense_is_told(rest: Rest, query: str) -> None:
         assert answer.json["detail"]
 
 
+@pytest.mark.parametrize(
+    "path", ["/v1/audit", "/v1/audit/export", "/v1/audit/stream", "/v1/graph", "/v1/policy"]
+)
+def test_a_parameter_that_there_is_not_is_told(rest: Rest, path: str) -> None:
+    """A misspelt filter is refused and does not find everything; the answer names what was meant."""
+    answer = rest.get(f"{path}?resourse=/cmd_*")
+    assert answer.status == 422
+    assert answer.json["errors"][0]["where"] == "query.resourse"
+    if path == "/v1/audit":
+        assert "did you mean resource?" in answer.json["detail"]
+
+
+def test_denials_of_a_topic_are_found_by_the_words_of_the_command(rest: Rest) -> None:
+    """`deny` and `topic` are what `rosrv audit search --deny --topic` asks; two words for one thing are refused."""
+    rest.with_token(None).get("/v1/graph")
+    found = rest.get("/v1/audit?deny=1&since=1h&topic=/v1/gra*").json["records"]
+    assert found
+    assert {(one["decision"], one["resource"]) for one in found} == {("deny", "/v1/graph")}
+    assert rest.get("/v1/audit?deny=1&topic=/none*").json["records"] == []
+    assert rest.get("/v1/audit?resource=/a&topic=/a").status == 422
+
+
 def test_followers_are_bounded(rest: Rest) -> None:
     """Beyond `api_limits.streams` a follower is told to come back; when one leaves there is room again."""
     open_ones: list[Generator[dict[str, str], None, None]] = []
