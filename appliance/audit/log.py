@@ -12,6 +12,7 @@ Invariants:
 import asyncio
 import contextlib
 import contextvars
+import os
 import sqlite3
 import threading
 import time
@@ -26,6 +27,7 @@ import structlog
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.folding import Folder, FoldSettings, Key, summary
+from appliance.audit.holders import holders
 from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
 from appliance.audit.lost import Lost
@@ -72,7 +74,7 @@ class AuditLog:
     `durability` says when writing starts: `strict` at once (group commit), `batched` after 20 ms; both
     fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is first,
     and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed` or
-    `refused`.
+    `refused`. `held_by(processes)` is told, on that thread too, which processes keep the log locked.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class AuditLog:
         signer: Signer | None = None,
         retention: Retention | None = None,
         queue_limit: int = 100_000,
+        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  nobody asks
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.path = path
@@ -93,6 +96,7 @@ class AuditLog:
         self.strict = durability == "strict"
         self._clock = clock
         self._queue_limit = queue_limit
+        self._held_by = held_by
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
         self._queue: deque[Any] = deque()
@@ -311,6 +315,12 @@ class AuditLog:
 
     def _fail(self, error: Exception) -> None:
         reason = str(error)
+        if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
+            # With ours still open, ours are in the list as well.
+            others = [one for one in holders(self.path) if one != os.getpid()]
+            if others:
+                reason = f"{reason} by process {', '.join(map(str, others))}"
+                self._held_by(others)
         self._failed = reason if str(self.path) in reason else f"{self.path}: {reason}"
         if self._failed_since == 0:
             self._failed_since = self._clock()

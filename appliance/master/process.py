@@ -5,8 +5,10 @@ restored, the listeners serve, the first reconcile round makes ROSMaster whole, 
 """
 
 import asyncio
+import contextlib
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -103,7 +105,7 @@ class _Control:
     async def _lay_foundation(self, restarted: bool) -> Foundation:
         self._authority = Authority()
         self._signing = Signing(self._authority)
-        self._audit = _open_audit(self._settings, self._signing)
+        self._audit = _open_audit(self._settings, self._signing, self._log_held())
         audit = self._settings.audit
         recorder = Recorder(
             self._audit,
@@ -241,6 +243,16 @@ class _Control:
         ):
             self._tasks.append(asyncio.get_running_loop().create_task(work))
 
+    def _log_held(self) -> Callable[[list[int]], None]:
+        """Tells the supervisor, from the log's thread, who keeps the log locked."""
+        loop, say = asyncio.get_running_loop(), self._lifeline.say
+
+        def tell(processes: list[int]) -> None:
+            with contextlib.suppress(RuntimeError):  # it has ended
+                loop.call_soon_threadsafe(say, messages.LogHeld(processes))
+
+        return tell
+
     def _say_ready(self, restarted: bool, token: str | None) -> None:
         host, base = self._settings.listen_address[0], self._base
         told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
@@ -309,7 +321,7 @@ class _Control:
             await asyncio.sleep(_SAVE_SECONDS)
 
 
-def _open_audit(settings: Settings, signing: Signing) -> AuditLog:
+def _open_audit(settings: Settings, signing: Signing, held_by: Callable[[list[int]], None]) -> AuditLog:
     audit = settings.audit
     return AuditLog(
         settings.state / "control" / "audit.db",
@@ -317,6 +329,7 @@ def _open_audit(settings: Settings, signing: Signing) -> AuditLog:
         checkpoint_every=audit.checkpoint_records,
         checkpoint_seconds=audit.checkpoint_seconds,
         signer=signing.want,
+        held_by=held_by,
         retention=Retention(
             days=audit.retention_days,
             size=None if audit.retention_bytes is None else int(audit.retention_bytes),

@@ -28,6 +28,7 @@ from appliance.channel.messages import (
     Announced,
     ApplianceStopRequested,
     Failed,
+    LogHeld,
     Message,
     PolicyReloadRequested,
     Pong,
@@ -59,6 +60,7 @@ ADMIN = "admin"
 _BACKOFF = (0.0, 0.2, 0.5, 1.0)
 _LONG_LIFE_SECONDS = 10.0
 _LOUD_AFTER = 5
+_READERS = "rosrv-api"  # the user whose group may read the audit log
 _START_SECONDS = 180.0
 _STOP_SECONDS = 3.0
 _TERMINATE_SECONDS = 0.3
@@ -70,6 +72,7 @@ _FROM_CONTROL: tuple[type[Message], ...] = (
     SocketDropped,
     RouteWanted,
     ApplianceStopRequested,
+    LogHeld,
     TunnelsWanted,
 )
 
@@ -288,9 +291,25 @@ class Supervisor:
                 self._spawn(self._route(life, host))
             case TunnelsWanted(pool, address):
                 self._spawn(self._open_tunnels(life, pool, address))
+            case LogHeld(processes):
+                self._free_log(processes)
             case ApplianceStopRequested(reason):
                 log.warning("control asks to end the appliance", reason=reason)
                 self.stop()
+
+    def _free_log(self, processes: list[int]) -> None:
+        """End readers of the audit log that hold what only its writer needs: none that is in order does.
+
+        Where the kernel does not know who (-1), or names a process that is none of ours, all readers are ended.
+        """
+        ours = {post.life.pid for post in self._posts if post.life is not None}
+        for post in self._posts:
+            if _READERS not in {post.role.user, post.role.group} or post.life is None:
+                continue
+            if post.life.pid in processes or not ours.issuperset(processes):
+                role, pid = post.role.name, post.life.pid
+                log.critical("process is ended: the audit log is kept locked", role=role, pid=pid)
+                post.life.kill()
 
     def _keep(self, life: Life, name: str, descriptor: int) -> None:
         if name == ADMIN:

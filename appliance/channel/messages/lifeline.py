@@ -133,6 +133,12 @@ class RouteFound(Message):
     address: str | None
 
 
+class LogHeld(Message):
+    """Control cannot write the audit log, because these processes hold its locks."""
+
+    processes: list[int]
+
+
 class ApplianceStopRequested(Message):
     """Control asks the supervisor to end the appliance (the `shutdown` call of the Master API, granted)."""
 
@@ -144,5 +150,5 @@ Lifeline = (
     | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted
     | TunnelsWanted | TunnelsEnclosed
-    | RouteFound | ApplianceStopRequested | SignatureWanted | SignatureMade
+    | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip

@@ -1,0 +1,87 @@
+"""Tests of who keeps the log from being written: a real process that holds SQLite's locks as a reader may."""
+
+import fcntl
+import queue
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.database import open_for_reading
+from appliance.audit.holders import holders
+from appliance.audit.log import AuditLog
+from tests.support.audit import decision, settle
+
+_HOLD = """\
+import fcntl, os, struct, sys
+descriptor = os.open(sys.argv[1], os.O_RDONLY)
+fcntl.fcntl(descriptor, fcntl.F_SETLK, struct.pack("hhqqi", fcntl.F_RDLCK, 0, int(sys.argv[2]), 1, 0))
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@contextmanager
+def holding(file: Path, byte: int) -> Iterator[int]:
+    """Another process that holds a shared lock on one byte of a file, which reading allows; its process id."""
+    command = [sys.executable, "-c", _HOLD, str(file), str(byte)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process.pid
+        process.kill()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[AuditLog]:
+    """A log with a record in it."""
+    log = AuditLog(tmp_path / "audit.db")
+    log.record(decision(log, 1))
+    assert settle(log) is None
+    yield log
+    log.close()
+
+
+@pytest.mark.parametrize(("suffix", "byte"), [("-shm", 120), ("-shm", 121), ("-shm", 122), ("", 0x40000000)])
+def test_who_holds_what_only_the_writer_needs(log: AuditLog, suffix: str, byte: int) -> None:
+    """It is found by the kernel's list, and gone from it when it ends."""
+    file = log.path.with_name(log.path.name + suffix)
+    with holding(file, byte) as pid:
+        assert holders(log.path) == [pid]
+    assert holders(log.path) == []
+
+
+def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
+    """A lock of an open file description hides its process, and not that it is there."""
+    file = log.path.with_name(log.path.name + "-shm")
+    with file.open("rb") as opened:
+        fcntl.fcntl(opened, fcntl.F_OFD_SETLK, struct.pack("hhqqi4x", fcntl.F_RDLCK, 0, 120, 1, 0))
+        assert holders(log.path) == [-1]
+
+
+def test_a_reader_that_is_in_order_is_not_named(log: AuditLog) -> None:
+    """Reading, with a read that is not finished, holds nothing that the writer needs; nor do locks of other files."""
+    with holding(log.path.with_name(log.path.name + "-shm"), 124), holding(Path(__file__), 120):
+        connection = open_for_reading(log.path)
+        connection.execute("BEGIN")
+        connection.execute("SELECT * FROM record").fetchone()
+        assert holders(log.path) == []
+        connection.close()
+    assert holders(log.path.with_name("nowhere.db")) == []
+
+
+def test_the_log_names_who_locks_it(tmp_path: Path) -> None:
+    """The owner is told the process, so that he can end it, and everybody reads it in the reason; then it goes on."""
+    told: queue.Queue[list[int]] = queue.Queue()
+    log = AuditLog(tmp_path / "audit.db", held_by=told.put)
+    log.record(decision(log, 1))
+    assert settle(log) is None
+    with holding(tmp_path / "audit.db-shm", 120) as pid:
+        log.record(decision(log, 2))
+        assert told.get(timeout=60) == [pid]
+    assert settle(log) is None
+    log.close()
