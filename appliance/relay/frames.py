@@ -196,6 +196,8 @@ def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
     if count < _MANY or _unpack_length(buffer, stride)[0] + 4 != stride:
         return 0, 0
     whole = count * stride
+    if end - whole >= 4 and _unpack_length(buffer, whole)[0] + 4 <= end - whole:
+        return 0, 0  # a whole frame that is shorter follows
     for place in range(4):
         if buffer[place:whole:stride].tobytes() != buffer[place : place + 1].tobytes() * count:
             return 0, 0

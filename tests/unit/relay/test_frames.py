@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from appliance.relay.frames import (
@@ -164,6 +164,7 @@ def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
 
 
 @given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
+@example([5, 5, 5, 5, 0], 0)
 def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
     """What is said of the whole buffer is what walking from frame to frame finds."""
     data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
