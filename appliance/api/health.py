@@ -60,6 +60,12 @@ class Status(_Model):
     master: str = Field(description="where nodes find their master")
     processes: list[Process]
     isolation: str
+    relaying: str = Field(
+        description="`all`, or `monitored`: then what no monitor is on passes the appliance by"
+    )
+    mediation: str = Field(
+        description="`full`, or `monitored`: then nodes are told each other's own addresses"
+    )
     firewall: dict[str, Any]
     probe: str
     policy: PolicyState

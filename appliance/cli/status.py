@@ -104,10 +104,12 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
         f"{counted(body['services'], 'service')}",
     )
     dropped = f", {body['dropped']} dropped at slow subscribers" if body["dropped"] else ""
-    grid.add_row(
-        "relay",
-        f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}",
+    relay = Text(
+        f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}"
     )
+    if body["relaying"] == "monitored":
+        relay.append("; only what is monitored: NO BOUNDARY, the rest passes it by", style=_YELLOW)
+    grid.add_row("relay", relay)
     grid.add_row("tunnels", _tunnels(body["ipsec"]))
     grid.add_row("hosts' ports", _ports(body["ipsec"]["ports"]))
     forwarding = audit["forwarding"]

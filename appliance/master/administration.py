@@ -227,6 +227,8 @@ class Administration:
             "master": self._surroundings.master,
             "processes": msgspec.to_builtins(self._surroundings.processes),
             "isolation": self._surroundings.firewall.isolation,
+            "relaying": "all" if self._master.mediation.relay_all else "monitored",
+            "mediation": "full" if self._master.mediation.stand_ins else "monitored",
             "firewall": self._surroundings.firewall.report,
             "probe": self._surroundings.probe,
             "policy": {

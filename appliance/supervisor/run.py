@@ -46,6 +46,13 @@ def run_appliance(
         )
     elif settings.firewall.backend == "iptables":
         load_modules()
+    if settings.relaying == "monitored":
+        log.warning(
+            "relaying monitored: NO BOUNDARY. Only topics and services with a monitor or in [Monitor] are carried; "
+            "nodes negotiate the rest among themselves, past policy and monitors. It takes effect for a running "
+            "node when it reconnects",
+            mediation=settings.mediation,
+        )
     keep_supervisors()
     state = StateDirectory(settings.state)
     try:

@@ -354,6 +354,9 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
     with Appliance(options=options) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
         assert monitor(appliance, "safeTrigger")["enabled"] is True
         assert monitor(appliance, "safeZone")["enabled"] is False
+        assert appliance.status()["relaying"] == relay
+        assert ("NO BOUNDARY" in appliance.rosrv("status", check=False).stdout) is (relay == "monitored")
+        assert ("relaying monitored: NO BOUNDARY" in appliance.story()) is (relay == "monitored")
         gun = ros.start([PYTHON, "-c", GUN, "gun"], label="gun")
         operator = ros.start([PYTHON, "-c", OPERATOR, "operator"], label="operator")
         for process in (gun, operator):

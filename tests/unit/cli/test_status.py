@@ -27,7 +27,7 @@ def body() -> dict[str, Any]:
     """A large appliance: everything there is, names as long as they get."""
     return {
         "version": "0.1.0", "since": time.time() - 100_000, "master": "http://10.113.11.1:11311", "processes": rows(),
-        "isolation": "netns", "firewall": {"backend": "nft"}, "probe": "passed",
+        "isolation": "netns", "relaying": "all", "mediation": "full", "firewall": {"backend": "nft"}, "probe": "passed",
         "policy": {"revision": 12, "file": "/etc/rosrv/policies/robot.ini", "source": "x", "who": "alice",
                    "differs_from_file": True, "warnings": 3, "confirm_by": None},
         "ipsec": {"esp": "kernel", "up": 3, "enrolled": 4, "troubles": [], "key_exchange": ["x25519"],
@@ -110,3 +110,12 @@ def test_few_lines_stay_as_they_are() -> None:
     """Nothing is said of more where there is no more."""
     assert shortened(["a", "b"], 2) == ["a", "b"]
     assert shortened(["a", "b", "c"], 2) == ["a", "and 2 more: rosrv status --json"]
+
+
+def test_that_not_everything_is_carried_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`--relay monitored` is no boundary, and the status says so; of the default it says nothing."""
+    monitored = " ".join(screen(monkeypatch, capsys, 160, body() | {"relaying": "monitored"}))
+    assert "only what is monitored: NO BOUNDARY" in monitored
+    assert "NO BOUNDARY" not in " ".join(screen(monkeypatch, capsys, 160, body()))
