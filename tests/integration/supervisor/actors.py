@@ -53,7 +53,7 @@ def crowded(lifeline_fd: int, config: Path) -> None:
     asyncio.run(_Crowded(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
-def signer(lifeline_fd: int, directory: Path) -> None:
+def signer(lifeline_fd: int, directory: Path, passphrase: int | None) -> None:
     """Stand-in for the signer."""
     asyncio.run(_Actor("signer", lifeline_fd, SignerLink).run())
 
