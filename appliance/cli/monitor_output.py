@@ -65,7 +65,7 @@ def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) 
     seconds = f"{outcome.time / BILLION:.3f}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} #{index} {topic}"
     if topic is not None and outcome.result != "passed":
-        yield f"{head}: {outcome.result}"
+        yield f"{head}: {outcome.result}" + (f" ({outcome.reason})" if outcome.reason else "")
     for verdict in outcome.verdicts:
         name = f"{verdict.monitor} ({verdict.logic} property {verdict.property})"
         yield f"{head}: {verdict.category} of {name}"

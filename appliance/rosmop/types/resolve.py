@@ -23,6 +23,14 @@ _NAMED: dict[tuple[str, ...], Type] = {
     ("int64_t",): kinds.LONG,
     ("uint64_t",): kinds.ULONG,
 }
+_CPP_NAMES = {  # of the types of fields, as .msg files name them
+    **{f"{sign}int{bits}": f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    "float32": "float",
+    "float64": "double",
+    "byte": "int8_t",
+    "time": "ros::Time",
+    "duration": "ros::Duration",
+}
 _UNKNOWN_CONTAINERS = frozenset(
     {"map", "set", "list", "deque", "pair", "array", "unordered_map", "queue", "tuple"}
 )
@@ -80,6 +88,11 @@ def _message(name: tree.TypeName, messages: Messages) -> Type:
         if name.name[-1] in _UNKNOWN_CONTAINERS:
             raise SpecificationError.at(name.position, f"there is no `{text}`; use a `std::vector`")
         raise SpecificationError.at(name.position, f"there is no type `{text}`")
+    if text in _CPP_NAMES:
+        raise SpecificationError.at(
+            name.position,
+            f"there is no type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that",
+        )
     if len(name.name) != 2:
         known = ["bool", "int", "double", "float", "char", "string", "size_t"]
         hint = nearest(text, known) if len(name.name) == 1 and len(text) > 2 else ""

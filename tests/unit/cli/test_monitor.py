@@ -318,3 +318,12 @@ def test_what_init_prints_comes_with_the_first_message(tmp_path: Path) -> None:
         line["text"]
         for line in records(invoke("run", write(tmp_path, "a.rv", text), "--bag", bag, "--json"))[0]["log"]
     ] == ["begin"]
+
+
+def test_run_says_why_a_monitor_that_could_not_begin_drops(tmp_path: Path) -> None:
+    """After a fault in `init` every message is dropped, and each line for people has the reason."""
+    text = "m() { int z = 0; init() { z = 1 / z; } event e(int x) /t std_msgs/Int32 '{data:x}' { } }"
+    one = message("std_msgs/Int32", data=1)
+    bag = make_bag(tmp_path / "in.bag", [("/t", "std_msgs/Int32", time, one) for time in (1.0, 2.0)])
+    said = invoke("run", write(tmp_path, "m.rv", text), "--bag", bag).stdout
+    assert said.count("dropped (m could not begin: its first values or `init` faulted)") == 2
