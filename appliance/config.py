@@ -369,11 +369,12 @@ class Settings(_Section):
             )
         return tls
 
-    @model_validator(mode="after")
-    def _mediation_fits(self) -> Self:
-        if self.mediation == "monitored" and self.relaying == "all":
-            raise ValueError("mediation: monitored needs relaying: monitored (--relay monitored)")
-        return self
+    @field_validator("mediation")
+    @classmethod
+    def _mediation_fits(cls, mediation: str, info: ValidationInfo) -> str:
+        if mediation == "monitored" and info.data.get("relaying") == "all":
+            raise ValueError("monitored needs relaying: monitored (--relay monitored)")
+        return mediation
 
     @model_validator(mode="after")
     def _receiver_is_reachable(self) -> Self:

@@ -145,3 +145,10 @@ def test_a_list_in_the_environment_is_yaml() -> None:
     value = "[{network: 10.0.0.0/8, address: 10.1.1.1}]"
     assert str(resolve(None, {"ROSRV_ADVERTISE": value}, {}).advertise[0].address) == "10.1.1.1"
     assert mistakes(None, {"ROSRV_ADVERTISE": "[{"})[0].startswith("ROSRV_ADVERTISE: is not YAML")
+
+
+def test_a_mistake_about_two_keys_stands_where_one_of_them_was_said() -> None:
+    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, whatever else was given."""
+    with pytest.raises(ConfigError) as caught:
+        resolve(None, {}, {"policy": Path("/a.ini"), "mediation": "monitored"})
+    assert str(caught.value) == "--mediation: monitored needs relaying: monitored (--relay monitored)"

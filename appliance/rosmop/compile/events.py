@@ -4,6 +4,7 @@
 the `when` or a constant of the pattern look at are decoded; only fields that were assigned are written.
 """
 
+import math
 from dataclasses import dataclass
 
 from appliance.ros.errors import DefinitionError
@@ -183,7 +184,8 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
     if isinstance(constant, bytes) or not kinds.is_number(field):
         return None
     if isinstance(field, kinds.Floating):
-        return f32(float(constant)) if field.bits == 32 else float(constant)
+        held = f32(float(constant)) if field.bits == 32 else float(constant)
+        return None if math.isinf(held) and not math.isinf(float(constant)) else held
     if isinstance(constant, float) and (constant - constant != 0 or constant != int(constant)):
         return None
     if isinstance(field, kinds.Bool):

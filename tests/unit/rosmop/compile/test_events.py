@@ -109,6 +109,7 @@ BAD_CONSTANTS = [
     ("std_msgs/Int32", "data:2.5", "a field of type int cannot hold 2.5"),
     ("std_msgs/UInt8", "data:256", "a field of type uint8_t cannot hold 256"),
     ("std_msgs/UInt8", "data:-1", "a field of type uint8_t cannot hold -1"),
+    ("std_msgs/Float32", "data:1e39", "a field of type float cannot hold 1e+39"),
     ("std_msgs/Bool", "data:2", "a field of type bool cannot hold 2"),
     ("std_msgs/Int32", 'data:"x"', "a field of type int cannot hold 'x'"),
     ("std_msgs/String", "data:1", "a field of type std::string cannot hold 1"),
