@@ -75,18 +75,19 @@ def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
     heard = listener.wait_for_count(3, event="received")
     assert all(event["data"].startswith("checked good") for event in heard)
     assert {event["publisher"] for event in heard} == {"/voice"}
-    told = alarm.wait_for(event="received")
-    assert (told["data"], told["publisher"]) == ("three words", "/rosrv")
+    alarmed = alarm.wait_for(event="received")
+    assert (alarmed["data"], alarmed["publisher"]) == ("three words", "/rosrv")
     bad = ros.talker(by, "/chatter", "--text", "bad", name="rude")
     bad.wait_for(event="ready")
     listener.wait_for_count(20, event="received")
     assert not [event for event in listener.seen(event="received") if "bad" in event["data"]]
     assert appliance.audit(event="message dropped", resource="/chatter")
-    changed = appliance.audit(event="message changed", resource="/chatter")[0]
+    told = appliance.audit(event="message changed", resource="/chatter")
+    changed = next(one for one in told if "before" in one["detail"])  # the others are sums of a second
     assert bytes.fromhex(changed["detail"]["before"])[4:].startswith(b"good")
     assert changed["detail"]["before_fields"]["data"].startswith("good")
     assert bytes.fromhex(changed["detail"]["after"])[4:].startswith(b"checked good")
-    assert appliance.audit(event="monitor log")[0]["reason"] == "a bad word"
+    assert "a bad word" in {one["reason"] for one in appliance.audit(event="monitor log")}
 
 
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
