@@ -1,4 +1,4 @@
-"""System tests run two at a time (`-n 2 --dist loadgroup`): what shares an engine, a machine or a browser stays together.
+"""System tests run two at a time (`-n 2 --dist loadgroup`): what shares an engine or a browser stays together.
 
 A folder is one group, so that its Docker engine, its images or its virtual machine are made once; each file beside
 the folders is a group of its own.
