@@ -23,7 +23,7 @@ from appliance.api.monitor_models import (
     SwitchMany,
 )
 from appliance.api.monitors import TAGGED, UNKNOWN, OneName
-from appliance.api.preconditions import IfMatch, etag, expected_revision
+from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, answered, ask
 from appliance.api.services import Services
@@ -40,7 +40,10 @@ from appliance.channel.admin import (
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 _CHANGES: dict[int | str, dict[str, Any]] = {
     **TAGGED,
-    412: {"description": "Other specifications are in force than If-Match names."},
+    412: {
+        "description": "The monitors were changed, switched or resumed since they had the ETag of If-Match.",
+        "headers": TAGGED[200]["headers"],
+    },
     428: {"description": "If-Match is missing."},
 }
 
@@ -150,21 +153,17 @@ class _Changing:
         if not dry_run:
             return await self.replace(order, bearer, response)
         body = await ask(self._control, MonitorsWanted(texts=True), bearer)
-        revision = body["revision"]
-        if order.expected not in (None, revision):
-            raise ProblemError(
-                412,
-                "changed-meanwhile",
-                f"revision {revision} of the specifications is in force, not {order.expected}: look at it first",
-            )
+        if order.expected not in (None, body["tag"]):
+            text = f"the monitors are at {body['tag']}, not at {order.expected}: look at them first"
+            raise _stale(text, body["tag"])
         async with self._services.judging:
-            draft = await asyncio.to_thread(judge, body, order.files, order.definitions, revision)
-        response.headers["ETag"] = etag(revision)
-        return _would(draft, revision)
+            draft = await asyncio.to_thread(judge, body, order.files, order.definitions, body["revision"])
+        response.headers["ETag"] = etag(body["tag"])
+        return _would(draft, body["revision"], body["tag"])
 
     async def replace(self, order: MonitorChange, bearer: Bearer, response: Response) -> Replaced:
         body = await _order(self._control, order, bearer)
-        response.headers["ETag"] = etag(body["revision"])
+        response.headers["ETag"] = etag(body["tag"])
         rows = (await ask(self._control, MonitorsWanted(), bearer))["monitors"]
         return Replaced.model_validate(
             body
@@ -176,14 +175,14 @@ class _Changing:
         )
 
     async def switch(
-        self, names: list[str], to: Switch, expected: int | None, bearer: Bearer, response: Response
+        self, names: list[str], to: Switch, expected: str | None, bearer: Bearer, response: Response
     ) -> Switched:
         order: MonitorChange = MonitorResume(names, expected)
         if to.enabled is not None:
             order = MonitorSwitch(names, to.enabled, expected)
         body = await _order(self._control, order, bearer)
-        response.headers["ETag"] = etag(body["revision"])
-        return Switched(revision=body["revision"], names=body["names"])
+        response.headers["ETag"] = etag(body["tag"])
+        return Switched(revision=body["revision"], tag=body["tag"], names=body["names"])
 
     async def file_of(self, name: str, bearer: Bearer) -> str:
         """The file that a monitor stands in. Raises `ProblemError` (404)."""
@@ -201,7 +200,14 @@ async def _order(control: ControlLink, order: MonitorChange, bearer: Bearer) -> 
     answer = await control.ask(order, bearer.name, _COMPILE_SECONDS)
     if not answer.ok and answer.trouble == "refused":
         raise refusal(answer.error, answer.findings)
+    if not answer.ok and answer.trouble == "conflict":
+        raise _stale(answer.error, answer.body["tag"])
     return answered(answer)
+
+
+def _stale(text: str, tag: str) -> ProblemError:
+    """Somebody else was quicker; the present ETag is in the answer."""
+    return ProblemError(412, "changed-meanwhile", text, headers={"ETag": etag(tag)})
 
 
 def _may_load(bearer: Bearer, *, dry_run: bool) -> None:
@@ -211,16 +217,17 @@ def _may_load(bearer: Bearer, *, dry_run: bool) -> None:
         )
 
 
-def _expected(if_match: str | None, *, dry_run: bool = False) -> int | None:
+def _expected(if_match: str | None, *, dry_run: bool = False) -> str | None:
     if dry_run and if_match is None:
         return None
-    return expected_revision(if_match, "specifications", "/v1/monitors")
+    return expected_tag(if_match, "monitors", "/v1/monitors")
 
 
-def _would(draft: Draft, revision: int) -> Replaced:
+def _would(draft: Draft, revision: int, tag: str) -> Replaced:
     return Replaced(
         loaded=False,
         revision=revision,
+        tag=tag,
         replaced=None,
         added=draft.added,
         changed=draft.changed,

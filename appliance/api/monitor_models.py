@@ -21,6 +21,9 @@ _DEFINITIONS: dict[Definition, Text] = Field(
     max_length=1000,
     description="definitions of messages and services that ROS does not ship, by `package/Type.msg`",
 )
+_TAG = Field(
+    description="another after every change, switch and resumption; in quotes it is the ETag, and what If-Match takes"
+)
 _NOTE = Field(default="", max_length=200, description="kept with the revision: why")
 
 
@@ -51,6 +54,7 @@ class Monitors(Model):
     """The specifications in force; `loaded` is seconds since the epoch."""
 
     revision: int
+    tag: str = _TAG
     who: str
     note: str
     loaded: float
@@ -107,6 +111,7 @@ class Monitor(MonitorState):
     """A monitor with the text it was made of."""
 
     revision: int
+    tag: str = _TAG
     text: str = Field(description="of its whole file")
     alphabet: list[EventShown] = Field(description="its events")
     properties: list[PropertyShown]
@@ -146,6 +151,7 @@ class Replaced(Model):
 
     loaded: bool
     revision: int = Field(description="in force now")
+    tag: str = _TAG
     replaced: int | None
     added: list[str]
     changed: list[str]
@@ -180,4 +186,5 @@ class Switched(Model):
     """The monitors that were not so already."""
 
     revision: int
+    tag: str = _TAG
     names: list[str]

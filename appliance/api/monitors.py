@@ -20,7 +20,12 @@ from appliance.channel.admin import MonitorsWanted
 
 TAGGED: dict[int | str, dict[str, Any]] = {
     200: {
-        "headers": {"ETag": {"description": "of the specifications in force", "schema": {"type": "string"}}}
+        "headers": {
+            "ETag": {
+                "description": "of the specifications in force and the switches of their monitors",
+                "schema": {"type": "string"},
+            }
+        }
     }
 }
 UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"description": "There is no such monitor."}}
@@ -72,7 +77,7 @@ def routes(services: Services) -> APIRouter:
     ) -> Monitors:
         """All monitors with state and counters, and whether they are what the folder has."""
         body = await ask(services.control, MonitorsWanted(texts=texts), bearer)
-        response.headers["ETag"] = etag(body["revision"])
+        response.headers["ETag"] = etag(body["tag"])
         return Monitors.model_validate(body)
 
     @router.get("/{name}", operation_id="monitor", responses=TAGGED | UNKNOWN)
@@ -80,11 +85,12 @@ def routes(services: Services) -> APIRouter:
         """One monitor: state, counters, the text of its file, its events and properties."""
         body, row = await looking.state(bearer, name)
         found = await looking.compiled(body, name)
-        response.headers["ETag"] = etag(body["revision"])
+        response.headers["ETag"] = etag(body["tag"])
         return Monitor.model_validate(
             row
             | {
                 "revision": body["revision"],
+                "tag": body["tag"],
                 "text": body["files"][row["file"]],
                 "alphabet": events_of(found),
                 "properties": properties_of(found),

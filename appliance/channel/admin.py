@@ -79,25 +79,28 @@ class MonitorsWanted(AdminRequest, frozen=True, tag="monitors"):
 
 
 class MonitorLoad(AdminRequest, frozen=True, tag="monitor load"):
-    """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`)."""
+    """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
+
+    `expected`, of this and every change below: the tag of the monitors that it is meant for; None for any.
+    """
 
     files: dict[str, str]
     definitions: dict[str, str] = {}
     note: str = ""
-    expected: int | None = None
+    expected: str | None = None
 
 
 class MonitorReload(AdminRequest, frozen=True, tag="monitor reload"):
     """Take what the folder of specifications has now, in the place of what is in force."""
 
-    expected: int | None = None
+    expected: str | None = None
 
 
 class MonitorRemove(AdminRequest, frozen=True, tag="monitor remove"):
     """Remove specifications, by the names of their files or monitors."""
 
     names: list[str]
-    expected: int | None = None
+    expected: str | None = None
 
 
 class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
@@ -105,14 +108,14 @@ class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
 
     names: list[str]
     enabled: bool
-    expected: int | None = None
+    expected: str | None = None
 
 
 class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
     names: list[str]
-    expected: int | None = None
+    expected: str | None = None
 
 
 MonitorChange = MonitorLoad | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume

@@ -76,10 +76,9 @@ def _monitors(rest: Calls, request: admin.MonitorsWanted | admin.MonitorChange) 
             return _replaced(rest.call("DELETE", path, params={"name": names}, match=True))
         case admin.MonitorSwitch(names, enabled):
             answer = rest.call("PATCH", path, body={"names": names, "enabled": enabled}, match=True)
-            return {"names": answer["names"], "enabled": enabled, "revision": answer["revision"]}
+            return {**answer, "enabled": enabled}
         case admin.MonitorResume(names):
-            answer = rest.call("PATCH", path, body={"names": names, "held": False}, match=True)
-            return {"names": answer["names"], "revision": answer["revision"]}
+            return rest.call("PATCH", path, body={"names": names, "held": False}, match=True)
 
 
 def _replaced(body: dict[str, Any]) -> dict[str, Any]:

@@ -98,7 +98,8 @@ class Administration:
             text = f"refused; revision {self._master.monitors.revision} of the specifications stays in force"
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
         except (RevisionChangedError, MonitorsChangedError, HostsChangedError) as error:
-            return admin.AdminAnswer(False, error=str(error), trouble="conflict")
+            body = {"tag": error.tag} if isinstance(error, MonitorsChangedError) else {}
+            return admin.AdminAnswer(False, body, error=str(error), trouble="conflict")
         except (UnknownThingError, UnknownMonitorError, UnknownHostError) as error:
             return admin.AdminAnswer(False, error=str(error), trouble="unknown")
         except (TokenRefusedError, HostRefusedError) as error:

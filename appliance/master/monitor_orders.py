@@ -12,17 +12,18 @@ async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who:
     """Carry out a change; what it did."""
     match request:
         case admin.MonitorLoad(files, definitions, note, expected):
-            return _replaced(await monitors.load(files, definitions, who=who, note=note, expected=expected))
+            loaded = await monitors.load(files, definitions, who=who, note=note, expected=expected)
+            return _replaced(loaded, monitors.tag)
         case admin.MonitorReload(expected):
-            return _replaced(await monitors.reload(who=who, expected=expected))
+            return _replaced(await monitors.reload(who=who, expected=expected), monitors.tag)
         case admin.MonitorRemove(names, expected):
-            return _replaced(await monitors.remove(names, who=who, expected=expected))
+            return _replaced(await monitors.remove(names, who=who, expected=expected), monitors.tag)
         case admin.MonitorSwitch(names, enabled, expected):
             changed = await monitors.switch(names, enabled, who=who, expected=expected)
-            return {"names": changed, "enabled": enabled, "revision": monitors.revision}
+            return {"names": changed, "enabled": enabled, "revision": monitors.revision, "tag": monitors.tag}
         case admin.MonitorResume(names, expected):
             held = await monitors.resume(names, who=who, expected=expected)
-            return {"names": held, "revision": monitors.revision}
+            return {"names": held, "revision": monitors.revision, "tag": monitors.tag}
 
 
 def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:
@@ -30,6 +31,7 @@ def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:
     monitors = master.monitors
     body: dict[str, Any] = {
         "revision": monitors.revision,
+        "tag": monitors.tag,
         "who": monitors.who,
         "note": monitors.note,
         "loaded": monitors.loaded,
@@ -51,6 +53,7 @@ def monitors_status(monitors: Monitors) -> dict[str, Any]:
     rows = [_row(monitors, name) for name in monitors.names()]
     return {
         "revision": monitors.revision,
+        "tag": monitors.tag,
         "loaded": len(rows),
         "enabled": sum(row["enabled"] for row in rows),
         "held": [row["name"] for row in rows if row["held"]],
@@ -80,9 +83,10 @@ def _row(monitors: Monitors, name: str) -> dict[str, Any]:
     }
 
 
-def _replaced(replaced: Replaced) -> dict[str, Any]:
+def _replaced(replaced: Replaced, tag: str) -> dict[str, Any]:
     return {
         "revision": replaced.revision,
+        "tag": tag,
         "replaced": replaced.replaced,
         "added": replaced.added,
         "changed": replaced.changed,

@@ -5,6 +5,9 @@ the store and survives a restart. New specifications are compiled before anythin
 and say everything that is wrong with them. The relay compiles them again and has the last word.
 
 Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says.
+
+What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
+a change that is meant for another tag than the present one is refused.
 """
 
 import asyncio
@@ -36,6 +39,7 @@ from appliance.store.state import MonitorRevisionRow, StateStore
 _log = structlog.get_logger()
 _DISK = "disk"
 _SWITCHES = "monitor switches"
+_ACTS = "monitor acts"
 ALLOCATION = "relays"
 
 
@@ -44,12 +48,14 @@ class UnknownMonitorError(Exception):
 
 
 class MonitorsChangedError(Exception):
-    """Another revision came into force than the one a change was meant for; the text says which."""
+    """The monitors are not as they were when a change to them was thought of; `tag` is the present one."""
 
-    def __init__(self, expected: int, found: int) -> None:
+    def __init__(self, expected: str, tag: str) -> None:
         super().__init__(
-            f"revision {found} of the specifications is in force, not {expected}: look at it first"
+            f"the monitors were loaded, switched or resumed meanwhile (they are at {tag}, not at {expected}):"
+            " look at them first"
         )
+        self.tag = tag
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +97,7 @@ class Monitors:
         self.allocation = allocation or Allocation(1)
         self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
         self._switches: dict[str, bool] = {}
+        self._acts = 0  # switches and resumptions, ever
         self._changing = asyncio.Lock()
         self.revision = 0
         self.sources = Sources()
@@ -109,6 +116,7 @@ class Monitors:
         """
         settings = self._store.settings()
         self._switches = json.loads(settings.get(_SWITCHES, "{}"))
+        self._acts = int(settings.get(_ACTS, "0"))
         last = self._store.monitor_revision()
         if last is not None and (restarted or last.who != _DISK):
             sources = Sources(**json.loads(last.sources))
@@ -133,6 +141,11 @@ class Monitors:
         self._stating.relays = relays
 
     # --- looking ---
+
+    @property
+    def tag(self) -> str:
+        """Names what a change is meant for: `expected` of the changes below."""
+        return f"{self.revision}.{self._acts}"
 
     @property
     def refused(self) -> list[str]:
@@ -179,21 +192,21 @@ class Monitors:
         *,
         who: str,
         note: str,
-        expected: int | None = None,
+        expected: str | None = None,
     ) -> Replaced:
         """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`."""
         async with self._changing:
             self._expect(expected)
             return await self._change(self.sources.with_files(files, definitions), who, who, note or "loaded")
 
-    async def reload(self, *, who: str, expected: int | None = None) -> Replaced:
+    async def reload(self, *, who: str, expected: str | None = None) -> Replaced:
         """Take what the folder has now. Raises `SpecificationsRefusedError`."""
         async with self._changing:
             self._expect(expected)
             sources = await asyncio.to_thread(self._read)
             return await self._change(sources, _DISK, who, "reloaded from disk")
 
-    async def remove(self, names: list[str], *, who: str, expected: int | None = None) -> Replaced:
+    async def remove(self, names: list[str], *, who: str, expected: str | None = None) -> Replaced:
         """Remove files, by their names or those of their monitors.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
@@ -218,47 +231,38 @@ class Monitors:
             )
 
     async def switch(
-        self, names: list[str], enabled: bool, *, who: str, expected: int | None = None
+        self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
     ) -> list[str]:
         """Enable or disable monitors; those that were not so already. Raises `UnknownMonitorError`."""
         async with self._changing:
             self._expect(expected)
             self._all_known(names)
             changed = [name for name in dict.fromkeys(names) if self.enabled(name) is not enabled]
+            if changed:
+                await self._count()
             for name in changed:
                 self._switches[name] = enabled
                 self._stating.tell(name, messages.MonitorSwitched(name, enabled))
                 word = "enabled" if enabled else "disabled"
-                self._recorder.happened(
-                    f"monitor {word}",
-                    f"{name} is {word}",
-                    severity=Severity.NOTICE,
-                    category="monitor",
-                    resource=name,
-                    who=who,
-                )
+                self._record(f"monitor {word}", f"{name} is {word}", name, who)
             if changed:
                 self._store.save_setting(_SWITCHES, json.dumps(self._switches))
                 await self._store.settled()
             return changed
 
-    async def resume(self, names: list[str], *, who: str, expected: int | None = None) -> list[str]:
+    async def resume(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
         """Let the topics of held monitors go on; which were held. Raises `UnknownMonitorError`."""
-        self._expect(expected)
-        self._all_known(names)
-        held = [name for name in dict.fromkeys(names) if name in self.held]
-        for name in held:
-            self._stating.tell(name, messages.MonitorResumed(name))
-            self._stating.resumed(name)
-            self._recorder.happened(
-                "monitor resumed",
-                f"the topics of {name} go on",
-                severity=Severity.NOTICE,
-                category="monitor",
-                resource=name,
-                who=who,
-            )
-        return held
+        async with self._changing:
+            self._expect(expected)
+            self._all_known(names)
+            held = [name for name in dict.fromkeys(names) if name in self.held]
+            if held:
+                await self._count()
+            for name in held:
+                self._stating.tell(name, messages.MonitorResumed(name))
+                self._stating.resumed(name)
+                self._record("monitor resumed", f"the topics of {name} go on", name, who)
+            return held
 
     # --- what the relay says ---
 
@@ -290,9 +294,20 @@ class Monitors:
         if unknown:
             raise UnknownMonitorError(self._unknown(unknown))
 
-    def _expect(self, expected: int | None) -> None:
-        if expected is not None and expected != self.revision:
-            raise MonitorsChangedError(expected, self.revision)
+    def _expect(self, expected: str | None) -> None:
+        if expected is not None and expected != self.tag:
+            raise MonitorsChangedError(expected, self.tag)
+
+    async def _count(self) -> None:
+        """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
+        self._store.save_setting(_ACTS, str(self._acts + 1))
+        await self._store.settled()
+        self._acts += 1
+
+    def _record(self, event: str, reason: str, name: str, who: str) -> None:
+        self._recorder.happened(
+            event, reason, severity=Severity.NOTICE, category="monitor", resource=name, who=who
+        )
 
     async def _change(self, sources: Sources, keeper: str, who: str, note: str) -> Replaced:
         before, previous = self.revision, self.sources

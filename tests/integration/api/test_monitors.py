@@ -134,6 +134,39 @@ def test_two_engineers_do_not_overwrite_each_other(appliance: Appliance) -> None
     assert [(one["name"], one["enabled"]) for one in state["monitors"]] == [("speed", True)]
 
 
+def test_a_switch_is_not_undone_by_who_has_not_seen_it(appliance: Appliance) -> None:
+    """A stale ETag is 412 with the present one and changes nothing, after a switch as after a load, and a restart."""
+    rest = appliance.rest()
+    seen = load(rest, {"speed.rv": LIMIT}).etag
+    assert rest.get("/v1/monitors").etag == rest.get("/v1/monitors/speed").etag == seen
+    off = send(rest, "PATCH", "/v1/monitors/speed", {"enabled": False}, seen)
+    now = off.etag
+    assert (off.status, off.json["names"]) == (200, ["speed"])
+    assert (
+        rest.get("/v1/monitors").etag == rest.get("/v1/monitors/speed").etag == now == f'"{off.json["tag"]}"'
+    )
+    changes = (
+        ("PATCH", "/speed", {"enabled": True}), ("PATCH", "", {"names": ["speed"], "held": False}),
+        ("PUT", "/speed", OTHER), ("POST", "", {"files": {"count.rv": OTHER}}), ("POST", "/reload", None),
+        ("POST", "?dry_run=1", {"files": {"count.rv": OTHER}}), ("DELETE", "/speed", None),
+        ("DELETE", "?name=speed", None),
+    )  # fmt: skip
+    for stale in (seen, '"1"'):  # of what was before, and of a version whose ETags were numbers
+        for method, path, body in changes:
+            refused = send(rest, method, f"/v1/monitors{path}", body, stale)
+            assert (refused.status, refused.headers.get("etag")) == (412, now), (method, path, refused.body)
+    state = rest.get("/v1/monitors").json
+    assert (state["revision"], [one["enabled"] for one in state["monitors"]]) == (1, [False])
+    same = send(rest, "PATCH", "/v1/monitors/speed", {"enabled": False}, now)
+    assert (same.etag, same.json["names"]) == (now, [])
+    appliance.stop()
+    appliance.start()
+    rest = appliance.rest(rest.token)
+    assert rest.get("/v1/monitors").etag == now
+    assert send(rest, "PATCH", "/v1/monitors/speed", {"enabled": True}, seen).status == 412
+    assert send(rest, "PATCH", "/v1/monitors/speed", {"enabled": True}, now).status == 200
+
+
 def test_monitors_are_switched_together_or_not_at_all(appliance: Appliance) -> None:
     """PATCH says which were not so already; with an unknown name none is switched; what makes no sense is 422."""
     rest = appliance.rest()

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -182,17 +183,64 @@ async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
     assert (await monitors.remove(["a.rv"], who="eve")).removed == ["a.rv"]
 
 
-async def test_a_change_that_is_meant_for_another_revision_is_refused(desk: Desk) -> None:
-    """Two engineers cannot overwrite each other."""
+async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) -> None:
+    """Two engineers cannot overwrite each other: not after a load, a switch, or a resumption."""
     monitors = desk.monitors()
-    changes: list[Callable[[], Any]] = [
-        lambda: monitors.load({"b.rv": B}, {}, who="eve", note="", expected=7),
-        lambda: monitors.reload(who="eve", expected=7),
-        lambda: monitors.remove(["a"], who="eve", expected=7),
-    ]
-    for change in changes:
-        with pytest.raises(MonitorsChangedError, match="revision 1"):
-            await change()
+    seen = [monitors.tag]
+    await monitors.load({"b.rv": B}, {}, who="adam", note="", expected=monitors.tag)
+    seen.append(monitors.tag)
+    await monitors.switch(["a"], False, who="adam", expected=monitors.tag)
+    seen.append(monitors.tag)
+    monitors.received(messages.SpecificationsTaken(2, [], ["b"]))
+    await monitors.resume(["b"], who="adam", expected=monitors.tag)
+    assert len({*seen, monitors.tag}) == 4
+    for stale in seen:
+        changes: list[Callable[[], Any]] = [
+            partial(monitors.load, {"b.rv": B}, {}, who="eve", note="", expected=stale),
+            partial(monitors.reload, who="eve", expected=stale),
+            partial(monitors.remove, ["a"], who="eve", expected=stale),
+            partial(monitors.switch, ["a"], True, who="eve", expected=stale),
+            partial(monitors.resume, ["b"], who="eve", expected=stale),
+        ]
+        for change in changes:
+            with pytest.raises(MonitorsChangedError, match="look at them first") as caught:
+                await change()
+            assert caught.value.tag == monitors.tag
+    assert (monitors.revision, monitors.enabled("a")) == (2, False)
+
+
+async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> None:
+    """Though they come at once, and the first takes its time."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
+    tag = monitors.tag
+    done = await asyncio.gather(
+        monitors.load({"c.rv": A.replace("a()", "c()")}, {}, who="adam", note="", expected=tag),
+        monitors.switch(["a"], False, who="eve", expected=tag),
+        monitors.resume(["b"], who="eve", expected=tag),
+        return_exceptions=True,
+    )
+    assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
+    assert monitors.enabled("a")
+    assert messages.MonitorResumed("b") not in desk.sent
+
+
+async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
+    """A switch that was so already, an unknown name and a bad specification leave it; no start brings one back."""
+    monitors = desk.monitors()
+    first = monitors.tag
+    assert await monitors.switch(["a"], True, who="eve") == []
+    assert await monitors.resume(["a"], who="eve") == []
+    with pytest.raises(UnknownMonitorError):
+        await monitors.switch(["a", "nobody"], False, who="eve")
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+    assert monitors.tag == first
+    await monitors.switch(["a"], False, who="eve")
+    await monitors.switch(["a"], True, who="eve")
+    assert monitors.tag != first
+    assert desk.monitors().tag == desk.monitors(restarted=True).tag == monitors.tag
 
 
 async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
