@@ -80,6 +80,25 @@ def _checked_address(text: str) -> str:
     return text
 
 
+def _checked_endpoint(text: str) -> str:
+    example = "for example 192.168.1.20 or robot.example.org"
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        if _HOST_NAME.fullmatch(text) is None or text.replace(".", "").isdecimal():
+            raise ValueError(
+                f"{text!r} is neither an address nor a name (no port, no brackets), {example}"
+            ) from None
+        if is_loopback(text):
+            raise ValueError(
+                f"{text} is this machine only, where no other host reaches it, {example}"
+            ) from None
+        return text
+    if address.is_loopback or address.is_unspecified or address.is_multicast or address.is_link_local:
+        raise ValueError(f"{text} is no address at which other hosts reach the appliance, {example}")
+    return str(address)
+
+
 def _checked_name(text: str) -> str:
     if _NODE_NAME.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
@@ -233,6 +252,12 @@ class Ipsec(_Section):
     pool: IPv4Network = Field(
         default=IPv4Network("10.113.11.0/24"),
         description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
+    )
+
+    endpoint: Annotated[str, AfterValidator(_checked_endpoint)] | None = Field(
+        default=None,
+        description="address or name at which hosts reach the appliance from outside, for their kits;"
+        " found out unless it is given here or with --appliance",
     )
 
     ca: Literal["ecdsa", "ed25519"] = Field(

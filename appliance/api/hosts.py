@@ -7,6 +7,7 @@ not change it.
 
 import asyncio
 import time
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Response
@@ -34,6 +35,7 @@ from appliance.api.roles import Admin, Operator, Viewer, answered, ask
 from appliance.api.services import Services
 from appliance.channel.admin import (
     HostAdd,
+    HostEndpoint,
     HostKit,
     HostList,
     HostPorts,
@@ -101,13 +103,14 @@ def _add_looks(router: APIRouter, desk: "_Desk") -> None:
         name: OneName,
         bearer: Operator,
         endpoint: Annotated[
-            str,
+            str | None,
             Query(pattern=ENDPOINT, description="address or name at which the host reaches the appliance"),
-        ],
+        ] = None,
     ) -> Response:
         """The kit of an enrolled host as it is now, without its private key, which the host has."""
         body = await ask(desk.control, HostKit(name), bearer)
-        return desk.archive(body, Wishes(endpoint), None)
+        placed = await desk.place(Wishes(endpoint or ""), bearer)
+        return desk.archive(body, placed.wishes, None)
 
 
 def _add_enrolment(router: APIRouter, desk: "_Desk") -> None:
@@ -127,8 +130,9 @@ def _add_enrolment(router: APIRouter, desk: "_Desk") -> None:
             return Response(made.model_dump_json(), 201, {"ETag": tag}, media_type="application/json")
         key, request = await _key_and_request(new.request)
         order = HostAdd(new.name, request, new.days, new.address, expected)
+        placed = await desk.place(wishes, bearer)
         body = await desk.slowly(order, bearer)
-        return desk.archive(body, wishes, key, 201)
+        return desk.archive(body, placed.wishes, key, 201)
 
     @router.post("/{name}/token", operation_id="host_token", responses=_CHANGES)
     async def token(
@@ -150,8 +154,9 @@ def _add_enrolment(router: APIRouter, desk: "_Desk") -> None:
         """A new certificate for an enrolled host, in a kit; the one before is revoked, its tunnel closed."""
         expected, wishes = _expected(if_match), _wishes(new)
         key, request = await _key_and_request(new.request)
+        placed = await desk.place(wishes, bearer)
         body = await desk.slowly(HostRenew(name, request, new.days, expected), bearer)
-        return desk.archive(body, wishes, key)
+        return desk.archive(body, placed.wishes, key)
 
 
 def _add_changes(router: APIRouter, desk: "_Desk") -> None:
@@ -178,6 +183,14 @@ def _add_changes(router: APIRouter, desk: "_Desk") -> None:
         return PortsSeen.model_validate(body["ports"])
 
 
+@dataclass(frozen=True)
+class _Placed:
+    """`reason`: why the endpoint is that, where none was given."""
+
+    wishes: Wishes
+    reason: str = ""
+
+
 class _Desk:
     """What the routes share."""
 
@@ -194,17 +207,25 @@ class _Desk:
         """Control's answer to what waits for charon or the signer."""
         return answered(await self.control.ask(order, bearer.name, SLOW_SECONDS))
 
+    async def place(self, wishes: Wishes, bearer: Bearer) -> "_Placed":
+        """The wishes with the address of the appliance, which it finds where nobody said it."""
+        if wishes.endpoint:
+            return _Placed(wishes)
+        body = await ask(self.control, HostEndpoint(), bearer)
+        return _Placed(replace(wishes, endpoint=body["endpoint"]), body["reason"])
+
     async def token(
         self, name: str, asked: "NewHost | TokenWishes", wishes: Wishes, expected: int | None, bearer: Bearer
     ) -> tuple[EnrolmentToken, str]:
         """A one-time token with its script, and the ETag."""
-        kept, seconds = wishes.kept(), asked.token_seconds
+        placed = await self.place(wishes, bearer)
+        kept, seconds = placed.wishes.kept(), asked.token_seconds
         order = HostToken(
             name, kept, seconds, asked.days, asked.address, expected, new=isinstance(asked, NewHost)
         )
         body = await self.slowly(order, bearer)
         try:
-            enrolment = enrolment_of(body, wishes)
+            enrolment = enrolment_of(body, placed.wishes)
         except ValueError as error:
             raise ProblemError(503, "not-available", str(error)) from None
         made = EnrolmentToken(
@@ -212,6 +233,8 @@ class _Desk:
             address=body["address"],
             token=body["token"],
             expires=body["token_expires"],
+            endpoint=placed.wishes.endpoint,
+            endpoint_reason=placed.reason,
             url=enrolment.url,
             pin=enrolment.pin,
             authority=enrolment.authority,
@@ -234,7 +257,7 @@ def _expected(if_match: str | None) -> int | None:
 
 def _wishes(given: KitWishes) -> Wishes:
     try:
-        return Wishes(given.endpoint, given.ports, tuple(given.open))
+        return Wishes(given.endpoint or "", given.ports, tuple(given.open))
     except ValueError as error:
         raise ProblemError(422, "bad-input", str(error)) from None
 

@@ -97,10 +97,11 @@ class Hosts(Model):
 class KitWishes(Asked):
     """What goes into a kit besides the certificate."""
 
-    endpoint: Annotated[
-        str,
-        Field(pattern=ENDPOINT, description="address or name at which the host reaches the appliance"),
-    ]
+    endpoint: Annotated[str, Field(pattern=ENDPOINT)] | None = Field(
+        default=None,
+        description="address or name at which the host reaches the appliance; null: `ipsec.endpoint` of the"
+        " configuration, else the machine's address towards its default route (422 when that cannot be told)",
+    )
     ports: Annotated[
         str, Field(pattern=PORTS, description="the host's local port range, which its firewall closes")
     ] = "32768-60999"
@@ -150,6 +151,8 @@ class EnrolmentToken(Model):
     address: str = Field(description="the virtual address that is kept for it")
     token: str
     expires: float
+    endpoint: str = Field(description="address or name at which the host reaches the appliance")
+    endpoint_reason: str = Field(description="why this one, where none was given; else empty")
     url: str = Field(description="where the host brings it: POST /v1/enrol there")
     pin: str = Field(description="of the key of that server, as curl's --pinnedpubkey takes it")
     authority: str = Field(description="SHA-256 of the authority's certificate, in hexadecimal")

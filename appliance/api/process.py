@@ -70,7 +70,11 @@ class _Api:
             limits=self._settings.api_limits,
             doorkeeper=self._doorkeeper,
             journal=self._journal,
-            names=[*self._settings.api_names, socket.gethostname()],
+            names=[
+                *self._settings.api_names,
+                *filter(None, [self._settings.ipsec.endpoint]),  # where hosts that enrol themselves come to
+                socket.gethostname(),
+            ],
             tunnels=self._settings.ipsec.pool,
             networks=self._settings.api_networks,
         )

@@ -211,6 +211,10 @@ class HostList(AdminRequest, frozen=True, tag="host list"):
     """All hosts that were enrolled or declared, with their tunnels."""
 
 
+class HostEndpoint(AdminRequest, frozen=True, tag="host endpoint"):
+    """At which address hosts reach the appliance, where nobody says it: `endpoint`, and `reason`: why that one."""
+
+
 class HostKit(AdminRequest, frozen=True, tag="host kit"):
     """What an enrolled host's kit is made of, without its private key."""
 
@@ -249,7 +253,7 @@ class RevocationsWanted(AdminRequest, frozen=True, tag="host revocations"):
 
 HostRequest = (
     HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | HostRenewed | HostList | HostKit | HostRevoke
-    | HostPorts | HostsReload | RevocationsWanted
+    | HostPorts | HostsReload | RevocationsWanted | HostEndpoint
 )  # fmt: skip
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions

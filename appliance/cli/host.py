@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
-from appliance.cli.host_kit import KitWriter, new_file, usage_error, wishes_of, write_script
+from appliance.cli.host_kit import KitWriter, new_file, place, usage_error, wishes_of, write_script
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import seconds_of
@@ -15,8 +15,12 @@ app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tun
 
 _Name = Annotated[str, typer.Argument(help="The host's name: `host:NAME` in the policy", show_default=False)]
 _Endpoint = Annotated[
-    str,
-    typer.Option(help="Address or name at which the host reaches the appliance (UDP 500 and 4500)"),
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Address or name at which the host reaches the appliance (UDP 500 and 4500) [default: `ipsec.endpoint` of"
+        " the configuration, else the machine's address towards its default route]",
+    ),
 ]
 _Csr = Annotated[
     Path | None,
@@ -35,7 +39,7 @@ _Ports = Annotated[str, typer.Option(help="The host's local port range, where RO
 def add(  # noqa: PLR0917  typer gives every flag by its name
     running: Appliance,
     name: _Name,
-    appliance: _Endpoint,
+    appliance: _Endpoint = None,
     address: Annotated[
         str | None, typer.Option(help="Its virtual address [default: the next free one]")
     ] = None,
@@ -53,7 +57,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
 ) -> None:
     """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
 
-    Example: rosrv host add ocu-1 --appliance 192.168.1.20 --token
+    Example: rosrv host add ocu-1 --token
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
@@ -61,13 +65,15 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             raise usage_error(
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
-        path = new_file(out, f"rosrv-{name}-join.sh")
-        order = HostToken(name, wishes.kept(), _seconds(within), days, address, new=True)
-        write_script(path, running.ask_or_exit(order, as_json=as_json), wishes, as_json=as_json)
+        path, seconds = new_file(out, f"rosrv-{name}-join.sh"), _seconds(within)
+        placed = place(running, wishes, as_json=as_json)
+        order = HostToken(name, placed.wishes.kept(), seconds, days, address, new=True)
+        write_script(path, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
         return
-    writer = KitWriter(name, wishes, csr=csr, out=out)
+    writer = KitWriter(name, csr=csr, out=out)
+    placed = place(running, wishes, as_json=as_json)
     order_kit = HostAdd(name, writer.request, days, address)
-    writer.write(running.ask_or_exit(order_kit, as_json=as_json), as_json=as_json)
+    writer.write(running.ask_or_exit(order_kit, as_json=as_json), placed, as_json=as_json)
 
 
 @app.command()
@@ -75,7 +81,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
 def kit(  # noqa: PLR0917  as above
     running: Appliance,
     name: _Name,
-    appliance: _Endpoint,
+    appliance: _Endpoint = None,
     token: Annotated[
         bool, typer.Option("--token", help="A one-time token instead: the host comes with another key")
     ] = False,
@@ -89,17 +95,19 @@ def kit(  # noqa: PLR0917  as above
 ) -> None:
     """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
 
-    Example: rosrv host kit ocu-1 --appliance 192.168.1.20
+    Example: rosrv host kit ocu-1
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
-        path = new_file(out, f"rosrv-{name}-join.sh")
-        order = HostToken(name, wishes.kept(), _seconds(within), days)
-        write_script(path, running.ask_or_exit(order, as_json=as_json), wishes, as_json=as_json)
+        path, seconds = new_file(out, f"rosrv-{name}-join.sh"), _seconds(within)
+        placed = place(running, wishes, as_json=as_json)
+        order = HostToken(name, placed.wishes.kept(), seconds, days)
+        write_script(path, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
         return
-    writer = KitWriter(name, wishes, csr=csr, out=out)
+    writer = KitWriter(name, csr=csr, out=out)
+    placed = place(running, wishes, as_json=as_json)
     body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
-    writer.write(body, as_json=as_json)
+    writer.write(body, placed, as_json=as_json)
 
 
 @app.command("list")

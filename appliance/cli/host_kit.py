@@ -3,13 +3,16 @@
 import os
 import re
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from appliance.api.kits import Wishes, enrolment_of, kit_of
+from appliance.channel.admin import HostEndpoint
 from appliance.cli.output import moment, say, say_json
+from appliance.cli.running import Appliance
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -24,14 +27,37 @@ def usage_error(text: str) -> typer.Exit:
     return typer.Exit(2)
 
 
-def wishes_of(appliance: str, ports: str, opened: list[str] | None) -> Wishes:
-    """What the flags ask for. Ends the program with 2 when that makes no sense."""
-    if not _ENDPOINT.fullmatch(appliance):
+def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Wishes:
+    """What the flags ask for; the endpoint is empty where they leave it to the appliance.
+
+    Ends the program with 2 when that makes no sense.
+    """
+    if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:
-        return Wishes(appliance, ports, tuple(opened or ()))
+        return Wishes(appliance or "", ports, tuple(opened or ()))
     except ValueError as error:
         raise usage_error(str(error)) from None
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What a host is given; `reason`: why the appliance took its own address for that, empty where it was said."""
+
+    wishes: Wishes
+    reason: str = ""
+
+
+def place(running: Appliance, wishes: Wishes, *, as_json: bool) -> Placed:
+    """The wishes with the address of the appliance, which it finds where nobody said it.
+
+    Over REST it is found when the order is carried out, and the answer has it. Ends the program with 1 when it
+    cannot be told.
+    """
+    if wishes.endpoint or running.remote:
+        return Placed(wishes)
+    body = running.ask_or_exit(HostEndpoint(), as_json=as_json)
+    return Placed(replace(wishes, endpoint=body["endpoint"]), body["reason"])
 
 
 def new_file(out: Path | None, default: str) -> Path:
@@ -45,8 +71,7 @@ def new_file(out: Path | None, default: str) -> Path:
 class KitWriter:
     """Checks everything that can be wrong before the appliance is asked, makes the key, writes the archive."""
 
-    def __init__(self, name: str, wishes: Wishes, *, csr: Path | None, out: Path | None) -> None:
-        self._wishes = wishes
+    def __init__(self, name: str, *, csr: Path | None, out: Path | None) -> None:
         self._path = new_file(out, f"rosrv-{name}.tar.gz")
         self._key: str | None = None
         if csr is None:
@@ -56,13 +81,14 @@ class KitWriter:
         else:
             self.request = _read_request(csr)
 
-    def write(self, body: dict[str, Any], *, as_json: bool) -> None:
+    def write(self, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
         """Write the archive, for its owner only."""
+        wishes = placed.wishes
         again = (
             f"{body['name']} is enrolled, its kit is not written:"
-            f" rosrv host kit {body['name']} --appliance {self._wishes.endpoint} --out FILE"
+            f" rosrv host kit {body['name']} --appliance {wishes.endpoint} --out FILE"
         )
-        _write(self._path, archive(kit_of(body, self._wishes, self._key)), again)
+        _write(self._path, archive(kit_of(body, wishes, self._key)), again)
         if body["warning"]:
             typer.echo(f"rosrv: {body['warning']}", err=True)
         if not body["rest_url"]:
@@ -71,28 +97,40 @@ class KitWriter:
                 err=True,
             )
         if as_json:
-            say_json({key: body[key] for key in _SHOWN} | {"kit": str(self._path)})
+            where = {"endpoint": wishes.endpoint, "endpoint_reason": placed.reason}
+            say_json({key: body[key] for key in _SHOWN} | where | {"kit": str(self._path)})
             return
         say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
         say(
             f"its kit: {self._path}" + ("" if self._key else " (without the private key, which the host has)")
         )
+        if placed.reason:
+            say(_taken(wishes.endpoint, placed.reason))
         say("on the host: unpack it, then sudo ./join.sh")
 
 
-def write_script(path: Path, body: dict[str, Any], wishes: Wishes, *, as_json: bool) -> None:
+def _taken(endpoint: str, reason: str) -> str:
+    return f"the appliance is at {endpoint} ({reason}); another: --appliance"
+
+
+def write_script(path: Path, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
     """Write the script of a host that was given a one-time token, and print the token."""
     try:
-        script = body.get("script") or enrolment_of(body, wishes).script()
+        script = body.get("script") or enrolment_of(body, placed.wishes).script()
     except ValueError as error:
         typer.echo(f"rosrv: {error}", err=True)
         raise typer.Exit(1) from None
+    endpoint = body.get("endpoint", placed.wishes.endpoint)
+    reason = body.get("endpoint_reason", placed.reason)
     _write(path, script.encode(), "the token is lost: ask for another one")
     if as_json:
         shown = {key: body[key] for key in ("name", "address", "token", "token_expires")}
-        say_json(shown | {"script": str(path)})
+        where = {"endpoint": endpoint, "endpoint_reason": reason}
+        say_json(shown | where | {"script": str(path)})
         return
     sys.stdout.write(body["token"] + "\n")
+    if reason:
+        typer.echo(f"rosrv: {_taken(endpoint, reason)}", err=True)
     typer.echo(
         f"rosrv: {body['name']} is awaited as {body['address']} until {moment(body['token_expires'])}; the token is"
         f" good once and shown only here.\nrosrv: on the host: sudo sh {path.name}   (it asks for the token)",

@@ -36,7 +36,7 @@ def carry_out_on_hosts(rest: Calls, request: admin.AdminRequest) -> dict[str, An
 def _token(rest: Calls, request: admin.HostToken) -> dict[str, Any]:
     kit = request.kit
     asked = {
-        "endpoint": kit["endpoint"],
+        "endpoint": kit["endpoint"] or None,
         "ports": kit["ports"],
         "open": [one for one in kit["open"].split(",") if one],
         "days": request.days,

@@ -8,6 +8,7 @@ from appliance.master.hosts import Hosts
 MINE = (
     admin.HostAdd, admin.HostToken, admin.HostEnrol, admin.HostRenew, admin.HostRenewItself, admin.HostRenewed,
     admin.HostList, admin.HostKit, admin.HostRevoke, admin.HostPorts, admin.HostsReload, admin.RevocationsWanted,
+    admin.HostEndpoint,
 )  # fmt: skip
 
 
@@ -18,6 +19,8 @@ async def manage_hosts(hosts: Hosts, request: admin.HostRequest, who: str) -> di
             return hosts.overview()
         case admin.HostKit(name):
             return await hosts.kit(name)
+        case admin.HostEndpoint():
+            return await hosts.endpoint()
         case admin.RevocationsWanted():
             return await hosts.revocations()
         case admin.HostEnrol() | admin.HostRenewItself() | admin.HostRenewed():

@@ -9,7 +9,7 @@ Invariants:
 """
 
 import ipaddress
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import structlog
@@ -32,10 +32,12 @@ class Hosts:
     """All hosts; `itself` is what they do themselves.
 
     `changed()` is called when `addresses` has changed, `expel(address, reason)` takes back what a host has; both
-    say how much that was.
+    say how much that was. `endpoint()` finds where hosts reach the appliance, as `appliance.master.endpoint` has it.
     """
 
-    def __init__(self, certification: Certification) -> None:
+    def __init__(
+        self, certification: Certification, endpoint: Callable[[], Awaitable[dict[str, Any]]]
+    ) -> None:
         self._certification = certification
         self._store = certification.store
         self._recorder = certification.recorder
@@ -48,6 +50,7 @@ class Hosts:
         self.ports = CheckedPorts(certification, self._view)
         self.changed: Callable[[], int] = lambda: 0
         self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
+        self.endpoint = endpoint
         certification.changed = lambda: self.changed()  # noqa: PLW0108  it is set later
 
     # --- what others ask ---

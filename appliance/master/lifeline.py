@@ -31,6 +31,7 @@ class ControlLifeline:
         self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
         self.tunnels_enclosed: Callable[[messages.TunnelsEnclosed], None] = lambda answer: None  # noqa: ARG005 - as above
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
+        self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
         self._early_links: list[tuple[str, int, int]] = []
 
     def attach(self) -> None:
@@ -60,6 +61,13 @@ class ControlLifeline:
         future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
         self._routes.setdefault(host, []).append(future)
         self.say(messages.RouteWanted(host))
+        return await future
+
+    async def endpoint(self) -> messages.EndpointFound:
+        """Where hosts of other networks reach the appliance, as the supervisor sees it now."""
+        future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
+        self._endpoints.append(future)
+        self.say(messages.EndpointWanted())
         return await future
 
     def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
@@ -109,8 +117,19 @@ class ControlLifeline:
             case messages.ProbePassed():
                 self.surroundings.probe = "passed"
                 self.probed("")
+            case _:
+                self._answered(message)
+
+    def _answered(self, message: Any) -> None:
+        """What control has asked for."""
+        match message:
             case messages.TunnelsEnclosed():
                 self.tunnels_enclosed(message)
+            case messages.EndpointFound():
+                waiting, self._endpoints = self._endpoints, []
+                for one in waiting:
+                    if not one.done():
+                        one.set_result(message)
             case messages.RouteFound(host, address):
                 for future in self._routes.pop(host, ()):
                     if not future.done():

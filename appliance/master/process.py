@@ -9,6 +9,7 @@ import contextlib
 import socket
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import structlog
@@ -29,6 +30,7 @@ from appliance.master.calls import MASTER_CALLS
 from appliance.master.certification import Certification
 from appliance.master.declared import Declared
 from appliance.master.doors import Doors
+from appliance.master.endpoint import find_endpoint
 from appliance.master.forwarded import Forwarded
 from appliance.master.host_table import HostRefusedError, HostTable
 from appliance.master.hosts import Hosts
@@ -162,7 +164,8 @@ class _Control:
             rest=rest_place(self._settings),
         )
         self._served = certification.served_by
-        hosts = Hosts(certification)
+        configured = self._settings.ipsec.endpoint
+        hosts = Hosts(certification, partial(find_endpoint, configured, self._lifeline.endpoint))
         self._lifeline.tunnels_enclosed = self._tunnels.answered
         await hosts.start()
         return hosts

@@ -35,6 +35,7 @@ from typing import Literal
 
 from appliance.network import links
 from appliance.network.endings import end_processes
+from appliance.network.endpoint import Endpoint, outward_address
 from appliance.network.firewall.firewall import RuleStatus, statuses
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.rules import Chain, Family, Interface, PortRange, Rule, Verdict, family_of
@@ -139,6 +140,10 @@ class Isolation:
     def host_address_for(self, peer: str) -> str:
         """Return the address by which `peer` reaches the host: what nodes on that peer are to be told."""
         return links.source_address_for(self._host, peer)
+
+    def endpoint(self) -> Endpoint:
+        """Where hosts of other networks reach the host. Raises: NetworkError when that cannot be told."""
+        return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
         """Name chains of others on the host that drop forwarded packets unless told otherwise.

@@ -9,6 +9,7 @@ import ipaddress
 import os
 import socket
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pyroute2 import IPRoute
@@ -18,6 +19,7 @@ from appliance.network.namespaces import Namespace, NetworkError
 
 IFNAMSIZ = 15  # characters
 _IFA_F_NODAD = 0x02
+_MAIN_TABLE, _UNICAST = 254, 1  # RT_TABLE_MAIN, RTN_UNICAST
 
 T = TypeVar("T")
 
@@ -144,6 +146,52 @@ def addresses(namespace: Namespace) -> list[str]:
         return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr()]
 
     return _netlink(namespace, "listing addresses", read)
+
+
+def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
+    """Return the addresses of each interface, with their prefix lengths."""
+
+    def read(route: Any) -> dict[str, list[str]]:
+        names = {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
+        held: dict[str, list[str]] = {name: [] for name in names.values()}
+        for entry in route.get_addr():
+            # Of a point-to-point link IFA_ADDRESS is the other end's; IPv6 has IFA_LOCAL there only.
+            own = entry.get_attr("IFA_LOCAL") or entry.get_attr("IFA_ADDRESS")
+            held.setdefault(names.get(entry["index"], ""), []).append(f"{own}/{entry['prefixlen']}")
+        return held
+
+    return _netlink(namespace, "listing addresses", read)
+
+
+@dataclass(frozen=True)
+class DefaultRoute:
+    """Where packets go that no other route is for; `source` is the address the route asks for, if it does."""
+
+    interface: str
+    gateway: str | None
+    source: str | None
+
+
+def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
+    """Return the default route of IPv4 or IPv6 that is preferred (lowest metric), in the main table."""
+
+    def read(route: Any) -> DefaultRoute | None:
+        family = socket.AF_INET if version == 4 else socket.AF_INET6
+        names = {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
+        found = [
+            entry
+            for entry in route.get_routes(family=family, table=_MAIN_TABLE)
+            if not entry["dst_len"] and entry["type"] == _UNICAST
+        ]
+        for entry in sorted(found, key=lambda one: one.get_attr("RTA_PRIORITY") or 0):
+            hops = entry.get_attr("RTA_MULTIPATH") or []
+            hop = hops[0] if hops else entry
+            index = hop["oif"] if hops else entry.get_attr("RTA_OIF")
+            if index in names:
+                return DefaultRoute(names[index], hop.get_attr("RTA_GATEWAY"), entry.get_attr("RTA_PREFSRC"))
+        return None
+
+    return _netlink(namespace, "looking up the default route", read)
 
 
 def networks(namespace: Namespace) -> list[str]:

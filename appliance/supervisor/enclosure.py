@@ -22,6 +22,7 @@ import structlog
 
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.network import links
+from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.rules import FirewallSettings, Forwarder, PortRange
@@ -87,6 +88,10 @@ class Enclosure:
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
         """The machine's address by which `host` reaches the appliance; None: the one it used."""
         return None
+
+    def endpoint(self) -> Endpoint:
+        """Where hosts of other networks reach the appliance. Raises `NetworkError` when that cannot be told."""
+        raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> dict[str, Any]:
         """How it stands, for `rosrv status`."""
@@ -167,6 +172,14 @@ class Contained(Enclosure):
             links.add_address(self._namespace, "lo", own)
         self._own = own
         return esp
+
+    def endpoint(self) -> Endpoint:
+        """The only address here, if there is but one: of several, the right one is known outside only."""
+        found = only_address(self._namespace, without=("lo", TUNNEL_INTERFACE))
+        if is_contained() and not lives_on_the_machines_network():
+            reason = f"{found.reason}, in a container: from outside its machine it may be another"
+            return replace(found, reason=reason)
+        return found
 
     def report(self) -> dict[str, Any]:
         """Back end, rules with counters; rules that are gone are put back first."""
@@ -288,6 +301,10 @@ class InNamespace(Contained):
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
             return None
         return self._isolation.host_address_for(host)
+
+    def endpoint(self) -> Endpoint:
+        """The machine's address towards its default route, else its only one."""
+        return self._isolation.endpoint()
 
     def report(self) -> dict[str, Any]:
         """As in a container, and the rules on the host; those that are gone are put back, too."""

@@ -13,7 +13,14 @@ from typing import TypeVar
 
 import structlog
 
-from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed, TunnelsEnclosed
+from appliance.channel.messages import (
+    EndpointFound,
+    FirewallReported,
+    Message,
+    ProbeFailed,
+    ProbePassed,
+    TunnelsEnclosed,
+)
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Enclosure
 
@@ -82,6 +89,14 @@ class Guard:
         except (NetworkError, ValueError) as error:
             log.warning("no route to a host", host=host, error=str(error))
             return None
+
+    async def endpoint(self) -> EndpointFound:
+        """Where hosts of other networks reach the appliance, or why that cannot be told."""
+        try:
+            found = await in_thread(self.enclosure.endpoint)
+        except (NetworkError, ValueError) as error:
+            return EndpointFound(None, str(error))
+        return EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
         """Look every minute."""

@@ -27,6 +27,7 @@ import structlog
 from appliance.channel.messages import (
     Announced,
     ApplianceStopRequested,
+    EndpointWanted,
     Failed,
     LogHeld,
     Message,
@@ -71,6 +72,7 @@ _FROM_CONTROL: tuple[type[Message], ...] = (
     SocketKept,
     SocketDropped,
     RouteWanted,
+    EndpointWanted,
     ApplianceStopRequested,
     LogHeld,
     TunnelsWanted,
@@ -289,6 +291,8 @@ class Supervisor:
                     self._kept.drop(name)
             case RouteWanted(host):
                 self._spawn(self._route(life, host))
+            case EndpointWanted():
+                self._spawn(self._tell_endpoint(life))
             case TunnelsWanted(pool, address):
                 self._spawn(self._open_tunnels(life, pool, address))
             case LogHeld(processes):
@@ -350,6 +354,9 @@ class Supervisor:
 
     async def _route(self, life: Life, host: str) -> None:
         life.send(RouteFound(host, await self._guard.route_to(host)))
+
+    async def _tell_endpoint(self, life: Life) -> None:
+        life.send(await self._guard.endpoint())
 
     async def _open_tunnels(self, life: Life, pool: str, address: str) -> None:
         if not CHARON.exists():

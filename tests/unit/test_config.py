@@ -138,3 +138,29 @@ def test_a_pool_of_virtual_addresses_that_cannot_be(pool: str, said: str) -> Non
     """IPv6, too small and too large: each says what is taken."""
     with pytest.raises(ValidationError, match=said):
         Settings.model_validate({"ipsec": {"pool": pool}})
+
+
+@pytest.mark.parametrize("endpoint", ["192.168.1.20", "fd00::20", "robot.example.org", "robot"])
+def test_where_hosts_reach_the_appliance(endpoint: str) -> None:
+    """An address or a name, as it stands in a kit."""
+    assert Settings.model_validate({"ipsec": {"endpoint": endpoint}}).ipsec.endpoint == endpoint
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("192.168.1.20:500", "no port"),
+        ("[fd00::20]", "no brackets"),
+        ("192.168.1.300", "neither an address nor a name"),
+        ("", "neither an address nor a name"),
+        ("a b", "neither an address nor a name"),
+        ("127.0.0.1", "no address at which other hosts"),
+        ("0.0.0.0", "no address at which other hosts"),
+        ("fe80::1", "no address at which other hosts"),
+        ("localhost", "this machine only"),
+    ],
+)
+def test_where_hosts_cannot_reach_the_appliance(endpoint: str, said: str) -> None:
+    """It is refused when the appliance is configured, not when a host cannot join."""
+    with pytest.raises(ValidationError, match=said):
+        Settings.model_validate({"ipsec": {"endpoint": endpoint}})

@@ -20,6 +20,8 @@ from appliance.channel.messages.forwarding import ForwardingLink, ForwardingRepo
 from appliance.channel.messages.lifeline import (
     Announced,
     ApplianceStopRequested,
+    EndpointFound,
+    EndpointWanted,
     Failed,
     FirewallReported,
     Lifeline,
@@ -129,6 +131,8 @@ __all__ = [
     "ConnectionClosed",
     "ConnectionOpened",
     "ConnectionRefused",
+    "EndpointFound",
+    "EndpointWanted",
     "Esp",
     "Failed",
     "FirewallReported",

@@ -133,6 +133,17 @@ class RouteFound(Message):
     address: str | None
 
 
+class EndpointWanted(Message):
+    """Control asks at which address hosts of other networks reach the appliance, for their kits."""
+
+
+class EndpointFound(Message):
+    """Supervisor's answer to `EndpointWanted`: the address and why it is that; None: `reason` says why none."""
+
+    address: str | None
+    reason: str
+
+
 class LogHeld(Message):
     """Control cannot write the audit log, because these processes hold its locks."""
 
@@ -148,7 +159,7 @@ class ApplianceStopRequested(Message):
 Lifeline = (
     Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
-    | PolicyReloadRequested | RouteWanted
+    | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
     | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip

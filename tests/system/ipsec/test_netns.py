@@ -36,7 +36,8 @@ def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
         robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
         with Appliance(bare, policy=POLICY, isolation="netns") as appliance:
             kit = tmp_path / "kit.tar.gz"
-            appliance.rosrv("host", "add", "ocu-1", "--appliance", BARE, "--out", str(kit))
+            said = appliance.rosrv("host", "add", "ocu-1", "--out", str(kit)).stdout
+            assert f"the appliance is at {BARE} (this machine's address towards its default route)" in said
             with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
                 joined.wait_until_up()
                 with (

@@ -1,12 +1,13 @@
 """Tests of `rosrv host` as a person sees it; with a running appliance: tests/system/ipsec."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from appliance.channel.admin import AdminAnswer, AdminRequest, HostList, HostRevoke, HostToken
+from appliance.channel.admin import AdminAnswer, AdminRequest, HostEndpoint, HostList, HostRevoke, HostToken
 from appliance.cli.admin_socket import AdminSocket
 from appliance.cli.main import app
 
@@ -42,6 +43,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[AdminRequest]:
         match request:
             case HostList():
                 return AdminAnswer(True, OVERVIEW)
+            case HostEndpoint():
+                return AdminAnswer(True, {"endpoint": "10.0.0.5", "reason": "the only address here"})
             case HostToken():
                 return AdminAnswer(True, TOKEN)
             case HostRevoke(name):
@@ -112,6 +115,42 @@ def test_a_token_and_its_script(asked: list[AdminRequest], tmp_path: Path) -> No
     assert again.exit_code == 2
     assert "is there already" in again.stderr
     assert len(asked) == 1, "it was not asked in vain"
+
+
+def test_the_appliance_knows_its_own_address(asked: list[AdminRequest], tmp_path: Path) -> None:
+    """Nobody has to give it; which one was taken, and why, is said."""
+    out = tmp_path / "join.sh"
+    done = run("add", "laptop", "--token", "--out", str(out))
+    assert done.exit_code == 0, done.output
+    assert done.stdout == "rosrv-enrol_x\n"
+    assert "the appliance is at 10.0.0.5 (the only address here); another: --appliance" in done.stderr
+    assert 'url="https://10.0.0.5:8443"' in out.read_text()
+    assert [type(one) for one in asked] == [HostEndpoint, HostToken]
+    assert isinstance(asked[1], HostToken)
+    assert asked[1].kit["endpoint"] == "10.0.0.5"
+    out.unlink()
+    shown = json.loads(run("kit", "laptop", "--token", "--out", str(out), "--json").stdout)
+    assert (shown["endpoint"], shown["endpoint_reason"]) == ("10.0.0.5", "the only address here")
+
+
+def test_an_address_that_cannot_be_told_enrols_nobody(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Exit status 1, the reason in words or as JSON; nothing else is asked, and nothing is written."""
+
+    def ask(_self: AdminSocket, request: AdminRequest) -> AdminAnswer:
+        assert request == HostEndpoint()
+        return AdminAnswer(False, error="there are several; give it: --appliance ADDRESS", trouble="refused")
+
+    monkeypatch.setattr(AdminSocket, "ask", ask)
+    for verb in ("add", "kit"):
+        done = run(verb, "laptop", "--out", str(tmp_path / "kit"))
+        assert (done.exit_code, done.stdout) == (1, "")
+        assert done.stderr == "rosrv: there are several; give it: --appliance ADDRESS\n"
+        as_json = run(verb, "laptop", "--out", str(tmp_path / "kit"), "--json")
+        assert as_json.exit_code == 1
+        assert json.loads(as_json.stdout)["error"].startswith("there are several")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ class Bench:
             rest=RestPlace(8443, "", 8443),
         )
         certification.served_by("sha256//pin")
-        self.hosts = Hosts(certification)
+        self.hosts = Hosts(certification, self._endpoint)
         self.hosts.changed = self._changed
         self.hosts.expel = self._expel
 
@@ -102,6 +102,9 @@ class Bench:
     def _said(self, message: Message) -> None:
         self.asked.append(message)
         self.tunnels.answered(self.answer)
+
+    async def _endpoint(self) -> dict[str, Any]:
+        return {"endpoint": "10.0.0.1", "reason": "it is"}
 
     def _changed(self) -> int:
         self.order.append(f"policy {sorted(self.hosts.addresses)}")

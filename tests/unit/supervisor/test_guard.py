@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.messages import FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.guard import Guard
@@ -128,3 +128,10 @@ def test_without_isolation_nothing_is_probed() -> None:
 
     asyncio.run(scene())
     assert told == [FirewallReported("none", {})]
+
+
+def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
+    """Why is handed on instead; nothing is raised in the supervisor."""
+    assert asyncio.run(Guard(surroundings, lambda _message: None).endpoint()) == EndpointFound(
+        None, "isolation container has no tunnels: use isolation netns or container"
+    )
