@@ -41,6 +41,47 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
     assert {one["detail"]["who"] for one in events} == {"first"}
 
 
+def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """The second is meant for what the first one made, whose ETag nobody has yet when it is clicked."""
+    page = opened().go("monitors")
+    names = ("safeZone", "safeTrigger")
+    switches = [page.get_by_role("switch", name=f"{name} enabled") for name in names]
+    before = [state(appliance, name)["enabled"] for name in names]
+    for _ in range(2):
+        wanted = [not one for one in before]
+        page.evaluate(
+            "names => names.forEach(name => document.querySelector(`[aria-label='${name} enabled']`).click())",
+            list(names),
+        )
+        for switch, on in zip(switches, wanted, strict=True):
+            expect(switch).to_have_attribute("aria-checked", str(on).lower())
+        assert [state(appliance, name)["enabled"] for name in names] == wanted
+        before = wanted
+    expect(page.get_by_text("Somebody else was quicker")).to_have_count(0)
+
+
+def test_a_switch_that_somebody_else_was_quicker_with_says_so(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """What the page has not seen yet is not overwritten; then it shows what is."""
+    reader = opened()
+    page = reader.go("monitors")
+    switch = page.get_by_role("switch", name="safeZone enabled")
+    before = state(appliance, "safeZone")["enabled"]
+    expect(switch).to_have_attribute("aria-checked", str(before).lower())
+    page.route("**/v1/live*", lambda route: route.abort())
+    page.route("**/v1/monitors", lambda route: route.abort())  # it hears nothing of what others do
+    appliance.rosrv("monitor", "disable" if before else "enable", "safeZone")
+    other = state(appliance, "safeTrigger")["enabled"]
+    page.get_by_role("switch", name="safeTrigger enabled").click()
+    expect(reader.toast("Somebody else was quicker")).to_be_visible()
+    assert state(appliance, "safeTrigger")["enabled"] is other
+    page.unroute("**/v1/monitors")
+    page.reload()
+    expect(switch).to_have_attribute("aria-checked", str(not before).lower())
+    appliance.rosrv("monitor", "enable" if before else "disable", "safeZone")
+
+
 def test_a_specification_is_loaded_replaced_and_removed(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:

@@ -1,27 +1,47 @@
 /** The monitors as `/v1/monitors` has them, fetched anew when the appliance says that something changed. */
 
-import { useEffect, useState } from "../html.js";
+import { useEffect, useRef, useState } from "../html.js";
 import { live } from "../live.js";
 import { ask } from "../rest.js";
 import { useStore } from "../store.js";
 
-/** @returns {{body: any, etag: string, error: unknown, again: () => Promise<void>}} */
+/**
+ * `change` sends what changes one of them as it is shown here. Such changes wait for one another: every one makes another
+ * ETag, and a second click before the first is answered is meant for what the first one made.
+ * @returns {{body: any, etag: string, error: unknown, again: () => Promise<void>, change: (name: string, to: any) => Promise<void>}}
+ */
 export function useMonitors() {
   const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
   const mark = useStore(live, (one) => JSON.stringify(one.status?.monitors ?? null));
   const counted = useStore(live, (one) => JSON.stringify(one.samples.at(-1)?.monitors ?? null));
+  const shown = useRef({ etag: "", changes: 0, last: /** @type {Promise<unknown>} */ (Promise.resolve()) });
   const again = async () => {
+    const { changes } = shown.current;
     try {
       const { body, etag } = await ask("GET", "/v1/monitors");
+      if (changes !== shown.current.changes) return; // it may be from before a change, which has it fetched anew
+      shown.current.etag = etag ?? "";
       setState({ body, etag: etag ?? "", error: null });
     } catch (error) {
       setState((state) => ({ ...state, error }));
     }
   };
+  const change = (/** @type {string} */ name, /** @type {any} */ to) => {
+    const made = shown.current.last.then(async () => {
+      try {
+        const { etag } = await ask("PATCH", `/v1/monitors/${encodeURIComponent(name)}`, { json: to, match: shown.current.etag });
+        shown.current.etag = etag ?? "";
+      } finally {
+        shown.current.changes += 1;
+      }
+    });
+    shown.current.last = made.catch(() => {});
+    return made;
+  };
   useEffect(() => {
     again();
   }, [mark, counted]);
-  return { ...state, again };
+  return { ...state, again, change };
 }
 
 /** In one word. @param {any} row */

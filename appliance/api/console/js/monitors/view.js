@@ -70,7 +70,7 @@ function summed(/** @type {any[]} */ samples, /** @type {string} */ name) {
 export function MonitorSwitch({ row, monitors }) {
   const change = async () => {
     try {
-      await ask("PATCH", `/v1/monitors/${encodeURIComponent(row.name)}`, { json: { enabled: !row.enabled }, match: monitors.etag });
+      await monitors.change(row.name, { enabled: !row.enabled });
       done(`${row.name} is ${row.enabled ? "disabled" : "enabled"}`, row.enabled ? "Messages pass it untouched." : "Its events happen from now on.");
     } catch (failure) {
       failed(failure);
@@ -84,7 +84,7 @@ export function MonitorSwitch({ row, monitors }) {
 export function Resume({ row, monitors }) {
   const change = async () => {
     try {
-      await ask("PATCH", `/v1/monitors/${encodeURIComponent(row.name)}`, { json: { held: false }, match: monitors.etag });
+      await monitors.change(row.name, { held: false });
       done(`${row.name} is resumed`, "The topics that it held go on.");
     } catch (failure) {
       failed(failure);
