@@ -17,7 +17,7 @@ const LASTS = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600"
 
 /** @param {{host?: any, etag: string, close: () => void, after: () => Promise<void>}} given `host`: one that is there already */
 export function Enrol({ host, etag, close, after }) {
-  const [form, setForm] = useState({ name: host?.name ?? "", how: "token", endpoint: location.hostname.replace(/^\[|\]$/g, ""), days: "90", token_seconds: "3600", open: "", address: "" });
+  const [form, setForm] = useState({ name: host?.name ?? "", how: "token", endpoint: reachedAt(location.hostname), days: "90", token_seconds: "3600", open: "", address: "" });
   const [error, setError] = useState(/** @type {unknown} */ (null));
   const [made, setMade] = useState(/** @type {any} */ (null));
   const set = (/** @type {string} */ name) => (/** @type {string} */ value) => setForm({ ...form, [name]: value });
@@ -39,19 +39,25 @@ export function Enrol({ host, etag, close, after }) {
   };
   if (made) return html`<${Made} made=${made} close=${close} />`;
   const title = host ? `A new ${host.enrolled === null ? "token" : "certificate"} for ${host.name}` : "Enrol a host";
-  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="admin" tone="primary" disabled=${!form.name || !form.endpoint} why="Name and address are needed" onClick=${go}>${token ? "Make the token" : "Make the kit"}</${Button}>`;
+  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="admin" tone="primary" disabled=${!form.name} why="A name is needed" onClick=${go}>${token ? "Make the token" : "Make the kit"}</${Button}>`;
   return html`<${Dialog} title=${title} close=${close} foot=${foot}><${Failure} error=${error} />
     ${!host && html`<${Field} label="Name" mono value=${form.name} set=${set("name")} placeholder="ocu-1" hint="host:NAME in the policy" />`}
     <${Field} label="How" value=${form.how} set=${set("how")} options=${HOW} />
     ${host?.enrolled && !token && html`<${Notice} tone="warn">The certificate before is revoked and its tunnel closed at once.</${Notice}>`}
-    <div class="form-grid"><${Field} label="Address of the appliance, from there" mono value=${form.endpoint} set=${set("endpoint")} hint="UDP 500 and 4500 must be reachable" /><${Field} label="Certificate lasts (days)" type="number" min="1" max="398" value=${form.days} set=${set("days")} /></div>
+    <div class="form-grid"><${Field} label="Address of the appliance, from there" mono value=${form.endpoint} set=${set("endpoint")} placeholder="what the appliance finds" hint="UDP 500 and 4500 must be reachable" /><${Field} label="Certificate lasts (days)" type="number" min="1" max="398" value=${form.days} set=${set("days")} /></div>
     <div class="form-grid">${token && html`<${Field} label="The token can be used for" value=${form.token_seconds} set=${set("token_seconds")} options=${LASTS} />`}<${Field} label="Services that stay open there" mono value=${form.open} set=${set("open")} placeholder="tcp/22" hint="all others are closed to all but the appliance" />
       ${!host && html`<${Field} label="Virtual address" mono value=${form.address} set=${set("address")} placeholder="the next free one" />`}</div></${Dialog}>`;
 }
 
+/** Where the browser reaches the appliance is where hosts do, too, unless it sits on the same machine. */
+function reachedAt(/** @type {string} */ hostname) {
+  const name = hostname.replace(/^\[|\]$/g, "");
+  return name === "localhost" || name === "::1" || name.startsWith("127.") ? "" : name;
+}
+
 function request(/** @type {Record<string, string>} */ form, /** @type {any} */ host, /** @type {string} */ etag) {
   const token = form.how === "token";
-  const common = { endpoint: form.endpoint, days: Number(form.days), open: form.open.split(/[\s,]+/).filter(Boolean) };
+  const common = { endpoint: form.endpoint || null, days: Number(form.days), open: form.open.split(/[\s,]+/).filter(Boolean) };
   const timed = token ? { token_seconds: Number(form.token_seconds) } : {};
   if (host) return send("POST", `/v1/hosts/${encodeURIComponent(host.name)}/${token ? "token" : "kit"}`, { json: { ...common, ...timed }, match: etag });
   return send("POST", "/v1/hosts", { json: { ...common, ...timed, name: form.name, how: form.how, address: form.address || null }, match: etag });
@@ -62,7 +68,7 @@ function Made(/** @type {{made: any, close: () => void}} */ { made, close }) {
   const script = () => save(new Blob([made.script], { type: "text/x-shellscript" }), `rosrv-${made.name}-join.sh`);
   return html`<${Dialog} title=${`${made.name} may enrol itself`} close=${close} foot=${html`<button class="button primary" onClick=${close}>Done</button>`}>
     <${Notice} tone="warn" title="Shown this once">The token is kept nowhere. It can be used one time, until <${Moment} at=${made.expires} />.</${Notice}>
-    <dl class="facts"><dt>Host</dt><dd><${Given} value=${made.name} mono />, <${Given} value=${made.address} mono /></dd><dt>Token</dt><dd data-token><${Given} value=${made.token} mono most=${200} /></dd><dt>Brought to</dt><dd><${Given} value=${made.url} mono most=${200} /></dd></dl>
+    <dl class="facts"><dt>Host</dt><dd><${Given} value=${made.name} mono />, <${Given} value=${made.address} mono /></dd><dt>Token</dt><dd data-token><${Given} value=${made.token} mono most=${200} /></dd><dt>Brought to</dt><dd><${Given} value=${made.url} mono most=${200} />${made.endpoint_reason && html` <${Given} value=${`(${made.endpoint_reason})`} />`}</dd></dl>
     <p>Bring the script there and run it as root: it makes the key on the host, enrols it, and starts and checks the tunnel.</p>
     <pre class="bytes">sudo sh rosrv-${made.name}-join.sh</pre>
     <div class="row"><button class="button" onClick=${script}><${Icon} name="down" size=${16} />Download the script</button></div></${Dialog}>`;
