@@ -20,6 +20,9 @@ _WITH_TOKEN = {
     "401": "No token, or a wrong, expired or revoked one.",
     "503": "The appliance cannot answer now.",
 }
+_NOT_HTTP = (
+    "What came is not HTTP, or its first line or headers are too long (64 KiB); the server's own words."
+)
 _REFERENCE = {"$ref": "#/components/schemas/Problem"}
 
 
@@ -61,3 +64,5 @@ def _complete(operation: dict[str, Any]) -> None:
             if response["description"] == "Validation Error":
                 response["description"] = "A parameter or the body makes no sense."
             response["content"] = {MEDIA_TYPE: {"schema": _REFERENCE}}
+    words = responses.setdefault("400", {"description": _NOT_HTTP}).setdefault("content", {})
+    words["text/plain"] = {"schema": {"type": "string"}}

@@ -157,6 +157,10 @@ def _furnish(tree: Path, kernel: Kernel) -> None:
         for place in units.glob(f"*.wants/{name}"):
             place.unlink()
     (tree / "etc/machine-id").write_text("")  # one of its own at each start
+    # systemd empties /tmp at its start: the checkout may lie there.
+    kept = tree / "etc/tmpfiles.d"
+    kept.mkdir(exist_ok=True)
+    (kept / "tmp.conf").symlink_to("/dev/null")
     (tree / "etc/hostname").write_text("rosrv-machine\n")
     (tree / "etc/resolv.conf").write_text("")
 

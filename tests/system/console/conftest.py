@@ -41,16 +41,16 @@ def chromium() -> str:
     return need_program("chromium", "chromium")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # it has an event loop: other tests of this process want none
 def playwright() -> Iterator[Playwright]:
-    """What drives browsers: one for all tests."""
+    """What drives browsers: one for the tests of a file."""
     with sync_playwright() as driver:
         yield driver
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
-    """A browser of this machine, for all tests."""
+    """A browser of this machine, for the tests of a file."""
     started = launch(playwright, chromium)
     yield started
     started.close()

@@ -63,5 +63,4 @@ def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
 def test_the_machine_is_alone(machine: Machine) -> None:
     """It runs Debian's cloud kernel and has no network card: what happens in it stays in it."""
     assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
-    listed = machine.run("ip", "-brief", "link").output.splitlines()
-    assert [line.split()[0] for line in listed] == ["lo"]
+    assert machine.run("ls", "/sys/class/net").output.split() == ["lo"]
