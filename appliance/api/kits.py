@@ -43,7 +43,9 @@ def kit_of(body: Mapping[str, Any], wishes: Wishes, key: str | None) -> Kit:
         certificate=body["certificate"],
         authority=body["authority"],
         key=key,
-        protect=protection([body["appliance"]], parse_ports(wishes.ports), parse_services(wishes.opened)),
+        protect=protection(
+            [body["appliance"]], parse_ports(wishes.ports), parse_services(wishes.opened), tunnelled=True
+        ),
         rest=rest_of(body),
     )
 

@@ -27,6 +27,8 @@ from appliance.network.namespaces import NetworkError
 TABLE = "rosrv_protect"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _NFT_SECONDS = 20.0
+# ESP in the kernel; ESP in user space, where strongSwan's TUN device has this name. join.sh looks for both.
+_THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 
@@ -79,15 +81,23 @@ def local_port_range() -> PortRange:
     return PortRange(int(first), int(last))
 
 
-def protection(appliances: Sequence[str], ports: PortRange, services: Sequence[Service]) -> str:
-    """Return the nftables file that closes `ports` to all but loopback and the appliances."""
+def protection(
+    appliances: Sequence[str], ports: PortRange, services: Sequence[Service], *, tunnelled: bool = False
+) -> str:
+    """Return the nftables file that closes `ports` to all but loopback and the appliances.
+
+    `tunnelled`: the appliances' addresses count only when a packet came through IPsec, which a stranger on the wire
+    cannot forge. There are two rules then, for ESP in the kernel and for ESP in user space; the one that the
+    machine does not need can never be right there, and may be taken out.
+    """
     if not appliances:
         raise ValueError("the address of at least one appliance is needed")
     rules = ['iifname "lo" accept']
     for keyword, version in (("ip", 4), ("ip6", 6)):
         found = [text for text in appliances if ipaddress.ip_address(text).version == version]
         if found:
-            rules.append(f"{keyword} saddr {{ {', '.join(sorted(set(found)))} }} accept")
+            source = f"{keyword} saddr {{ {', '.join(sorted(set(found)))} }} accept"
+            rules += [f"{through}{source}" for through in (_THROUGH_IPSEC if tunnelled else ("",))]
     rules += [f"{one.protocol} dport {one.ports} accept" for one in dict.fromkeys(services)]
     rules += [
         f"tcp dport {ports} tcp flags & (syn | ack) == syn counter reject with tcp reset",

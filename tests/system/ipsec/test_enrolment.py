@@ -9,9 +9,11 @@ import json
 import os
 import re
 import signal
+import socket
 import ssl
 import subprocess
 import tarfile
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -20,9 +22,11 @@ from typing import Any
 import pytest
 
 from appliance.ipsec.requests import make_key, signing_request
+from appliance.network import links
 from appliance.network.lab import Lab
 from tests.support.appliance import ROSRV
 from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root
 from tests.support.rest import Rest
 from tests.support.script_host import ScriptHost
@@ -88,6 +92,7 @@ def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, 
     assert (found["state"], found["address"], found["token_expires"]) == ("up", address, None)
     nodes_talk(site, laptop, address)
     closed(site, laptop)
+    forged(site, laptop)
     again(site, laptop, script)
     renew(site, laptop)
     leave(site, laptop, before)
@@ -131,6 +136,28 @@ def closed(site: TunnelSite, laptop: ScriptHost) -> None:
     seen = row(site, "laptop")["ports"]
     assert (seen["state"], seen["open"], seen["who"]) == ("closed", [], "first")
     assert site.appliance.status()["ipsec"]["ports"]["laptop"]["state"] == "closed"
+
+
+def forged(site: TunnelSite, laptop: ScriptHost) -> None:
+    """A datagram from the wire with the appliance's tunnel address is dropped: it counts in the tunnel only."""
+    before = dropped(laptop)
+    stranger = site.attacker.namespace
+    links.add_address(stranger, "lo", f"{OWN}/32")
+    try:
+        with stranger.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind((OWN, 0))
+            sock.sendto(b"forged", (OCU, 40_000))
+        deadline = time.monotonic() + LIMIT
+        while dropped(laptop) == before:
+            assert time.monotonic() < deadline, "the forged datagram passed the laptop's firewall"
+    finally:
+        links.delete_address(stranger, "lo", f"{OWN}/32")
+
+
+def dropped(laptop: ScriptHost) -> int:
+    """The datagrams that the laptop's firewall has dropped."""
+    rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
+    return int(re.findall(r"udp dport .* counter packets (\d+) bytes \d+ drop", rules)[0])
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:

@@ -1,6 +1,7 @@
 """Tests of a host's kit: what is in it, and for whose eyes."""
 
 import io
+import re
 import subprocess
 import tarfile
 from dataclasses import replace
@@ -20,7 +21,7 @@ KIT = Kit(
     certificate="CERTIFICATE\n",
     authority="AUTHORITY\n",
     key="KEY\n",
-    protect=protection(["10.113.11.1"], PortRange(32768, 60999), ()),
+    protect=protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True),
 )
 
 
@@ -83,8 +84,25 @@ def test_the_tunnel_carries_the_way_to_the_appliance_only() -> None:
 
 
 def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
-    """Its ROS ports are open to the appliance's tunnel address and to nobody else."""
-    assert "ip saddr { 10.113.11.1 } accept" in unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
+    """Its ROS ports are open to the appliance's tunnel address, through IPsec, and to nobody else."""
+    text = unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
+    named = [line.strip() for line in text.splitlines() if "saddr" in line]
+    assert named == [
+        "meta ipsec exists ip saddr { 10.113.11.1 } accept",
+        'iifname "ipsec*" ip saddr { 10.113.11.1 } accept',
+    ]
+
+
+def test_the_script_takes_out_the_rule_that_is_never_right() -> None:
+    """One of two stays, for where ESP runs: on a kernel without IPsec the other could not even be loaded."""
+    files = unpack(KIT)
+    script, text = files["rosrv-ocu-1/join.sh"][0], files["rosrv-ocu-1/protect.nft"][0]
+    patterns = re.findall(r"""^    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)
+    assert len(patterns) == 2
+    for single, double in patterns:
+        left = [line for line in text.splitlines() if (single or double) not in line]
+        assert len(left) == len(text.splitlines()) - 1
+        assert sum("saddr" in line for line in left) == 1
 
 
 def test_a_kit_says_where_its_certificate_is_renewed() -> None:
