@@ -34,8 +34,7 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	@# Two folders at a time (tests/system/conftest.py). What fails beside another is tried once more, alone, and both are shown.
-	$(PYTEST) tests/system --quiet -n 2 --dist loadgroup --durations=15 || \
+	$(PYTEST) tests/system --quiet --durations=15 || \
 		{ echo "== once more: what failed"; $(PYTEST) tests/system --quiet --last-failed --last-failed-no-failures none; }
 
 bench: setup ## measure: every program in benchmarks/
