@@ -124,7 +124,9 @@ def test_every_operation_is_described(appliance: Appliance) -> None:
         assert one.get("description"), name
         assert ("security" in one) == (name not in WITHOUT_TOKEN), name
         for status, response in one["responses"].items():
-            if status == "400":  # what the server says where there is no request yet, so no application either
+            if (
+                status == "400"
+            ):  # what the server says where there is no request yet, so no application either
                 assert "text/plain" in response["content"], name
             elif int(status) > 400:
                 assert list(response["content"]) == ["application/problem+json"], (name, status)
