@@ -309,7 +309,8 @@ def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, t
     assert "in force" in laptop.run("/etc/rosrv/renew.sh").stdout
     site.recorded(mark, event="host renewed")
     second = row(site, "brief")
-    assert second["expires"] > first["expires"]
+    assert second["serial"] != first["serial"]
+    assert second["expires"] >= first["expires"]  # in whole seconds, and a quick machine takes less
     site.recorded(mark, event="tunnel down")
     site.recorded(site.mark - 1, event="tunnel up")
     assert row(site, "brief")["serial"] == second["serial"]
