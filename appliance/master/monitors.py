@@ -244,7 +244,14 @@ class Monitors:
                 self._switches[name] = enabled
                 self._stating.tell(name, messages.MonitorSwitched(name, enabled))
                 word = "enabled" if enabled else "disabled"
-                self._record(f"monitor {word}", f"{name} is {word}", name, who)
+                self._recorder.happened(
+                    f"monitor {word}",
+                    f"{name} is {word}",
+                    severity=Severity.NOTICE,
+                    category="monitor",
+                    resource=name,
+                    who=who,
+                )
             if changed:
                 self._store.save_setting(_SWITCHES, json.dumps(self._switches))
                 await self._store.settled()
@@ -261,7 +268,14 @@ class Monitors:
             for name in held:
                 self._stating.tell(name, messages.MonitorResumed(name))
                 self._stating.resumed(name)
-                self._record("monitor resumed", f"the topics of {name} go on", name, who)
+                self._recorder.happened(
+                    "monitor resumed",
+                    f"the topics of {name} go on",
+                    severity=Severity.NOTICE,
+                    category="monitor",
+                    resource=name,
+                    who=who,
+                )
             return held
 
     # --- what the relay says ---
@@ -303,11 +317,6 @@ class Monitors:
         self._store.save_setting(_ACTS, str(self._acts + 1))
         await self._store.settled()
         self._acts += 1
-
-    def _record(self, event: str, reason: str, name: str, who: str) -> None:
-        self._recorder.happened(
-            event, reason, severity=Severity.NOTICE, category="monitor", resource=name, who=who
-        )
 
     async def _change(self, sources: Sources, keeper: str, who: str, note: str) -> Replaced:
         before, previous = self.revision, self.sources
