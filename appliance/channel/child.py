@@ -10,7 +10,7 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, Stop
 
 
@@ -36,16 +36,18 @@ class Child:
     def attach(self, ready: Ready) -> None:
         """Begin to listen, and say that this process is in service."""
         self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
-        self._lifeline.send(ready)
+        self._answer(ready)
 
-    def tell(self, message: Message) -> None:
-        """Tell control something; nothing happens while there is none: it asks again over its next link."""
+    def tell(self, message: Message) -> bool:
+        """Tell control something; False while there is none, or it reads nothing: it asks again over its next link."""
         if self._control is None:
-            return
+            return False
         try:
             self._control.send(message)
-        except ChannelClosedError:
+        except (ChannelClosedError, ChannelFullError):
             self._control = None
+            return False
+        return True
 
     def close(self) -> None:
         """Close the link to control."""
@@ -56,7 +58,7 @@ class Child:
     def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:
             case Ping(number):
-                self._lifeline.send(Pong(number))
+                self._answer(Pong(number))
             case Stop():
                 self.ended.set()
             case LinkOpened(role="control"):
@@ -64,6 +66,12 @@ class Child:
             case _:
                 for descriptor in descriptors:
                     os.close(descriptor)
+
+    def _answer(self, message: Message) -> None:
+        try:
+            self._lifeline.send(message)
+        except ChannelClosedError:
+            self.ended.set()  # the supervisor is gone
 
     def _open(self, descriptor: int) -> None:
         self.close()

@@ -6,7 +6,6 @@ firewall lets this user reach the receiver and nobody else. It outlives control:
 
 import asyncio
 import contextvars
-import os
 import socket
 import threading
 from collections.abc import Callable
@@ -14,16 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import structlog
 
 from appliance.channel import messages
-from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.channel import Channel
+from appliance.channel.child import Child
 from appliance.config import Settings, Syslog, load_resolved
 from appliance.forwarding.forwarder import Forwarder, Progress
 from appliance.forwarding.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
 from appliance.forwarding.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
 
-_log = structlog.get_logger()
 _REPORT_SECONDS = 1.0
 _LAST_SECONDS = 1.0
 
@@ -37,27 +35,27 @@ class _Process:
     """The parts of the process and the wires between them."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
-        self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
-        self._control: Channel | None = None
+        lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self._child = Child(
+            lifeline, messages.ForwardingLink, said=lambda _message: None, linked=self._report_anew
+        )
         self._told: messages.ForwardingReported | None = None
-        self._stopping = asyncio.Event()
         self._ending = threading.Event()
         self._forwarder = make_forwarder(settings, Path.cwd() / "position.json")
 
     async def run(self) -> None:
         """Forward from start to end."""
-        self._lifeline.attach(asyncio.get_running_loop(), self._received, self._stopping.set)
         # A daemon: when a receiver hangs, the end does not wait for it; its batch is sent again at the next start.
         said_with_logs = contextvars.copy_context()  # which process this is
         thread = threading.Thread(
             target=said_with_logs.run, args=(self._forward,), name="forward", daemon=True
         )
         thread.start()
-        self._say(messages.Ready())
-        while not self._stopping.is_set():
+        self._child.attach(messages.Ready())
+        while not self._child.ended.is_set():
             self._report()
             try:
-                await asyncio.wait_for(self._stopping.wait(), _REPORT_SECONDS)
+                await asyncio.wait_for(self._child.ended.wait(), _REPORT_SECONDS)
             except TimeoutError:
                 if not thread.is_alive():
                     break  # a defect, which it has said: the supervisor starts a fresh life
@@ -71,45 +69,11 @@ class _Process:
 
     def _report(self) -> None:
         message = report_of(self._forwarder.progress)
-        if self._control is None or message == self._told:
-            return
-        try:
-            self._control.send(message)
+        if message != self._told and self._child.tell(message):
             self._told = message
-        except (ChannelClosedError, ChannelFullError):
-            self._control = None
 
-    def _say(self, message: messages.Message) -> None:
-        try:
-            self._lifeline.send(message)
-        except ChannelClosedError:
-            self._stopping.set()
-
-    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        match message:
-            case messages.Ping(number):
-                self._say(messages.Pong(number))
-            case messages.Stop():
-                self._stopping.set()
-            case messages.LinkOpened(role) if role == "control":
-                self._link(Channel(socket.socket(fileno=descriptors[0]), messages.ForwardingLink))
-            case _:
-                for descriptor in descriptors:
-                    os.close(descriptor)
-                _log.error(
-                    "the supervisor said what is not for the forwarder", message=type(message).__name__
-                )
-
-    def _link(self, channel: Channel) -> None:
-        if self._control is not None:
-            self._control.close()
-        self._control, self._told = channel, None
-
-        def lost(_reason: str = "") -> None:
-            if self._control is channel:
-                self._control = None
-
-        channel.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lost, lost)
+    def _report_anew(self) -> None:
+        self._told = None
         self._report()
 
 
