@@ -19,7 +19,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Operator, Viewer
+from appliance.api.roles import OPERATOR, VIEWER, Viewer
 from appliance.api.services import Services
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.database import LogUnreadableError
@@ -211,9 +211,8 @@ def routes(services: Services) -> APIRouter:
     router = APIRouter(prefix="/v1/audit", tags=["audit"])
     desk = Desk(services)
 
-    @router.get("", operation_id="search_audit", responses=_json(_PAGE))
+    @router.get("", operation_id="search_audit", responses=_json(_PAGE), dependencies=[VIEWER])
     async def search_audit(
-        bearer: Viewer,  # noqa: ARG001  asked for its role
         wanted: Wanted,
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
         limit: Limit = 100,
@@ -242,8 +241,8 @@ def routes(services: Services) -> APIRouter:
             raise ProblemError(503, "busy", "too many clients follow the audit log", retry_after=10)
         return EventSourceResponse(_follow(services, desk, follower, bearer), ping=_PING_SECONDS)
 
-    @router.get("/verify", operation_id="verify_audit", response_model=Verified)
-    async def verify_audit(bearer: Operator) -> JSONResponse:  # noqa: ARG001  asked for its role
+    @router.get("/verify", operation_id="verify_audit", response_model=Verified, dependencies=[OPERATOR])
+    async def verify_audit() -> JSONResponse:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
         What the signer remembers is not looked at: `rosrv audit verify` on the machine does that too.
@@ -251,9 +250,10 @@ def routes(services: Services) -> APIRouter:
         async with desk.turn(desk.verification, "verifications"):
             return JSONResponse(msgspec.to_builtins(await desk.in_thread(verify, desk.path)))
 
-    @router.get("/checkpoints", operation_id="audit_checkpoints", response_model=LogCheckpoints)
+    @router.get(
+        "/checkpoints", operation_id="audit_checkpoints", response_model=LogCheckpoints, dependencies=[VIEWER]
+    )
     async def audit_checkpoints(
-        bearer: Viewer,  # noqa: ARG001  asked for its role
         after: Annotated[int, Query(ge=0, le=10**18, description="only those with a greater number")] = 0,
         limit: Limit = 1000,
     ) -> JSONResponse:
@@ -262,18 +262,22 @@ def routes(services: Services) -> APIRouter:
         return JSONResponse({"checkpoints": msgspec.to_builtins(found)})
 
     @router.get(
-        "/export", operation_id="export_audit", responses=_text("application/x-ndjson", "A record a line.")
+        "/export",
+        operation_id="export_audit",
+        dependencies=[VIEWER],
+        responses=_text("application/x-ndjson", "A record a line."),
     )
-    async def export_audit(bearer: Viewer, wanted: Wanted) -> StreamingResponse:  # noqa: ARG001  its role
+    async def export_audit(wanted: Wanted) -> StreamingResponse:
         """All records that match, oldest first, one JSON object a line."""
         entries = await desk.read(lambda: _begun(export(desk.path, wanted)))
         if desk.exports.locked():
             raise ProblemError(503, "busy", "too many exports at once", retry_after=10)
         return StreamingResponse(_lines(entries, desk.exports), media_type="application/x-ndjson")
 
-    @router.get("/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN)
+    @router.get(
+        "/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN, dependencies=[VIEWER]
+    )
     async def audit_record(
-        bearer: Viewer,  # noqa: ARG001  asked for its role
         record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")],
         neighbours: Annotated[int, Query(ge=0, le=100)] = 5,
     ) -> JSONResponse:

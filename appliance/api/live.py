@@ -18,7 +18,7 @@ from appliance.api.alarms import open_alarms
 from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, History, Sample, Seen
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Viewer, ask
+from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import GraphWanted
 
@@ -53,9 +53,8 @@ def routes(services: Services, history: History) -> APIRouter:
     router = APIRouter(prefix="/v1", tags=["status"])
     streams = asyncio.Semaphore(services.settings.api_limits.streams)
 
-    @router.get("/history", operation_id="history")
+    @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(
-        bearer: Viewer,  # noqa: ARG001  asked for its role
         points: Annotated[int, Query(ge=2, le=1800, description="at most so many samples")] = 360,
     ) -> Hour:
         """Decisions, relayed messages and what monitors did over the last hour, as counters."""

@@ -11,7 +11,7 @@ from appliance.api.monitor_judgement import Compiler, events_of, picture_of, pro
 from appliance.api.monitor_models import Happened, History, Monitor, Monitors
 from appliance.api.preconditions import etag
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Viewer, ask
+from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.services import Services
 from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
@@ -109,10 +109,9 @@ def routes(services: Services) -> APIRouter:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")
 
-    @router.get("/{name}/history", operation_id="monitor_history")
+    @router.get("/{name}/history", operation_id="monitor_history", dependencies=[VIEWER])
     async def monitor_history(
         name: OneName,
-        bearer: Viewer,  # noqa: ARG001  asked for its role
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
     ) -> History:

@@ -31,8 +31,12 @@ class _Requires:
         return bearer
 
 
-Viewer = Annotated[Bearer, Depends(_Requires(Role.VIEWER))]
-Operator = Annotated[Bearer, Depends(_Requires(Role.OPERATOR))]
+VIEWER = Depends(_Requires(Role.VIEWER))
+"""For `dependencies=` of a route that asks for the role and nothing more of who calls."""
+
+OPERATOR = Depends(_Requires(Role.OPERATOR))
+Viewer = Annotated[Bearer, VIEWER]
+Operator = Annotated[Bearer, OPERATOR]
 Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
 
 _PROBLEMS = {
