@@ -28,6 +28,10 @@ from appliance.policy.model import Address
 
 _log = structlog.get_logger()
 
+FIELD_FRAMING = len(
+    ": \r\n"
+)  # of a header field: a head of many short ones is as long as the bytes it came in
+
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
@@ -283,7 +287,7 @@ class _Connection(asyncio.Protocol):
         self._count_head(len(url))
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        self._count_head(len(name) + len(value))
+        self._count_head(len(name) + len(value) + FIELD_FRAMING)
         if self._closing:
             return
         lowered = name.lower()
