@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from appliance.channel.messages import (
+    MonitorRow,
     SpecificationsRefused,
     SpecificationsStated,
     SpecificationsTaken,
@@ -62,13 +63,7 @@ class Middle:
         self._timer: Timer | None = None
         self._due: int | None = None
         self._compiler = Compiler(loop, self._compiled)
-        self.observations = Observations(
-            loop,
-            reporter,
-            lambda: (
-                [self.telling.row(one) for one in self.monitors.monitors] if self.monitors is not None else []
-            ),
-        )
+        self.observations = Observations(loop, reporter, self._rows)
         self.publish: Callable[[Published], None] = lambda published: None  # noqa: ARG005 - set by the engine
         self.changed: Callable[[], None] = lambda: None
         self.telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
@@ -209,6 +204,9 @@ class Middle:
             self._timer.cancel()
 
     # --- inside ---
+
+    def _rows(self) -> list[MonitorRow]:
+        return self.telling.rows(self.monitors.monitors, self.now()) if self.monitors is not None else []
 
     def _service(self, key: str, service: str, part: str, body: bytes) -> Judged:
         if self.blocked or self.spent > LONGEST:

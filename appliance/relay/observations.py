@@ -5,6 +5,7 @@ Invariants:
   told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
   happened is left out of the counts.
 - Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
+- Counters follow the events that they count, and once a second those of which no event was told.
 - While there is no control, at most `_KEPT` events wait; how many more there were is said.
 """
 
@@ -116,14 +117,10 @@ class Observations:
         self._last.clear()
         self._shared.clear()
         self._distinct.clear()
-        if self._reporter.attached:
-            rows = list(self._rows())
-            if rows != self._counted:
-                self._counted = rows
-                self._reporter.send(MonitorsCounted(rows))
+        self._tell_counters()
 
     def repeat(self) -> None:
-        """There is a new control: it is told everything that waits, and all counters at the next tick."""
+        """There is a new control: it is told everything that waits, and all counters."""
         self._counted = []
         self._flush()
 
@@ -155,6 +152,15 @@ class Observations:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
             self._reporter.send(MonitorsReported(events, self._lost))
             self._lost = 0
+        self._tell_counters()  # who reads of a drop finds it counted
+
+    def _tell_counters(self) -> None:
+        if not self._reporter.attached:
+            return
+        rows = list(self._rows())
+        if rows != self._counted:
+            self._counted = rows
+            self._reporter.send(MonitorsCounted(rows))
 
 
 def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ made its bytes others. A change that several made is one record, under the last 
 for each of them, and once for the topic.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorRow
@@ -181,8 +181,12 @@ class Telling:
                 self._again[writers, place] = self._again.get((writers, place), 0) + messages
         self._owed.clear()
 
-    def row(self, monitor: Monitor) -> MonitorRow:
-        """The state and counters of one monitor."""
+    def rows(self, monitors: Iterable[Monitor], time: int) -> list[MonitorRow]:
+        """The state and counters of these monitors."""
+        self._sum_up(time)
+        return [self._row(monitor) for monitor in monitors]
+
+    def _row(self, monitor: Monitor) -> MonitorRow:
         counters = self._counter(monitor.name)
         return MonitorRow(
             monitor.name,

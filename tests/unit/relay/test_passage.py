@@ -93,7 +93,7 @@ class Monitored:
 
     def rows(self) -> list[MonitorRow]:
         """The counters."""
-        return [self.middle.telling.row(one) for one in self.set.monitors]
+        return self.middle.telling.rows(self.set.monitors, self.middle.now())
 
     def state(self) -> list[object]:
         """Variables, states of properties, what is due."""

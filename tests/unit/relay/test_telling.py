@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.messages import MonitorEvent
+from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
 from tests.unit.relay.test_passage import Monitored
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Traffic, definitions
@@ -141,3 +141,15 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
     assert sum(one.count or 1 for one in changes) == 256
     assert len(changes) <= 102
     monitored.close()
+
+
+def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
+    """Who reads of a drop in the audit log finds it in the counters, events included."""
+    told.send((1, 5, 0))
+    told.monitored.middle.observations._flush()
+    *_before, events, counters = told.monitored.heard.messages
+    assert isinstance(events, MonitorsReported)
+    assert isinstance(counters, MonitorsCounted)
+    assert [one.kind for one in events.events] == ["drop"]
+    rows = {row.name: (row.events, row.drops) for row in counters.rows}
+    assert rows == {"stop": (1, 0), "turn": (1, 0), "look": (1, 1)}
