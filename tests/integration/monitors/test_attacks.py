@@ -119,11 +119,15 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     early.wait_for(event="received", data="hello 1")
     talker = ros.node("rospy", "flood_talker", "/flood", name="flood")
     fast = ros.node("rospy", "counting_listener", "/flood", name="fast")
-    slow = ros.node("rospy", "counting_listener", "/flood", "--slow", "0.002", name="slow")
     stopped = ros.node("rospy", "counting_listener", "/flood", name="stopped")
-    for listener in (fast, slow, stopped):
+    for listener in (fast, stopped):
         listener.wait_for(event="first")
     stopped.popen.send_signal(signal.SIGSTOP)
+    wait_until(
+        lambda: ask(appliance, StatusWanted())["dropped"] > 0, "the stopped one's queue is full", seconds=90
+    )
+    slow = ros.node("rospy", "counting_listener", "/flood", "--slow", "0.002", name="slow")
+    slow.wait_for(event="first")
     late: Process | None = None
     for number in range(1, ROUNDS + 1):
         change(appliance, number)
