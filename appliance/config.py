@@ -364,7 +364,8 @@ class Settings(_Section):
         default=[], description="who may connect to REST besides this machine (the firewall's rule)"
     )
     api_names: list[str] = Field(
-        default=[], description="names REST is called by; addresses and localhost always are"
+        default=[],
+        description="names and addresses for the certificate; other names are refused, addresses are not",
     )
     hosts: Path = Field(
         default=Path("ipsec/hosts.yaml"),

@@ -1,7 +1,7 @@
 """The certificate REST is served with: self-signed, made at first start, kept in the api's part of the state.
 
-The appliance has no certificate authority yet; when it has one, its certificate takes this one's place. Until then
-a client is given `certificate.pem` by hand, or pins its fingerprint.
+The authority of the tunnels' hosts does not sign it: REST is there before, and without, any tunnel. A client is given
+`certificate.pem` by hand, or pins its fingerprint, as the kits of hosts do.
 """
 
 import base64

@@ -12,6 +12,12 @@ from appliance.cli.running import DEFAULT_STATE, State
 from appliance.supervisor.backup import BackupError, back_up
 from appliance.supervisor.backup import restore as put_back
 
+_NewState = Annotated[
+    Path,
+    typer.Option(
+        "--state", envvar="ROSRV_STATE", help="State directory to make; must not exist, or be empty"
+    ),
+]
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object")]
 
 
@@ -39,7 +45,7 @@ def backup(
 
 def restore(
     file: Annotated[Path, typer.Argument(help="What `rosrv backup` wrote")],
-    state: State = DEFAULT_STATE,
+    state: _NewState = DEFAULT_STATE,
     as_json: _Json = False,
 ) -> None:
     """Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.

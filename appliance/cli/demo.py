@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -33,6 +34,7 @@ from appliance.cli.landshark import (
     DemoError,
     Stage,
 )
+from appliance.cli.output import say_json
 from appliance.network.lab import Lab
 from appliance.network.namespaces import NetworkError, has_privileges
 
@@ -251,12 +253,17 @@ def demo(
         Path | None,
         typer.Option(metavar="FILE.svg", help="Draw the robot's ways, without and with monitors, from above"),
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
+    ] = False,
 ) -> None:
     """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
 
+    Exit status: 0 the robot obeyed its operator and nobody else, 1 it did not.
+
     Example: rosrv demo --hold --picture drive.svg
     """
-    console, errors = Console(), Console(stderr=True)
+    console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         require_everything()
@@ -265,6 +272,10 @@ def demo(
             stage = stack.enter_context(Stage(lab, EXAMPLES))
             show = Show(stage, stack.enter_context(stage.console()), console)
             good = show.run()
+            if as_json:
+                for result in show.results:
+                    say_json(asdict(result))
+                sys.stdout.flush()
             if picture is not None:
                 stage.draw(show.ways, picture)
                 console.print(f"  {picture}: the robot's ways from above", soft_wrap=True)

@@ -18,8 +18,8 @@ _Endpoint = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Address or name at which the host reaches the appliance (UDP 500 and 4500) [default: `ipsec.endpoint` of"
-        " the configuration, else the machine's address towards its default route]",
+        help="Address or name at which the host reaches the appliance (UDP 500 and 4500; default: `ipsec.endpoint` of"
+        " the configuration, else the machine's address towards its default route)",
     ),
 ]
 _Csr = Annotated[
@@ -27,7 +27,12 @@ _Csr = Annotated[
     typer.Option(help="Signing request (PEM) of a key that the host made: the kit has no private key then"),
 ]
 _Days = Annotated[float, typer.Option(help="Days until the certificate ends")]
-_Out = Annotated[Path | None, typer.Option(help="What is written [default: rosrv-NAME.tar.gz]")]
+_Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh)"
+    ),
+]
 _Open = Annotated[
     list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
 ]
@@ -41,7 +46,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     name: _Name,
     appliance: _Endpoint = None,
     address: Annotated[
-        str | None, typer.Option(help="Its virtual address [default: the next free one]")
+        str | None, typer.Option(help="Its virtual address (default: the next free one)")
     ] = None,
     token: Annotated[
         bool,

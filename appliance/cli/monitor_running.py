@@ -1,6 +1,7 @@
 """`rosrv monitor list|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
 
 import sys
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,6 +102,8 @@ def load(
     _say_replaced(
         appliance.ask_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json
     )
+    if not as_json:
+        _say_disabled(appliance, texts)
 
 
 @speaks
@@ -118,7 +121,10 @@ def reload(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv monitor reload
     """
-    _say_replaced(appliance.ask_or_exit(MonitorReload(), as_json=as_json), as_json=as_json)
+    body = appliance.ask_or_exit(MonitorReload(), as_json=as_json)
+    _say_replaced(body, as_json=as_json)
+    if not as_json:
+        _say_disabled(appliance, [*body["added"], *body["changed"]])
 
 
 @speaks
@@ -178,6 +184,14 @@ def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
         say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
     if body["warnings"]:
         say(counted(len(body["warnings"]), "warning"), "yellow")
+
+
+def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
+    """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
+    rows = appliance.ask_or_exit(MonitorsWanted(), as_json=False)["monitors"]
+    names = [row["name"] for row in rows if row["file"] in files and not row["enabled"]]
+    if names:
+        say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")
 
 
 def _text(file: Path) -> str:

@@ -152,7 +152,7 @@ def _explanation_fields(explanation: Explanation) -> dict[str, object]:
 def test(
     file: _File,
     cases: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The cases [default: FILE.tests.yaml]")
+        Path | None, typer.Option(metavar="FILE", help="The cases (default: FILE.tests.yaml)")
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,

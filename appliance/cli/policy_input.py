@@ -14,7 +14,7 @@ from appliance.channel.admin import RegistrationsWanted
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
 from appliance.policy import Address, Category, Policy, Request, compile_policy
-from appliance.policy.actions import find_hosts
+from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
 
 Robot = Annotated[
@@ -69,7 +69,13 @@ def _enrolled(text: str) -> tuple[str, Address]:
 
 def find_host(text: str, policy: Policy) -> Address:
     """The address somebody asks from; `robot` with several addresses is its first."""
-    return find_hosts(text, policy)[0]
+    try:
+        return find_hosts(text, policy)[0]
+    except BadWordError as error:
+        for word, option in (("robot", "--robot ADDRESS"), ("host:", "--enrolled NAME=ADDRESS")):
+            if text.startswith(word):
+                raise BadWordError(f"{error}; say it with {option}") from None
+        raise
 
 
 def requests_of_file(file: Path) -> Iterator[Request]:

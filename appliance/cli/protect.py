@@ -56,7 +56,7 @@ def protect(
         list[str] | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Address of the appliance, as this machine sees it. Repeatable. [default: the one at --state]",
+            help="Address of the appliance, as this machine sees it (default: the one at --state). Repeatable.",
         ),
     ] = None,
     open_services: Annotated[
@@ -66,7 +66,7 @@ def protect(
     ports: Annotated[
         str | None,
         typer.Option(
-            metavar="FIRST-LAST", help="The ports to close. [default: this machine's local port range]"
+            metavar="FIRST-LAST", help="The ports to close (default: this machine's local port range)."
         ),
     ] = None,
     apply: Annotated[

@@ -31,7 +31,7 @@ def selftest(
 ) -> None:
     """Try whether this machine can run the appliance, and whether the running one does what it must.
 
-    Without --state or --api: programs, users, namespaces, firewall, tunnels, ports, and the files of the configuration.
+    Without --api: programs, users, namespaces, firewall, tunnels, ports, and the files of the configuration.
     Where an appliance runs also its status, its audit log, a call through RVMaster and a message through the relay.
     With --api only the running appliance is tried, from here. Exit status: 0 nothing failed (warnings or not), 1
     something failed.

@@ -1,5 +1,6 @@
 """`rosrv up`: start the appliance and stay until it is told to stop."""
 
+import contextlib
 import json
 import os
 import sys
@@ -95,6 +96,7 @@ def _node_ports(file: Path) -> range:
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     rest = _rest_url(settings)
+    more: list[str] = []
     if as_json:
         event: dict[str, Any] = {
             "event": "ready",
@@ -104,26 +106,28 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         }
         if said.token is not None:
             event["token"] = said.token
-        lines = json.dumps(event)
+        line = json.dumps(event)
     else:
-        lines = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
+        line = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
         if settings.isolation == "netns":
             port = settings.listen_address[1]
-            lines += (
-                f"\nNodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}"
+            more.append(
+                f"Nodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}"
             )
         if settings.monitors is not None:
-            lines += f"\nMonitors: {settings.monitors} (rosrv monitor list)"
+            more.append(f"Monitors: {settings.monitors} (rosrv monitor list)")
         if rest is not None:
-            lines += f"\nREST: {rest}"
+            more.append(f"REST: {rest}")
         if said.token is not None:
-            lines += f"\nThe first access token (admin) is in {_keep_token(settings.state, said.token)}"
+            more.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
     try:
-        sys.stdout.write(lines + "\n")
+        sys.stdout.write(line + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
         kept = None if said.token is None else str(_keep_token(settings.state, said.token))
-        log.warning("nobody reads standard output", first_token=kept, lines=None if said.token else lines)
+        log.warning("nobody reads standard output", first_token=kept, line=None if said.token else line)
+    with contextlib.suppress(BrokenPipeError):
+        typer.echo("".join(f"{one}\n" for one in more), err=True, nl=False)
 
 
 def _rest_url(settings: Settings) -> str | None:

@@ -12,7 +12,7 @@ _ROUTES = Path("/proc/net/route")
 
 
 def robot_addresses(settings: Settings) -> list[Address]:
-    """Loopback with `isolation: none`; else what was configured, or the gateway of the default route."""
+    """Loopback with `isolation: none`; else the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
     gateway = _default_gateway(_ROUTES.read_text(encoding="ascii"))

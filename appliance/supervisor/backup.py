@@ -19,6 +19,7 @@ import sqlite3
 import stat
 import tarfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
@@ -204,8 +205,9 @@ def restore(file: Path, state: Path) -> list[str]:
             state.chmod(0o711)
             for entry in entries:
                 _extract(archive, entry, state)
-    except (OSError, tarfile.TarError, EOFError) as error:
-        raise BackupError(f"{file} cannot be put back: {error}") from error
+    except (OSError, tarfile.TarError, EOFError, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise BackupError(f"{file} cannot be put back: {reason}") from error
     if os.geteuid() == 0:
         _hand_over(state)
     return [entry.name for entry in entries]

@@ -1,5 +1,6 @@
 """`rosrv demo`, the first thing a newcomer runs: it works, tells the truth, and leaves nothing behind."""
 
+import json
 import os
 import re
 import signal
@@ -41,11 +42,14 @@ def before() -> set[str]:
 def test_demo(tmp_path: Path, before: set[str]) -> None:
     """The robot obeys its operator, every attack is refused by a rule, and the exit status says so."""
     picture = tmp_path / "drive.svg"
-    command = [ROSRV, "demo", "--picture", str(picture)]
+    command = [ROSRV, "demo", "--json", "--picture", str(picture)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert "NOT OK" not in said
+    results = [json.loads(line) for line in done.stdout.splitlines()]  # the story is on standard error
+    assert len(results) > 15
+    assert all(result["good"] and result["what"] and result["remark"] for result in results)
     assert "fired one shot" in said
     for line in (
         "refused   take over the operator",

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.processes import LIMIT
+from tests.support.relay_driver import wait_until
 from tests.support.rest import Rest
 
 WRITES = ("/v1/policy", "/v1/policy/rollback", "/v1/policy/reload", "/v1/policy/confirm")
@@ -192,13 +192,19 @@ def test_the_first_token_is_shown_once(tmp_path: Path) -> None:
 
 
 def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
-    """The path is printed, the file is for its owner only, and the token in it is an admin's."""
+    """Beside the one line for scripts, the path is printed; the file is its owner's only, the token an admin's."""
     with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off"), json=False) as appliance:
-        assert appliance.process is not None
-        line = appliance.process.wait_for_text("first access token", timeout=LIMIT)
-        path = Path(line.rpartition(" ")[2])
+        process = appliance.process
+        assert process is not None
+
+        def said(text: str) -> str:
+            return next((line for line in process.errors if text in line), "")
+
+        wait_until(lambda: bool(said("first access token")), "the path of the token is printed")
+        path = Path(said("first access token").rpartition(" ")[2])
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        url = appliance.process.wait_for_text("REST: ").partition(" ")[2]
+        assert len(process.output().splitlines()) == 1
+        url = said("REST: ").partition(" ")[2]
         rest = Rest(url, path.read_text().strip())
         assert rest.post("/v1/policy/reload", match="*").status == 200
 
