@@ -1,7 +1,8 @@
 """Folds repeated denials, so that a flood cannot push evidence out of the log. No I/O; time is given.
 
 Invariants:
-1. The first denial of its kind is recorded in full; every repetition is counted in exactly one summary.
+1. The first denial of its kind is recorded in full; every repetition is counted in exactly one summary. A record
+   that stands for many, because who reported it had counted them (`count`), is as many repetitions.
 2. Memory is bounded: at most `keys_per_host` kinds of one host, `keys` in all. Past that a host's further
    denials are one kind (`scope` "host"); past `keys` all further ones are one kind (`scope` "all"). Who and what such a
    kind is made of is counted by name, for the first names of each; the rest is counted together.
@@ -111,10 +112,11 @@ class Folder:
             return True
         if not state.count:
             state.first_id, state.first_time = record.id, record.time
-        state.count += 1
+        number = _stands_for(record)
+        state.count += number
         state.last_id, state.last_time = record.id, record.time
         if scope != "kind":
-            _tally(state.tallies, record)
+            _tally(state.tallies, record, number)
         self.touched.add(key)
         return False
 
@@ -200,7 +202,13 @@ def _about(record: Record) -> dict[str, str]:
     return {name: str(record.detail[name])[:_LONGEST_NAME] for name in _ABOUT if name in record.detail}
 
 
-def _tally(tallies: dict[str, dict[str, int]], record: Record) -> None:
+def _stands_for(record: Record) -> int:
+    """How many denials this record is: its reporter may have counted repetitions itself (`count`)."""
+    count = record.detail.get("count")
+    return count if type(count) is int and count > 0 else 1
+
+
+def _tally(tallies: dict[str, dict[str, int]], record: Record, number: int) -> None:
     """Count who it was and what was asked, by the first names of each."""
     named = {"hosts": record.host, "callers": record.caller_id, "resources": record.resource}
     for what, name in (named | {"calls": record.detail.get("call")}).items():
@@ -208,7 +216,7 @@ def _tally(tallies: dict[str, dict[str, int]], record: Record) -> None:
             counts = tallies.setdefault(what, {})
             key = str(name)[:_LONGEST_NAME]
             key = key if key in counts or len(counts) < _NAMES else OTHERS
-            counts[key] = counts.get(key, 0) + 1
+            counts[key] = counts.get(key, 0) + number
 
 
 def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> Record:

@@ -178,3 +178,24 @@ def test_denials_of_different_parameters_are_different() -> None:
     ]
     assert [list(folder.offer(one, 0.0)) for one in kinds] == [[one] for one in kinds]
     assert [list(folder.offer(one, 0.0)) for one in kinds] == [[], [], []]
+
+
+def test_what_was_counted_before_counts_as_many() -> None:
+    """A denial that stands for many, because its reporter counted them, is as many in the summary and its tallies."""
+    folder = make_folder(seconds=10)
+    flood = [denial(detail={"count": 1000}) for _ in range(10)]
+    assert offer(folder, *flood) == flood[:1]
+    assert [one.detail["count"] for one in folder.expire(10)] == [9000]
+    varied = make_folder(seconds=10, keys_per_host=1)
+    offer(varied, denial("/a"), denial("/b"), denial("/c", detail={"count": 50}))
+    (host,) = [one for one in varied.expire(30) if one.detail["scope"] == "host"]
+    assert host.detail["count"] == 50
+    assert host.detail["resources"] == {"/c": 50}
+
+
+def test_a_count_that_is_none_counts_once() -> None:
+    """What stands under `count` and is no positive number is one denial."""
+    folder = make_folder(seconds=10)
+    strange: tuple[object, ...] = (True, 0, -5, "9", 2.5, None)
+    offer(folder, denial(), *(denial(detail={"count": one}) for one in strange))
+    assert [one.detail["count"] for one in folder.expire(10)] == [len(strange)]
