@@ -65,7 +65,8 @@ _INCOMPLETE = frozenset(
 
 _INTEGER = re.compile(r"[ \t\r\n]*([+-]?[0-9]{1,20})[ \t\r\n]*\Z")
 _DOUBLE = re.compile(
-    r"[ \t\r\n]*([+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf|infinity|nan))[ \t\r\n]*\Z",
+    # Only one part can take a digit: two that both can try every way to share them out, quadratic in the digits.
+    r"[ \t\r\n]*([+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf|infinity|nan))[ \t\r\n]*\Z",
     re.IGNORECASE | re.ASCII,
 )
 _DATE_TIME = re.compile(

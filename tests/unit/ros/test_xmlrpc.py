@@ -2,6 +2,7 @@
 
 import datetime
 import math
+import time
 import xmlrpc.client
 from typing import Any
 
@@ -408,6 +409,20 @@ def test_large_values_in_pieces() -> None:
     """A document of many pieces is read like a small one, text that crosses them included."""
     value: Value = [{"a": "x\u00e9<&" * 30_000, "b": list(range(20_000))}, "\U0001f916" * 60_000]
     assert parse_call(build_call("m", [value])).params == (value,)
+
+
+@pytest.mark.parametrize(
+    "number",
+    ["1" * 16_000 + "x", "1." + "1" * 16_000 + "x", "1" * 8_000 + " " * 8_000 + "x", " " * 16_000 + "x"],
+    ids=["digits", "fraction", "space behind", "space before"],
+)
+@pytest.mark.parametrize("tag", ["double", "int", "base64", "dateTime.iso8601"])
+def test_a_long_number_that_is_none_costs_no_more_than_its_length(tag: str, number: str) -> None:
+    """What turns out to be no number in its last byte is refused at once: no pattern tries the digits over and over."""
+    begun = time.process_time()
+    with pytest.raises(ProtocolError):
+        read(f"<value><{tag}>{number}</{tag}></value>")
+    assert time.process_time() - begun < 1.0  # a quadratic pattern takes seconds
 
 
 # --- fuzz -------------------------------------------------------------------------------------------------
