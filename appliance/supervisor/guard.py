@@ -3,6 +3,9 @@
 What the enclosure does takes time, so each call is made in a thread, one after the other; the
 supervisor's loop goes on meanwhile. The threads are daemons: one that hangs does not keep the appliance
 from ending.
+
+Invariant: whatever is raised on the way (no file, no process, no memory, an answer that cannot be read) is a
+finding with its reason. It never ends the looking, and never leaves control with an older, better one.
 """
 
 import asyncio
@@ -52,21 +55,28 @@ class Guard:
         """Probe, look at the rules, tell control; the reason when something is open that must be hidden."""
         async with self._one_at_a_time:
             reason = await self._find_fault()
-        if self.enclosure.probes:
-            self._probe = ProbePassed() if reason is None else ProbeFailed(reason)
+        self._found(reason)
+        return reason
+
+    def _found(self, reason: str | None) -> None:
+        """Keep what was found, and tell control."""
         if reason is not None:
             log.critical("the appliance must not serve", reason=reason)
+            self._probe = ProbeFailed(reason)
+        elif self.enclosure.probes:
+            self._probe = ProbePassed()
         for message in self.news():
             self._tell(message)
-        return reason
 
     async def control_ready(self, inner_port: int, own_port: int) -> str | None:
         """Close control's inner ports to others and look whether they are; the reason when not."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.enclosure.control_ready(inner_port, own_port))
-        except NetworkError as error:
-            return f"control's inner ports cannot be closed to others: {error}"
+        except Exception as error:  # noqa: BLE001  see the invariant
+            reason = f"control's inner ports cannot be closed to others: {_words(error)}"
+            self._found(reason)
+            return reason
         return await self.look()
 
     async def open_tunnels(self, pool: str, address: str) -> TunnelsEnclosed:
@@ -75,8 +85,8 @@ class Guard:
             async with self._one_at_a_time:
                 esp = await in_thread(lambda: self.enclosure.open_tunnels(pool, address))
                 report = await in_thread(self.enclosure.report)
-        except (NetworkError, ValueError) as error:
-            return TunnelsEnclosed(None, str(error))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            return TunnelsEnclosed(None, _words(error))
         self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
         self._tell(self._report)
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
@@ -86,16 +96,16 @@ class Guard:
         """The machine's address by which `host` reaches the appliance; None when its own route is right."""
         try:
             return await in_thread(lambda: self.enclosure.route_to(host))
-        except (NetworkError, ValueError) as error:
-            log.warning("no route to a host", host=host, error=str(error))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.warning("no route to a host", host=host, error=_words(error))
             return None
 
     async def endpoint(self) -> EndpointFound:
         """Where hosts of other networks reach the appliance, or why that cannot be told."""
         try:
             found = await in_thread(self.enclosure.endpoint)
-        except (NetworkError, ValueError) as error:
-            return EndpointFound(None, str(error))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            return EndpointFound(None, _words(error))
         return EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
@@ -109,8 +119,16 @@ class Guard:
             report = await in_thread(self.enclosure.report)
             self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
             return await in_thread(self.enclosure.probe)
-        except NetworkError as error:
-            return f"the state of the firewall cannot be told: {error}"
+        except Exception as error:  # noqa: BLE001  see the invariant
+            return f"the state of the firewall cannot be told: {_words(error)}"
+
+
+def _words(error: Exception) -> str:
+    """What a person is told; what nobody thought of is shown whole in the log."""
+    if isinstance(error, NetworkError | ValueError):
+        return str(error)
+    log.error("fault while looking at the surroundings", exc_info=error)
+    return f"{type(error).__name__}: {error}"
 
 
 async def in_thread(function: Callable[[], T]) -> T:

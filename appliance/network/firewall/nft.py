@@ -41,23 +41,30 @@ class NftBackend:
 
     def counters(self) -> tuple[RuleCounter, ...]:
         """Read the rules of the table back from the kernel."""
-        tables = json.loads(self._nft(["list", "tables"], ""))["nftables"]
-        if not any(_is_ours(entry.get("table", {})) for entry in tables):
+        if not any(_is_ours(table) for table in self._list("table", "list", "tables")):
             return ()
-        listed = json.loads(self._nft(["list", "table", _FAMILY, TABLE], ""))["nftables"]
-        rules = [entry["rule"] for entry in listed if "rule" in entry]
+        rules = self._list("rule", "list", "table", _FAMILY, TABLE)
         hooked = {jump for rule in rules for jump in _jumps(rule)}
         return tuple(_counter(rule) for rule in rules if rule["chain"] in hooked)
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
         """Return the chains of other tables that hook forwarded packets with the policy drop."""
-        listed = json.loads(self._nft(["list", "chains"], ""))["nftables"]
-        chains = [entry["chain"] for entry in listed if "chain" in entry]
         return tuple(
             f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
-            for chain in chains
+            for chain in self._list("chain", "list", "chains")
             if chain.get("hook") == "forward" and chain.get("policy") == "drop"
         )
+
+    def _list(self, kind: str, *arguments: str) -> list[Json]:
+        """What nft lists of one kind: `table`, `chain` or `rule`."""
+        text = self._nft(list(arguments), "")
+        try:
+            return [entry[kind] for entry in json.loads(text)["nftables"] if kind in entry]
+        except json.JSONDecodeError as error:
+            raise FirewallError(f"nft {' '.join(arguments)}: the answer is not JSON: {error}") from error
+        except (KeyError, TypeError) as error:
+            reason = f"the answer is not what is understood: {_first_lines(text)}"
+            raise FirewallError(f"nft {' '.join(arguments)}: {reason}") from error
 
     def _nft(self, arguments: list[str], text: str) -> str:
         try:
@@ -72,6 +79,8 @@ class NftBackend:
             raise BackendMissingError(
                 "the firewall back end nft needs the program `nft`: sudo apt install nftables"
             ) from None
+        except OSError as error:
+            raise FirewallError(f"nft cannot be run: {error.strerror}") from error
         with process:
             try:
                 out, err = process.communicate(text, timeout=_SECONDS)

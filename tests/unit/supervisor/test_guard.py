@@ -1,12 +1,14 @@
 """Tests of `appliance.supervisor.guard`, with surroundings that do what a test says."""
 
 import asyncio
+import errno
 import threading
 from typing import Any
 
 import pytest
 
 from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.network.esp import Esp
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.guard import Guard
@@ -36,10 +38,16 @@ class Surroundings(Enclosure):
         return finding
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Fails for port 0."""
+        """Fails for port 0 and 1."""
         if inner_port == 0:
             raise NetworkError("the kernel says no")
+        if inner_port == 1:
+            raise OSError(errno.EAGAIN, "no process can be made")
         self.closed.append(inner_port)
+
+    def open_tunnels(self, pool: str, address: str) -> Esp:
+        """Fails as a machine does that has no process left."""
+        raise OSError(errno.EAGAIN, "no process can be made")
 
 
 @pytest.fixture
@@ -100,6 +108,53 @@ def test_the_inner_face_is_closed_and_then_probed(surroundings: Surroundings) ->
     asyncio.run(scene())
     assert surroundings.closed == [4711]
     assert surroundings.found == []
+
+
+@pytest.mark.parametrize("port", [0, 1])
+def test_an_inner_face_that_cannot_be_closed_is_told_to_control(
+    surroundings: Surroundings, port: int
+) -> None:
+    """Whatever stood in the way: control hears that it must not serve, and so does the next one."""
+    told: list[Message] = []
+
+    async def scene() -> list[Message]:
+        guard = Guard(surroundings, told.append)
+        assert "cannot be closed to others" in str(await guard.control_ready(port, 4712))
+        return guard.news()
+
+    news = asyncio.run(scene())
+    assert isinstance(told[-1], ProbeFailed)
+    assert news[-1] == told[-1]
+
+
+@pytest.mark.parametrize(
+    "broken", [OSError(errno.EMFILE, "too many open files"), ValueError("no JSON"), KeyError("chain")]
+)
+def test_whatever_breaks_a_probe_is_a_finding_and_the_next_one_is_made(
+    surroundings: Surroundings, broken: Exception
+) -> None:
+    """A machine without files or processes for a moment: told as a fault, then looked at again and told as over."""
+    told: list[Message] = []
+    surroundings.found = [broken, *[None] * 100_000]
+
+    async def scene() -> None:
+        running = asyncio.create_task(Guard(surroundings, told.append, every=0.001).run())
+        async with asyncio.timeout(20):
+            while len(told) < 4 and not running.done():
+                await asyncio.sleep(0)
+        running.cancel()
+
+    asyncio.run(scene())
+    assert [type(one) for one in told[1:4:2]] == [ProbeFailed, ProbePassed]
+    (failed,) = [one for one in told if isinstance(one, ProbeFailed)]
+    assert str(broken) in failed.reason
+
+
+def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
+    """Control waits for the answer: also an error that nobody thought of is one."""
+    answer = asyncio.run(Guard(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1"))
+    assert answer.esp is None
+    assert "no process can be made" in str(answer.reason)
 
 
 def test_it_looks_again_and_again(surroundings: Surroundings) -> None:

@@ -1,6 +1,14 @@
 """Tests of what the nft back end makes of rules, without a kernel."""
 
-from appliance.network.firewall.nft import render, render_rule
+import errno
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from appliance.network.firewall.backend import BackendMissingError, FirewallError
+from appliance.network.firewall.nft import NftBackend, render, render_rule
 from appliance.network.firewall.rules import (
     Chain,
     FirewallSettings,
@@ -11,6 +19,7 @@ from appliance.network.firewall.rules import (
     appliance_rules,
     inner_port,
 )
+from appliance.network.namespaces import Namespace
 
 PORT = {"match": {"op": "==", "left": {"payload": {"protocol": "tcp", "field": "dport"}}, "right": 11312}}
 SYN = {
@@ -98,3 +107,40 @@ def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
         (body,) = render_rule(rule)
         keys.append(body["expr"][2]["match"]["left"])
     assert keys == [{"meta": {"key": "ipsec"}}, {"rt": {"key": "ipsec"}}]
+
+
+class Machine(Namespace):
+    """A namespace where `nft` is what a test says: an error on the way to it, or what it prints."""
+
+    def __init__(self, nft: OSError | str) -> None:
+        super().__init__("machine")
+        self.nft = nft
+
+    def popen(self, args: Any, **options: Any) -> "subprocess.Popen[Any]":
+        """The program that stands in."""
+        if isinstance(self.nft, OSError):
+            raise self.nft
+        return subprocess.Popen([sys.executable, "-c", f"print({self.nft!r})"], **options)
+
+
+@pytest.mark.parametrize(
+    ("nft", "said"),
+    [
+        (OSError(errno.EAGAIN, "Resource temporarily unavailable"), "Resource temporarily unavailable"),
+        (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
+        ("{", "not JSON"),
+        ('{"something": []}', "not what is understood"),
+        ('{"nftables": [7]}', "not what is understood"),
+    ],
+)
+def test_an_nft_that_cannot_be_asked_is_an_error_of_the_firewall(nft: OSError | str, said: str) -> None:
+    """No process, no file, an answer that cannot be read: an error with words, which a caller expects."""
+    with pytest.raises(FirewallError, match=said) as caught:
+        NftBackend(Machine(nft)).counters()
+    assert not isinstance(caught.value, BackendMissingError)
+
+
+def test_an_nft_that_is_not_there_is_to_be_installed() -> None:
+    """Only then another back end is what the machine has."""
+    with pytest.raises(BackendMissingError, match="apt install nftables"):
+        NftBackend(Machine(FileNotFoundError(errno.ENOENT, "no such file"))).remove()
