@@ -46,7 +46,7 @@ class Codecs:
         self._messages = messages
         self._made: dict[tuple[str, Type], str] = {}
         self._measures: dict[Type, Callable[[Any], int]] = {}
-        for name in ("text", "text_end", "count", "numbers", "moments", "elements", "skip"):
+        for name in ("text", "text_end", "count", "numbers", "moments", "elements", "skip", "skip_inner"):
             module.namespace[f"w_{name}"] = getattr(wire, name)
         for name in ("put_text", "put_numbers", "put_moments"):
             module.namespace[f"w_{name}"] = getattr(wire, name)

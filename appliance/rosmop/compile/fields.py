@@ -72,7 +72,7 @@ def read_fields(scope: Scope, bound: list[Bound]) -> None:
     """Write the lines that find and read the fields that are used, and compare those that have constants."""
     lines = scope.lines
     layout = scope.messages.definitions.layout(scope.message_type or "")
-    walk = Walk(Locator(scope.module, scope.codecs, lines), layout, Spot(None, 0))
+    walk = Walk(Locator(scope.module, scope.codecs, lines, scope.context), layout, Spot(None, 0))
     fixed: list[Bound] = []
     large = False
     for each in bound:

@@ -131,12 +131,19 @@ class Walk:
 
 
 class Locator:
-    """Writes the code that finds fields; `lines` are those of the function."""
+    """Writes the code that finds fields; `lines` are those of the function, `context` the name of who is charged.
 
-    def __init__(self, module: Module, codecs: Codecs, lines: Lines) -> None:
+    `inner`: the function says where an element ends, and is called for each.
+    """
+
+    def __init__(
+        self, module: Module, codecs: Codecs, lines: Lines, context: str, *, inner: bool = False
+    ) -> None:
         self._module = module
         self._codecs = codecs
         self.lines = lines
+        self._context = context
+        self._skip = "w_skip_inner" if inner else "w_skip"
         self._skippers: dict[int, str] = {}
 
     def behind(self, part: Part, start: Spot) -> Spot:
@@ -157,7 +164,7 @@ class Locator:
         if part.element_size is not None:
             self.lines.add(f"{end} = {start.code} + {count} * {part.element_size}")
         else:
-            self.lines.add(f"{end} = w_skip(b, {start.code}, {count}, {self.skipper(part)})")
+            self.lines.add(self._skipped(end, start, count, part))
         return Spot(end, 0)
 
     def element(self, item: Leaf | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
@@ -177,8 +184,11 @@ class Locator:
         if not index:
             return start
         spot = self._module.fresh("p")
-        self.lines.add(f"{spot} = w_skip(b, {start.code}, {index}, {self.skipper(item)})")
+        self.lines.add(self._skipped(spot, start, str(index), item))
         return Spot(spot, 0)
+
+    def _skipped(self, target: str, start: Spot, count: str, item: Leaf | ArrayPart) -> str:
+        return f"{target} = {self._skip}(b, {start.code}, {count}, {self.skipper(item)}, {self._context})"
 
     def skipper(self, item: Leaf | ArrayPart) -> str:
         """The name of the function that says where an element ends."""
@@ -188,7 +198,7 @@ class Locator:
         if key not in self._skippers:
             inner = Lines()
             name = self._module.fresh("k")
-            locator = Locator(self._module, self._codecs, inner)
+            locator = Locator(self._module, self._codecs, inner, self._context, inner=True)
             end = Walk(locator, item.layout, Spot("p", 0)).end()
             self._module.add([(f"def {name}(b, p):", -1), *inner.lines, (f"    return {end.code}", -1)])
             self._skippers[key] = name

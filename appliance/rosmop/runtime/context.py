@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. Between two calls of `begin` a specification spends at most its budget of instructions; loops, calls and
-   copies of anything long are charged before they are done.
+1. Between two calls of `begin` a specification spends at most its budget of instructions; loops, calls, copies of
+   anything long and walks over many elements of a message are charged before they are done.
 2. The values of a specification never hold more than `MAX_BYTES` plus `UNMEASURED` bytes. Whatever makes
    something long says so to `allocate`; when enough has been said, the live values are measured.
 """
@@ -98,6 +98,14 @@ class Context:
         if self.budget < 0:
             raise FaultError(
                 site, f"more than {BUDGET} instructions for one message; is there a loop without end?"
+            )
+
+    def walk(self, elements: int) -> None:
+        """So many elements of arrays are about to be walked over, one by one, to a field behind them."""
+        self.budget -= elements
+        if self.budget < 0:
+            raise FaultError(
+                -1, f"more than {BUDGET} instructions for one message: too many elements stand before a field"
             )
 
     def allocate(self, size: int, site: int) -> None:

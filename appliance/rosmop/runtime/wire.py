@@ -15,6 +15,8 @@ Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
 _MAX_EMPTY = 1_000_000  # elements without bytes that one array may have
+_MAX_DECODED = 1_000_000  # elements that are decoded one by one
+_FEW = 64  # elements that cost less than an instruction's worth of counting them
 
 
 def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
@@ -59,6 +61,10 @@ def elements(
     buffer: Buffer, start: int, number: int, decode: Callable[[Buffer, int], tuple[Any, int]]
 ) -> tuple[list[Any], int]:
     """`number` values, each by `decode`, and where they end."""
+    if number > _MAX_DECODED:
+        raise MalformedError(
+            f"an array of {number} elements; at most {_MAX_DECODED} that are no numbers are read"
+        )
     values = []
     for _ in range(number):
         value, start = decode(buffer, start)
@@ -66,8 +72,20 @@ def elements(
     return values, start
 
 
-def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int]) -> int:
-    """Where `number` elements end, each of which ends where `end` says."""
+def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
+    """Where `number` elements end, each of which ends where `end` says. Many are charged before they are walked."""
+    if number > _FEW:
+        context.walk(number)
+    for _ in range(number):
+        start = end(buffer, start)
+    return start
+
+
+def skip_inner(
+    buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
+) -> int:
+    """As `skip`, within an element that is skipped: a few are charged, too, since there may be many such elements."""
+    context.walk(number + 1)
     for _ in range(number):
         start = end(buffer, start)
     return start

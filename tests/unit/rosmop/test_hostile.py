@@ -193,6 +193,45 @@ def test_a_count_beyond_the_message_is_a_fault(kind: str, parameter: str, data: 
     assert "not a message of this type" in outcome.faults[0].text
 
 
+WALKS = [
+    ("sensor_msgs/JointState", "position[1]:x", b"\0" * 16 + (3_000_000).to_bytes(4, "little") + bytes(12_000_000)),
+    ("diagnostic_msgs/DiagnosticArray", "status[1].level:x",
+     b"\0" * 16 + b"\2\0\0\0" + bytes(13) + (2_000_000).to_bytes(4, "little") + bytes(16_000_017)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "pattern", "data"), WALKS)
+def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
+    kind: str, pattern: str, data: bytes
+) -> None:
+    """A publisher that puts more than a budget of elements before a field costs no time, nested or not."""
+    monitors = load(f"a() {{ event e(auto x) /t {kind} '{{{pattern}}}' {{ auto y = x; }} }}")
+    began = time.process_time()
+    outcome = monitors.process("/t", data, 0)
+    assert time.process_time() - began < 0.05
+    assert (outcome.result, len(outcome.faults)) == ("dropped", 1)
+    assert "too many elements stand before a field" in outcome.faults[0].text
+
+
+def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> None:
+    """So that what reads a field of a robot's joint states has the budget that it always had."""
+    for names, cost in ((50, 0), (500, 500)):
+        monitors = load(
+            "a() { event e(double x) /t sensor_msgs/JointState '{position[1]:x}' { double y = x; } }"
+        )
+        data = message("sensor_msgs/JointState", name=["j"] * names, position=[1.0, 2.0])
+        spent_on = monitors.monitor("a").context
+        assert monitors.process("/t", data, 0).result == "passed"
+        assert 1_000_000 - spent_on.budget in range(cost, cost + 20)
+
+
+def test_more_elements_than_anybody_sends_are_not_decoded() -> None:
+    """Strings and messages in an array are read one by one, and so at most a million."""
+    monitors = load("a() { event e(std::string[] x) /t sensor_msgs/JointState '{name:x}' { auto y = x; } }")
+    outcome = monitors.process("/t", b"\0" * 16 + (1_500_000).to_bytes(4, "little") + bytes(6_000_012), 0)
+    assert "an array of 1500000 elements; at most 1000000" in outcome.faults[0].text
+
+
 def test_random_bytes_for_text_are_refused_with_a_position() -> None:
     """Whatever stands in a file, the answer is an error with a place."""
     for text in (
