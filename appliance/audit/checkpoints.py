@@ -17,6 +17,7 @@ from appliance.audit.signatures import signature_is_right
 
 _HASH = 32
 _HEADER = 8
+_TYPES = (int, int, bytes, bytes | None, bytes | None)
 
 
 class Remembered(msgspec.Struct, frozen=True):
@@ -176,7 +177,10 @@ def _finding(kind: Kind, first: int, last: int, message: str) -> Finding:
 def checkpoint_rows(
     connection: sqlite3.Connection,
 ) -> Iterator[tuple[int, int, bytes, bytes | None, bytes | None]]:
-    """The rows of table `checkpoint` in order."""
-    yield from connection.execute(
+    """The rows of table `checkpoint` in order. Raises `sqlite3.DataError` for what is of another type."""
+    for row in connection.execute(
         "SELECT number, sequence, text, signature, public_key FROM checkpoint ORDER BY number"
-    )
+    ):
+        if not all(map(isinstance, row, _TYPES)):
+            raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
+        yield row

@@ -141,9 +141,9 @@ def _reading(path: Path, read: Callable[[sqlite3.Connection], _Found]) -> _Found
         with closing(open_for_reading(path)) as connection:
             connection.execute("BEGIN")
             return read(connection)
-    except (sqlite3.Error, msgspec.DecodeError, ValueError) as error:
-        if isinstance(error, FilterError):
-            raise
+    except FilterError:
+        raise
+    except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError) as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
 

@@ -9,11 +9,12 @@ anew. `Verification.unsealed` says how many records that concerns. What root can
 the signer's memory with it) only checkpoints kept on another machine can show.
 """
 
+import re
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 
@@ -33,6 +34,31 @@ _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.in
 # By how many places a record may have been renumbered.
 _DISTANCES = tuple(distance for one in range(1, 1000) for distance in (one, -one))
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
+_LOG_ID = re.compile("[0-9a-f]{32}")
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+_NOT_AS_WRITTEN = (msgspec.MsgspecError, TypeError, ValueError, RecursionError, MemoryError)
+
+
+class _Removal(msgspec.Struct, frozen=True):
+    """What the detail of a `records removed` record must be for the chain to begin after it."""
+
+    first_sequence: _Count
+    last_sequence: _Count
+    last_hash: _Hash
+    first_time: int
+    last_time: int
+    last_checkpoint: _Count
+    last_checkpoint_hash: _Hash
+
+
+class _Reported(msgspec.Struct, frozen=True):
+    """What the detail of a `checkpoint` record must be."""
+
+    number: _Count
+    hash: str
 
 
 def verify(
@@ -79,6 +105,21 @@ class _Row(NamedTuple):
             return False
 
 
+def _row(row: tuple[object, ...]) -> _Row:
+    """A record; tables that were made anew may hold any type in any column."""
+    sequence, digest, detail = row[0], row[-1], row[_DETAIL]
+    if not (isinstance(sequence, int) and isinstance(digest, bytes) and isinstance(detail, bytes)):
+        raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
+    return _Row(row[:-1], digest, sequence, detail)
+
+
+def _log_id(connection: sqlite3.Connection) -> str:
+    """The id of the log; empty if the file does not have exactly one that is well formed."""
+    rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
+    found = rows[0][0] if len(rows) == 1 else None
+    return found if isinstance(found, str) and _LOG_ID.fullmatch(found) else ""
+
+
 class _Verifier:
     """One walk over one log."""
 
@@ -93,19 +134,21 @@ class _Verifier:
         self._connection = connection
         self._progress = progress
         self._key = key
-        (self._log,) = connection.execute("SELECT id FROM log").fetchone()
+        self._log = _log_id(connection)
         remembered = None if signer is None else read_remembered(signer, self._log)
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
         self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
         self._findings: list[Finding] = []
         self._sealed: dict[int, bytes] = {}
-        self._reported: dict[int, str] = {}
+        self._reported: set[int] = set()
         self._shift = 0
         self._explained = 0
         self.records = self.first = self.last = 0
 
     def run(self) -> Verification:
         self._check_structure()
+        if not self._log:
+            self._structure("table log does not have the one id of a log: what it sealed cannot be told")
         removed = self._last_removal()
         sequences = self._connection.execute("SELECT sequence FROM checkpoint")
         self._sealed = {sequence: b"" for (sequence,) in sequences}
@@ -160,6 +203,7 @@ class _Verifier:
             self._structure(str(error))
 
     def _structure(self, message: str) -> None:
+        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were no text
         self._findings.append(Finding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
 
     def _last_removal(self) -> RemovedRange | None:
@@ -169,9 +213,9 @@ class _Verifier:
             row = self._connection.execute(query).fetchone()
             if row is None:
                 return None
-            detail = msgspec.json.decode(row[0])
-            return RemovedRange(**{name: detail[name] for name in RemovedRange._fields})
-        except (msgspec.DecodeError, KeyError, TypeError, sqlite3.DatabaseError):
+            removal = msgspec.json.decode(row[0], type=_Removal)
+            return RemovedRange(**{name: getattr(removal, name) for name in RemovedRange._fields})
+        except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
             return None  # a damaged record is found when it is walked
 
     # --- the chain ------------------------------------------------------------------------------------------
@@ -212,9 +256,8 @@ class _Verifier:
             self._sealed[place] = row.hash
         if row.columns[_EVENT] == "checkpoint":
             try:
-                detail = msgspec.json.decode(bytes(row.detail))
-                self._reported[detail["number"]] = detail["hash"]
-            except (msgspec.DecodeError, KeyError, TypeError):
+                self._reported.add(msgspec.json.decode(row.detail, type=_Reported).number)
+            except _NOT_AS_WRITTEN:
                 return  # not as the writer wrote it: found when its hash is checked
 
     def _rows(self, after: int = -(1 << 63), limit: int = -1) -> Iterator[_Row]:
@@ -223,7 +266,7 @@ class _Verifier:
             " ORDER BY sequence LIMIT ?",
             (after, limit),
         )
-        return (_Row(row[:-1], row[-1], row[0], row[_DETAIL]) for row in rows)
+        return map(_row, rows)
 
     def _explain(self, row: _Row, previous: bytes) -> bytes:
         """Say what happened at a record that does not follow; gives the hash to go on from."""

@@ -1,5 +1,6 @@
 """Tests of finding every way to tamper with a log. The attacker of these tests has the database file."""
 
+import base64
 import hashlib
 import sqlite3
 from collections.abc import Callable
@@ -7,12 +8,16 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.chain import genesis, parse_checkpoint, record_hash
 from appliance.audit.database import COLUMNS, LogUnreadableError
 from appliance.audit.findings import Kind
+from appliance.audit.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog
@@ -396,3 +401,69 @@ def test_a_clock_that_was_set_back(make_log: MakeLog, path: Path) -> None:
     assert len(rows) == 30
     assert [row[1] for row in rows] == sorted(row[1] for row in rows)
     assert min(row[2] for row in rows) < max(row[2] for row in rows) - 9 * 10**17
+
+
+_NESTED = f"CAST('{'[' * 100_000}{']' * 100_000}' AS BLOB)"
+_REMOVED = (
+    '{"first_sequence":1,"last_sequence":5,"last_hash":"%s","first_time":1,"last_time":2,"last_checkpoint":0,'
+    '"last_checkpoint_hash":"%s"}'
+)
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ("DELETE FROM log",),
+        ("INSERT INTO log VALUES ('00000000000000000000000000000000', 1)",),
+        ("UPDATE log SET id = CAST(x'ff' AS TEXT)",),
+        ("UPDATE log SET id = '../../../etc/passwd'",),
+        ("UPDATE record SET detail = CAST('{\"number\":\"x\",\"hash\":1}' AS BLOB) WHERE event = 'checkpoint'",),
+        ("UPDATE record SET detail = CAST('{\"number\":[1],\"hash\":1}' AS BLOB) WHERE event = 'checkpoint'",),
+        (f"UPDATE record SET detail = {_NESTED} WHERE event = 'checkpoint'",),
+        (f"UPDATE record SET event = 'records removed', detail = {_NESTED} WHERE sequence = 60",),
+        *(
+            (f"UPDATE record SET event = 'records removed', detail = CAST('{detail}' AS BLOB) WHERE sequence = 60",)
+            for detail in (
+                _REMOVED % ("zz", "0" * 64),
+                (_REMOVED % ("0" * 64, "0" * 64)).replace('"last_sequence":5', '"last_sequence":"q"'),
+                (_REMOVED % ("0" * 64, "0" * 64)).replace('"last_checkpoint":0', '"last_checkpoint":"q"'),
+                "[]",
+            )
+        ),
+        (
+            "CREATE TABLE other AS SELECT * FROM record",
+            "DROP TABLE record",
+            "ALTER TABLE other RENAME TO record",
+            "UPDATE record SET hash = 'text' WHERE sequence = 60",
+        ),
+        (
+            "CREATE TABLE other AS SELECT * FROM checkpoint",
+            "DROP TABLE checkpoint",
+            "ALTER TABLE other RENAME TO checkpoint",
+            "UPDATE checkpoint SET signature = 'text', text = 7",
+        ),
+    ],
+)  # fmt: skip
+def test_hostile_content_has_a_verdict(log: Path, statements: tuple[str, ...]) -> None:
+    """Whatever stands in the tables, verification ends with findings in words that can be sent on."""
+    with closing(sqlite3.connect(log)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+    result = verify(log)
+    assert not result.ok
+    assert msgspec.json.encode(result)
+
+
+@pytest.mark.parametrize("curve", ["secp256k1", "an unsupported one"])
+def test_a_key_of_another_kind(tmp_path: Path, curve: str) -> None:
+    """A key file with a key of any other kind is refused in words."""
+    public = ec.generate_private_key(ec.SECP256K1()).public_key()
+    der = public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    if curve != "secp256k1":
+        der = der.replace(bytes.fromhex("2b8104000a"), bytes.fromhex("2b8104007a"))
+    text = base64.encodebytes(der).decode()
+    file = tmp_path / "key.pem"
+    file.write_text(f"-----BEGIN PUBLIC KEY-----\n{text}-----END PUBLIC KEY-----\n")
+    with pytest.raises(KeyUnreadableError, match=r"key\.pem: not"):
+        read_public_key(file)
