@@ -2,7 +2,8 @@
 
 Invariants: a checkpoint is right when its text is well formed and of this log, follows the checkpoint
 before it, and names the hash that the chain has at its sequence; it is proven when the expected key signed
-it.
+it. What the signer signed and the log has no signature of is on its way as long as it is among the last that are asked
+for at once (after a crash, or in a copy, it stays so); with signatures after it, or with more of it, it was removed.
 """
 
 import sqlite3
@@ -13,7 +14,7 @@ import msgspec
 
 from appliance.audit.chain import Checkpoint, checkpoint_hash, parse_checkpoint
 from appliance.audit.findings import Finding, Kind
-from appliance.audit.signatures import signature_is_right
+from appliance.audit.signatures import ASKED_AT_ONCE, signature_is_right
 
 _HASH = 32
 _HEADER = 8
@@ -59,6 +60,7 @@ class CheckpointAudit:
         self.last_number = 0
         self.hashes: dict[int, str] = {}
         self._signed_seen = False
+        self._on_their_way: list[int] = []
 
     def check(
         self,
@@ -79,6 +81,8 @@ class CheckpointAudit:
             yield from self._check_row(row, previous, chain, last_sequence)
             previous = checkpoint_hash(row[2])
             self.hashes[number] = previous
+        if len(self._on_their_way) > ASKED_AT_ONCE:
+            yield from self._signatures_removed()
         if self._remembered is not None and self._remembered.last > number:
             yield _finding(
                 Kind.CHECKPOINT_MISSING,
@@ -105,12 +109,11 @@ class CheckpointAudit:
             yield wrong
         elif remembered is not None and remembered != checkpoint_hash(text):
             yield _finding(Kind.CHECKPOINT_CHANGED, number, number, "not the one that the signer signed")
-        elif signature is None and remembered is not None and number < self._remembered_last():
-            yield _finding(
-                Kind.SIGNATURE_MISSING, number, number, "the signer signed it, its signature was removed"
-            )
+        elif signature is None and remembered is not None:
+            self._on_their_way.append(number)
         if signature is None:
             return
+        yield from self._signatures_removed()
         self._signed_seen = True
         if self._key is None:
             return
@@ -124,8 +127,11 @@ class CheckpointAudit:
             self.signed += 1
             self.signed_through = row[1]
 
-    def _remembered_last(self) -> int:
-        return 0 if self._remembered is None else self._remembered.last
+    def _signatures_removed(self) -> Iterator[Finding]:
+        numbers, self._on_their_way = self._on_their_way, []
+        for number in numbers:
+            message = "the signer signed it, its signature was removed"
+            yield _finding(Kind.SIGNATURE_MISSING, number, number, message)
 
     def _disagreement(
         self,

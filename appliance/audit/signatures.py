@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from appliance.audit.writer import ChainWriter
 
 Signer = Callable[[int, bytes], None]
-_ASKED_AT_ONCE = 64
+ASKED_AT_ONCE = 64
 
 
 class KeyUnreadableError(Exception):
@@ -72,7 +72,7 @@ class Signatures:
     def sealed(self, number: int, text: bytes) -> None:
         """A checkpoint was made: ask for its signature, unless others have to be asked for before."""
         # The signer signs in order only, so once one had to wait all that follow wait until `ask`.
-        self._waiting = self._waiting or len(self._asked) >= _ASKED_AT_ONCE
+        self._waiting = self._waiting or len(self._asked) >= ASKED_AT_ONCE
         if not self._waiting:
             self._ask(number, text)
 
@@ -81,8 +81,8 @@ class Signatures:
         self._asked.clear()
         self._waiting = False
         if self._signer is not None:
-            unsigned = writer.unsigned(_ASKED_AT_ONCE)
-            self._waiting = len(unsigned) == _ASKED_AT_ONCE
+            unsigned = writer.unsigned(ASKED_AT_ONCE)
+            self._waiting = len(unsigned) == ASKED_AT_ONCE
             for number, text in unsigned:
                 self._ask(number, text)
 

@@ -20,7 +20,7 @@ import msgspec
 
 from appliance.audit import database
 from appliance.audit.chain import NO_CHECKPOINT, StoredColumns, genesis, record_hash
-from appliance.audit.checkpoints import CheckpointAudit, checkpoint_rows, read_remembered
+from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
 from appliance.audit.copies import CopiesAudit, SignedCheckpoint
 from appliance.audit.database import LogUnreadableError, open_for_reading
 from appliance.audit.findings import Elsewhere, Finding, Kind, Verification
@@ -81,8 +81,12 @@ def verify(
     try:
         with closing(open_for_reading(path)) as connection:
             connection.text_factory = _undecoded
+            log = _log_id(connection)
+            # Before the log is: what is signed while it is read is in neither, or in the log only.
+            remembered = None if signer is None else read_remembered(signer, log)
             connection.execute("BEGIN")
-            return _Verifier(connection, public_key, signer, copies, progress).run()
+            verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
+            return verifier.run()
     except sqlite3.Error as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
 
@@ -126,16 +130,17 @@ class _Verifier:
     def __init__(
         self,
         connection: sqlite3.Connection,
+        log: str,
         key: bytes | None,
-        signer: Path | None,
+        remembered: Remembered | None,
+        *,
         copies: Sequence[SignedCheckpoint] | None,
         progress: Callable[[int], None],
     ) -> None:
         self._connection = connection
         self._progress = progress
         self._key = key
-        self._log = _log_id(connection)
-        remembered = None if signer is None else read_remembered(signer, self._log)
+        self._log = log
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
         self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
         self._findings: list[Finding] = []

@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.chain import genesis, parse_checkpoint, record_hash
+from appliance.audit.checkpoints import Remembered, read_remembered
 from appliance.audit.database import COLUMNS, LogUnreadableError
 from appliance.audit.findings import Kind
 from appliance.audit.signatures import KeyUnreadableError, read_public_key
@@ -467,3 +468,56 @@ def test_a_key_of_another_kind(tmp_path: Path, curve: str) -> None:
     file.write_text(f"-----BEGIN PUBLIC KEY-----\n{text}-----END PUBLIC KEY-----\n")
     with pytest.raises(KeyUnreadableError, match=r"key\.pem: not"):
         read_public_key(file)
+
+
+def unsign(path: Path, first: int) -> None:
+    """Take the signatures from the checkpoint `first` on away."""
+    attack(path, f"UPDATE checkpoint SET signature = NULL, public_key = NULL WHERE number >= {first}")
+
+
+def test_signatures_on_their_way(log: Path, tmp_path: Path) -> None:
+    """What the signer has signed and the log does not have yet, at its end, is no tampering."""
+    signer_memory(log, tmp_path / "signer")
+    unsign(log, 2)
+    result = verify(log, signer=tmp_path / "signer")
+    assert result.findings == []
+    assert result.signed_checkpoints == 1
+    assert result.unsealed > 100
+
+
+def test_more_signatures_missing_than_are_asked_for(make_log: MakeLog, path: Path, tmp_path: Path) -> None:
+    """More of them at the end than are ever on their way together were removed."""
+    log = make_log(checkpoint_every=1, checkpoint_seconds=3600)
+    for number in range(70):
+        log.record(decision(log, number))
+        assert settle(log) is None
+    log.close()
+    signer_memory(path, tmp_path / "signer")
+    assert found(path, signer=tmp_path / "signer") == []
+    checkpoints = verify(path).checkpoints
+    unsign(path, checkpoints - 63)
+    assert found(path, signer=tmp_path / "signer") == []
+    unsign(path, checkpoints - 64)
+    kinds = [kind for kind, _first, _last in found(path, signer=tmp_path / "signer")]
+    assert kinds == [Kind.SIGNATURE_MISSING] * 65
+
+
+def test_signed_while_it_is_verified(
+    log: Path, make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkpoint that is made and signed while verification begins is not taken for one cut off."""
+
+    def meanwhile(directory: Path, log_id: str) -> Remembered | None:
+        writing = make_log(checkpoint_every=10, checkpoint_seconds=3600)
+        for number in range(40):
+            writing.record(decision(writing, number))
+        assert settle(writing) is None
+        writing.close()
+        signer_memory(log, directory)
+        return read_remembered(directory, log_id)
+
+    before = verify(log).checkpoints
+    monkeypatch.setattr("appliance.audit.verify.read_remembered", meanwhile)
+    result = verify(log, signer=tmp_path / "signer")
+    assert result.findings == []
+    assert result.checkpoints > before
