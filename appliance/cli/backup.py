@@ -9,8 +9,9 @@ import typer
 
 from appliance.audit.output import printable
 from appliance.cli.running import DEFAULT_STATE, State
-from appliance.supervisor.backup import BackupError, back_up
-from appliance.supervisor.backup import restore as put_back
+from appliance.supervisor.backup import back_up
+from appliance.supervisor.backup_contents import BackupError
+from appliance.supervisor.backup_restore import restore as put_back
 
 _NewState = Annotated[
     Path,

@@ -1,15 +1,13 @@
-"""The state directory in one file, taken while the appliance runs or not, and put back in another place.
+"""The state directory in one file, taken while the appliance runs or not (put back: `backup_restore`).
 
 Invariants:
 
 1. A database is copied by SQLite itself, as of one moment; nothing of a running appliance is waited for or stopped.
 2. What the signer remembers is taken back to the checkpoints that the copy of the log has, so that a restored log can
    be signed on. (It is taken after the log, so it has all of them.)
-3. The file has keys in it: only its owner may read it. Nothing is written over: neither the file nor a state directory
-   that is in use.
-4. A file that is put back is only what `back_up` makes: regular files of the parts of a state directory.
-5. Root reads, and gives away, in folders of users whose processes may have fallen to a stranger: a link is never
-   followed, a file that is not the user's own is an error, and what is in a folder is given away before the folder.
+3. The file has keys in it: only its owner may read it. Nothing is written over, and nothing unfinished is left.
+4. Root reads in folders of users whose processes may have fallen to a stranger: a link is never followed, and a file
+   that is not the user's own is an error.
 """
 
 import errno
@@ -19,31 +17,27 @@ import sqlite3
 import stat
 import tarfile
 import time
-import zlib
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
-from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import roles_of
-from appliance.supervisor.users import account_of
+from appliance.supervisor.backup_contents import (
+    AUDIT_LOG,
+    LARGEST,
+    BackupError,
+    is_database,
+    is_passing,
+    kept_parts,
+    trouble_with,
+)
 
-_HEADER, _HASH = 8, 32
-_LOG = "control/audit.db"
-_DATABASES = "control/"  # the only part that has any
-_LARGEST = 1 << 30  # bytes of a file that is no database
-# Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
-_PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid")
-_LOGS_OF_ROS = ("rosmaster",)
+_HEADER, _HASH = 8, 32  # bytes, of the signer's memory
+_FORMAT = tarfile.GNU_FORMAT  # a large database has its size in the one header
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe is not waited for
 _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/upgrade-and-backup.md)"
-
-
-class BackupError(Exception):
-    """A backup cannot be made or put back; the text says what is in the way, and what to do."""
 
 
 def back_up(state: Path, file: Path) -> list[str]:
@@ -51,7 +45,7 @@ def back_up(state: Path, file: Path) -> list[str]:
 
     Raises `BackupError`.
     """
-    if not (state / _LOG).exists():
+    if not (state / AUDIT_LOG).exists():
         raise BackupError(f"{state} has no audit log: it is no state directory of an appliance (--state)")
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
@@ -60,7 +54,10 @@ def back_up(state: Path, file: Path) -> list[str]:
     except OSError as error:
         raise BackupError(f"{file}: {error.strerror}") from error
     try:
-        with os.fdopen(descriptor, "wb") as raw, tarfile.open(fileobj=raw, mode="w:gz") as archive:
+        with (
+            os.fdopen(descriptor, "wb") as raw,
+            tarfile.open(fileobj=raw, mode="w:gz", format=_FORMAT) as archive,
+        ):
             names = _write(state, archive, file.absolute().parent)
             archive.close()
             raw.flush()
@@ -82,11 +79,13 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
         for name, descriptor in _files(state):
             with os.fdopen(descriptor, "rb") as file:
                 mode = os.fstat(descriptor).st_mode & 0o777
-                if name.startswith(_DATABASES) and name.endswith(".db"):
+                if trouble := trouble_with(name, os.fstat(descriptor).st_size):
+                    raise BackupError(f"{name} {trouble}: see who put it there, and take it away")
+                if is_database(name):
                     _copy_database(state / name, copy)
                 else:
                     _copy_file(name, file, copy, last)
-            if name == _LOG:
+            if name == AUDIT_LOG:
                 last = _last_checkpoint(copy)
             entry = tarfile.TarInfo(name)
             entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(time.time()), mode
@@ -99,14 +98,13 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
     """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it."""
-    parts = {role.part for role in roles_of(syslog=True)} - set(_LOGS_OF_ROS)
     names = [
         name
-        for part in sorted(parts)
+        for part in sorted(kept_parts())
         if (state / part).exists()  # else a role that never ran here
         for name in _names(state, part)
     ]
-    for name in sorted(names, key=lambda one: one != _LOG):
+    for name in sorted(names, key=lambda one: one != AUDIT_LOG):
         descriptor = _opened(state, name)
         if descriptor is not None:
             yield name, descriptor
@@ -117,7 +115,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
     for folder, folders, names in os.walk(state / part, onerror=_raise):
         folders.sort()
         for name in sorted(names):
-            if not name.endswith(_PASSING):
+            if not is_passing(name):
                 yield (Path(folder) / name).relative_to(state).as_posix()
 
 
@@ -150,11 +148,8 @@ def _opened(state: Path, name: str) -> int | None:
 
 
 def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> None:
-    size = os.fstat(file.fileno()).st_size
-    if size > _LARGEST:
-        raise BackupError(f"{name} has {size} bytes: see who put it there, and take it away")
     if name.endswith(".signed"):
-        copy.write_bytes(_as_far_as(file.read(_LARGEST), last.get(PurePosixPath(name).stem)))
+        copy.write_bytes(_as_far_as(file.read(LARGEST), last.get(PurePosixPath(name).stem)))
         return
     with copy.open("wb") as written:
         shutil.copyfileobj(file, written)
@@ -185,67 +180,3 @@ def _as_far_as(memory: bytes, number: int | None) -> bytes:
         return memory
     first = int.from_bytes(memory[:_HEADER], "big")
     return memory[: _HEADER + max(0, number - first + 1) * _HASH]
-
-
-def restore(file: Path, state: Path) -> list[str]:
-    """Make the state directory `state` of a backup, for `rosrv up --state` there; the names of what is in it.
-
-    As root each part is given to its user. Raises `BackupError`.
-    """
-    if state.exists() and any(state.iterdir()):
-        raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
-    try:
-        with tarfile.open(file, mode="r:gz") as archive:
-            entries = archive.getmembers()
-            for entry in entries:
-                _check(file, entry)
-            if _LOG not in {entry.name for entry in entries}:
-                raise BackupError(f"{file} has no audit log: it is no backup of an appliance")
-            state.mkdir(mode=0o711, parents=True, exist_ok=True)
-            state.chmod(0o711)
-            for entry in entries:
-                _extract(archive, entry, state)
-    except (OSError, tarfile.TarError, EOFError, zlib.error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise BackupError(f"{file} cannot be put back: {reason}") from error
-    if os.geteuid() == 0:
-        _hand_over(state)
-    return [entry.name for entry in entries]
-
-
-def _check(file: Path, entry: tarfile.TarInfo) -> None:
-    path = PurePosixPath(entry.name)
-    parts = {role.part for role in roles_of(syslog=True)}
-    inside = (
-        not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1 and path.parts[0] in parts
-    )
-    if not entry.isreg() or not inside:
-        raise BackupError(f"{file} has {entry.name!r} in it, which no backup has: nothing is put back")
-
-
-def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> None:
-    target = state / entry.name
-    for folder in reversed(target.relative_to(state).parents[:-1]):
-        (state / folder).mkdir(mode=0o700, exist_ok=True)
-    source = archive.extractfile(entry)
-    assert source is not None  # noqa: S101  `_check` let regular files pass only
-    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with source, os.fdopen(descriptor, "wb") as written:
-        while piece := source.read(1 << 20):
-            written.write(piece)
-        os.fchmod(descriptor, entry.mode & 0o755)
-
-
-def _hand_over(state: Path) -> None:
-    """Give each part to its role's user; the files in it that others may read, to the group that may."""
-    try:
-        roles = roles_of(syslog=True)
-    except StartError as error:
-        raise BackupError(f"{state}: everything is there, but: {error}") from error
-    for role in roles:
-        account = account_of(role.user)
-        group = account.gid if role.readable_by is None else account_of(role.readable_by).gid
-        part = state / role.part
-        # The innermost first: whoever has a folder could put a link in the place of what is in it.
-        for path in (*sorted(part.rglob("*"), reverse=True), part) if part.exists() else ():
-            os.chown(path, account.uid, account.gid if path.is_dir() else group, follow_symlinks=False)

@@ -1,6 +1,5 @@
 """Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
 
-import io
 import os
 import sqlite3
 import stat
@@ -18,7 +17,9 @@ from appliance.audit.log import AuditLog
 from appliance.audit.verify import verify
 from appliance.ipsec.checkpoints import SignedCheckpoints
 from appliance.supervisor import backup
-from appliance.supervisor.backup import BackupError, back_up, restore
+from appliance.supervisor.backup import back_up
+from appliance.supervisor.backup_contents import BackupError
+from appliance.supervisor.backup_restore import restore
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 
@@ -27,7 +28,7 @@ from tests.support.requirements import need_root
 def state(tmp_path: Path) -> Path:
     """A state directory with a log of some signed checkpoints, whose signer has signed one more since."""
     state = tmp_path / "state"
-    for part in ("control", "signer", "api", "run", "rosmaster/log"):
+    for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
     key = Ed25519PrivateKey.generate()
     memory = SignedCheckpoints(state / "signer")
@@ -50,7 +51,8 @@ def state(tmp_path: Path) -> Path:
         connection.execute("INSERT INTO thing VALUES ('kept')")
         connection.commit()
     for name, text in (("signer/audit.key", "secret"), ("run/config.json", "{}"), ("rosmaster/log/x.log", "x"),
-                       ("control/state.ahead", "x"), ("control/audit.db.lock", "")):  # fmt: skip
+                       ("control/state.ahead", "x"), ("control/audit.db.lock", ""),
+                       ("ipsec/strongswan.conf", "")):  # fmt: skip
         (state / name).write_text(text)
     (state / "signer" / "audit.key").chmod(0o600)
     return state
@@ -65,7 +67,8 @@ def test_there_and_back(state: Path, tmp_path: Path) -> None:
     assert sorted(names) == sorted(restore(file, other))
     assert {"control/audit.db", "control/audit.pub", "control/state.db", "signer/audit.key"} <= set(names)
     assert not any(
-        name.startswith(("run/", "rosmaster/")) or name.endswith((".ahead", ".lock")) for name in names
+        name.startswith(("run/", "rosmaster/")) or name.endswith((".ahead", ".lock", ".conf"))
+        for name in names
     )
     assert stat.S_IMODE((other / "signer" / "audit.key").stat().st_mode) == 0o600
     result = verify(other / "control" / "audit.db", signer=other / "signer")
@@ -89,41 +92,10 @@ def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
         restore(file, state)
 
 
-@pytest.mark.parametrize(
-    "name", ["../evil", "/etc/evil", "control/../../evil", "evil", "elsewhere/evil", "run/config.json"]
-)
-def test_a_file_that_is_no_backup(tmp_path: Path, name: str) -> None:
-    """An archive with a name that no backup has is refused whole, before anything is written."""
-    file = tmp_path / "evil.tar.gz"
-    with tarfile.open(file, "w:gz") as archive:
-        for one in ("control/audit.db", name):
-            archive.addfile(tarfile.TarInfo(one), io.BytesIO())
-    with pytest.raises(BackupError, match="nothing is put back"):
-        restore(file, tmp_path / "state")
-    assert not (tmp_path / "state").exists()
-
-
-@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
-def test_only_files(tmp_path: Path, kind: bytes) -> None:
-    """Links, devices and folders are in no backup."""
-    file = tmp_path / "evil.tar.gz"
-    with tarfile.open(file, "w:gz") as archive:
-        entry = tarfile.TarInfo("control/audit.db")
-        entry.type, entry.linkname = kind, "/etc/passwd"
-        archive.addfile(entry)
-    with pytest.raises(BackupError, match="nothing is put back"):
-        restore(file, tmp_path / "state")
-
-
 def test_what_cannot_be_read(tmp_path: Path) -> None:
-    """No state directory, no archive, one that was cut: an error that names it."""
+    """No state directory: an error that names it."""
     with pytest.raises(BackupError, match="no state directory of an appliance"):
         back_up(tmp_path, tmp_path / "x.tar.gz")
-    (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
-    with pytest.raises(BackupError, match="rubbish cannot be put back"):
-        restore(tmp_path / "rubbish", tmp_path / "state")
-    with pytest.raises(BackupError, match="nowhere cannot be put back"):
-        restore(tmp_path / "nowhere", tmp_path / "state")
 
 
 def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
@@ -210,16 +182,10 @@ def test_a_file_without_end_is_refused(state: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "backup.tar.gz").exists()
 
 
-def test_a_folder_is_given_away_after_what_is_in_it(
-    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While `restore` hands a part over, its user cannot put a link in the place of what is still to be given away."""
-    need_root()
-    (state / "api" / "inner").mkdir()
-    (state / "api" / "inner" / "file").write_text("x")
-    given: list[str] = []
-    monkeypatch.setattr(os, "chown", lambda path, *_ids, **_more: given.append(str(path)))
-    back_up(state, tmp_path / "backup.tar.gz")
-    restore(tmp_path / "backup.tar.gz", tmp_path / "other")
-    order = [given.index(str(tmp_path / "other" / name)) for name in ("api/inner/file", "api/inner", "api")]
-    assert order == sorted(order)
+@pytest.mark.parametrize("name", ["\x1b[2J", "x" * 97])
+def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: str) -> None:
+    """A backup that nobody could put back is not made: the file that is in the way is named."""
+    (state / "api" / name).touch()
+    with pytest.raises(BackupError, match="see who put it there"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
