@@ -147,6 +147,20 @@ class Carried:
             count=message.count,
         )
 
+    def upstream_lost(self, message: messages.UpstreamLost, host: str) -> None:
+        """A publisher at this address is not read any more: recorded if it was cut for what it sent."""
+        if message.violation:
+            self._recorder.happened(
+                message.violation,
+                message.reason,
+                severity=Severity.WARNING,
+                decision="deny",
+                host=host,
+                caller_id=self._name(message.key),
+                category="topic",
+                resource=message.topic,
+            )
+
     def publication_refused(self, message: messages.PublicationRefused) -> None:
         """A publisher is not carried."""
         self._recorder.happened(

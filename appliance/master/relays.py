@@ -306,6 +306,7 @@ class RelayControl:
             case messages.UpstreamLost():
                 incarnation = self._registry.by_key(message.key)
                 if incarnation is not None:
+                    self.carried.upstream_lost(message, str(incarnation.host))
                     self._broken(incarnation)
             case messages.TrafficReported():
                 self.carried.reported(message.rows)

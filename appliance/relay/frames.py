@@ -16,7 +16,7 @@ subscribers have been sent always ends with a frame.
 import mmap
 import struct
 
-from appliance.ros.errors import LimitExceededError, PeerError
+from appliance.ros.errors import LimitExceededError
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
@@ -111,7 +111,7 @@ class FrameReceiver:
     def received(self, count: int) -> Batch | None:
         """The frames that are whole now that `count` more bytes are in the buffer.
 
-        The batch is good until the next call of `buffer`. Raises `PeerError` for a frame beyond the limit,
+        The batch is good until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
         and when the process has no memory left for an unfinished one.
         """
         if self._area is not None:
@@ -168,7 +168,7 @@ class FrameReceiver:
             if need - 4 > self._limit:
                 raise _too_long(need - 4, self._limit)
             if self._budget.exhausted:
-                raise PeerError("the relay has no memory left for the rest of this message")
+                raise LimitExceededError("the relay has no memory left for the rest of this message")
             if need > len(area):
                 self._begin_area(need, area[: self._filled])
             else:

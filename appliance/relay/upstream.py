@@ -11,16 +11,18 @@ import socket
 from collections.abc import Callable
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
+from appliance.channel.messages.relay import Violation
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import FrameReceiver
 from appliance.relay.loop import READ, Timer
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.relay.topic import RelayedTopic
-from appliance.ros.errors import PeerError
+from appliance.ros.errors import LimitExceededError, PeerError
 from appliance.ros.tcpros import HeaderParser, encode_header
 
 _CALLER_ID = "/rosrv"
+_REASON = 1000  # characters that are reported; an error in a header is as long as the publisher likes
 
 
 class Publisher:
@@ -152,13 +154,13 @@ class Publisher:
         try:
             header = self._parser.feed(data)
         except PeerError as error:
-            self._lose(f"the publisher's header cannot be read: {error}")
+            self._lose(f"the publisher's header cannot be read: {error}", _violation(error))
             return
         if header is None:
             return
-        missing = [field for field in ("type", "md5sum") if field not in header]
-        if "error" in header or missing:
-            self._lose(f"the publisher says: {header.get('error', f'nothing about its {missing[0]}')}")
+        refusal = _refusal(header)
+        if refusal is not None:
+            self._lose(*refusal)
             return
         reason = self._objection(header)
         if reason:
@@ -225,7 +227,7 @@ class Publisher:
         try:
             batch = self._received(count)
         except PeerError as error:
-            self._lose(str(error))
+            self._lose(str(error), _violation(error))
             return
         if batch is not None:
             self._topic.received(batch, since)
@@ -236,9 +238,9 @@ class Publisher:
     def _late(self, reason: str) -> Callable[[], None]:
         return lambda: self._lose(f"{reason} within {self._limits.connect_seconds:g} s")
 
-    def _lose(self, reason: str) -> None:
+    def _lose(self, reason: str, violation: Violation = "") -> None:
         self._drop_connection()
-        self._reporter.send(UpstreamLost(self._topic.key, self._topic.topic, reason))
+        self._reporter.send(UpstreamLost(self._topic.key, self._topic.topic, reason[:_REASON], violation))
         self._retry()
 
     def _retry(self) -> None:
@@ -272,3 +274,17 @@ class Publisher:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if callback is None else self._loop.after(seconds, callback)
+
+
+def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
+    """Why a publisher's header begins no conversation, and what that is."""
+    if "error" in header:
+        return f"the publisher says: {header['error']}", "connection refused"
+    missing = [field for field in ("type", "md5sum") if field not in header]
+    if missing:
+        return f"the publisher says nothing about its {missing[0]}", "malformed"
+    return None
+
+
+def _violation(error: PeerError) -> Violation:
+    return "limit exceeded" if isinstance(error, LimitExceededError) else "malformed"

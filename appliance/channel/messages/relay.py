@@ -131,12 +131,19 @@ class UpstreamRefused(Message):
     reason: str
 
 
+Violation = Literal["", "limit exceeded", "malformed", "connection refused"]
+
+
 class UpstreamLost(Message):
-    """A connection to a publisher broke or could not be made: control looks at the node at once."""
+    """A connection to a publisher broke or could not be made: control looks at the node at once.
+
+    `violation` is the event to be recorded if it was cut for what the publisher sent; empty for one that broke.
+    """
 
     key: str
     topic: str
     reason: str
+    violation: Violation = ""
 
 
 class ConnectionOpened(Message):

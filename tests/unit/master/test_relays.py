@@ -76,6 +76,7 @@ class World:
     """Two relays; /left and the service /serve belong to the first, /right to the second."""
 
     def __init__(self) -> None:
+        self.records: list[tuple[str, str, dict[str, Any]]] = []
         self.registry = Registry(cast(Any, Nothing()))
         self.allocation = Allocation(2)
         self.put(left=0, right=1)
@@ -85,7 +86,7 @@ class World:
             cast(Places, self.ports),
             cast(StateStore, Nothing()),
             cast(Delivery, Nothing()),
-            cast(Recorder, Nothing()),
+            cast(Recorder, self),
             allocation=self.allocation,
             broken=lambda _incarnation: None,
         )
@@ -104,6 +105,11 @@ class World:
         ):
             self.registry.register(self.node, kind, name, detail)
             self.relay.placed(self.node, kind, name, detail)
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """As `Recorder`."""
+        self.records.append((event, reason, fields))
+        return ""
 
     def put(self, **topics: int) -> None:
         """These topics belong to these relays."""
@@ -178,4 +184,20 @@ async def test_one_relay_goes_and_its_connections_with_it() -> None:
     assert (lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"
+    world.close()
+
+
+async def test_a_publisher_that_is_cut_for_what_it_sent_is_recorded() -> None:
+    """With its address and name, as a denial that is folded; one whose connection only broke is not."""
+    world = World()
+    say = world.links[0].say
+    say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
+    assert world.records == []
+    say(messages.UpstreamLost("key", "/left", "a message of 1 GiB is declared", "limit exceeded"), ())
+    ((event, reason, fields),) = world.records
+    assert (event, reason) == ("limit exceeded", "a message of 1 GiB is declared")
+    assert (fields["host"], fields["caller_id"], fields["resource"]) == ("10.0.0.5", "/node", "/left")
+    assert fields["decision"] == "deny"
+    say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
+    assert len(world.records) == 1
     world.close()

@@ -432,14 +432,23 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
     closed.close()
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", LOOPBACK, nowhere))
-    world.hears(UpstreamLost)
+    assert not world.hears(UpstreamLost).violation
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
     silent = world.accept(world.publisher)
     assert "no answer" in world.hears(UpstreamLost).reason
     world.ends(silent)
-    world.upstream({"error": "not a publisher of it"})
-    assert "not a publisher of it" in world.hears(UpstreamLost).reason
+    world.upstream({"error": "not a publisher of it" + 2000 * "!"})
+    refused = world.hears(UpstreamLost)
+    assert "not a publisher of it" in refused.reason
+    assert (len(refused.reason), refused.violation) == (1000, "connection refused")
+    world.upstream({"type": "std_msgs/String"})
+    assert world.hears(UpstreamLost).violation == "malformed"
+    world.hears(UpstreamWanted)
+    world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
+    world.accept(world.publisher).send(struct.pack("<II", 8, 100) + b"type")
+    unreadable = world.hears(UpstreamLost)
+    assert ("header cannot be read" in unreadable.reason, unreadable.violation) == (True, "malformed")
     world.upstream()
     assert world.gets_header(subscriber) == HEADER
 
@@ -458,7 +467,8 @@ def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world:
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one") + struct.pack("<I", LIMITS.message_bytes + 1))
     world.ends(publisher)
-    assert "limit" in world.hears(UpstreamLost).reason
+    lost = world.hears(UpstreamLost)
+    assert ("limit" in lost.reason, lost.violation) == (True, "limit exceeded")
     subscriber.read()
     assert not subscriber.ended
 
