@@ -17,7 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -42,30 +42,24 @@ from appliance.channel.messages import (
     SocketKept,
     SocketRestored,
     SocketsRestored,
-    Stop,
     TunnelsEnclosed,
     TunnelsWanted,
 )
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health
-from appliance.supervisor.child import Plan
 from appliance.supervisor.enclosure import Enclosure
+from appliance.supervisor.ending import end_all
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.guard import Guard
 from appliance.supervisor.kept import KeptSockets, RefusedSocketError
-from appliance.supervisor.life import ANSWER_SECONDS, Life, Reports, link, program_environment
+from appliance.supervisor.life import ANSWER_SECONDS, Life, Reports, link
+from appliance.supervisor.post import Post
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.users import account_of
 
 ADMIN = "admin"
-_BACKOFF = (0.0, 0.2, 0.5, 1.0)
-_LONG_LIFE_SECONDS = 10.0
-_LOUD_AFTER = 5
 _READERS = "rosrv-api"  # the user whose group may read the audit log
 _START_SECONDS = 180.0
-_STOP_SECONDS = 3.0
-_TERMINATE_SECONDS = 0.3
-_LAST_SECONDS = 1.0
 
 _FROM_ANY: tuple[type[Message], ...] = (Pong, Ready, Failed)
 _FROM_CONTROL: tuple[type[Message], ...] = (
@@ -90,18 +84,6 @@ class ControlReady(msgspec.Struct, frozen=True):
     inner_port: int
     own_port: int
     token: str | None = None
-
-
-@dataclass
-class Post:
-    """A place in the table that is to be filled at all times while the appliance runs."""
-
-    role: Role
-    index: int
-    life: Life | None = None
-    lives: int = 0
-    short_lives: int = 0
-    due: asyncio.TimerHandle | None = None
 
 
 class Supervisor:
@@ -203,7 +185,7 @@ class Supervisor:
             return
         here, there = socket.socketpair()
         try:
-            plan = self._plan(post, there.fileno())
+            plan = post.plan(self._facts, there.fileno())
             with self._guard.enclosure.inside():
                 post.life = Life(post.role.name, post.index, plan, here, self._reports)
         except OSError as error:
@@ -221,30 +203,6 @@ class Supervisor:
             post.life.send(SocketRestored(post.role.name), (self._listeners[post.role.name].fileno(),))
         self._link(post)
         self._tell_processes()
-
-    def _plan(self, post: Post, lifeline: int) -> Plan:
-        role, facts = post.role, self._facts
-        home = str(facts.part(role.part))
-        plan = Plan(
-            parent=os.getpid(),
-            lifeline=lifeline,
-            account=account_of(role.user, group=role.group),
-            home=home,
-            network=role.network,
-            files=role.files,
-            entry=role.entry,
-            index=post.index if role.indexed else None,
-            path=str(role.path(facts)) if role.path else None,
-            capabilities=role.capabilities,
-            takes_secret=role.secret is not None,
-            secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
-        )
-        if role.program is None:
-            return plan
-        program = role.program(facts)
-        return msgspec.structs.replace(
-            plan, argv=program.argv, environment=program_environment(home, dict(program.environment))
-        )
 
     def _equip_control(self, life: Life) -> None:
         for name, descriptor in self._kept:
@@ -345,7 +303,7 @@ class Supervisor:
         if self._stopping.is_set() or not life.alive:
             return
         for post in self._posts:
-            if post.role.after == life.role and post.life is None and post.due is None:
+            if post.role.after == life.role and post.is_vacant:
                 self._fill(post)
         if not self._is_ready:
             self._is_ready = True
@@ -366,7 +324,7 @@ class Supervisor:
         answer = await self._guard.open_tunnels(pool, address)
         if answer.esp is not None:
             for post in self._posts:
-                if post.role.on_demand and post.life is None and post.due is None:
+                if post.role.on_demand and post.is_vacant:
                     self._fill(post)
         life.send(answer)
 
@@ -424,15 +382,13 @@ class Supervisor:
 
     def _died(self, life: Life, code: int) -> None:
         post = next(one for one in self._posts if one.life is life)
-        post.life = None
+        lived = post.bury(life)
         self._someone_died.set()
         if self._stopping.is_set():
             return
-        lived = time.monotonic() - life.started
-        post.short_lives = post.short_lives + 1 if lived < _LONG_LIFE_SECONDS else 0
         log.error("process died", role=life.role, pid=life.pid, end=_end_of(code), lived=round(lived, 3))
         self._tell_processes()
-        if post.short_lives >= _LOUD_AFTER:
+        if post.keeps_dying:
             if not self._is_ready:
                 self.stop(f"{life.role} died {post.short_lives} times ({_end_of(code)}); the log says why")
                 return
@@ -440,8 +396,7 @@ class Supervisor:
         self._fill_later(post)
 
     def _fill_later(self, post: Post) -> None:
-        delay = _BACKOFF[min(max(post.short_lives - 1, 0), len(_BACKOFF) - 1)]
-        post.due = asyncio.get_running_loop().call_later(delay, self._fill, post)
+        post.due = asyncio.get_running_loop().call_later(post.delay(), self._fill, post)
 
     def _tell_processes(self) -> None:
         rows = [
@@ -463,41 +418,7 @@ class Supervisor:
         self._stopping.set()
         for task in self._tasks:
             task.cancel()
-        for post in self._posts:
-            if post.due is not None:
-                post.due.cancel()
-        await self._end_some([one for one in self._posts if not one.role.outlives_control], _STOP_SECONDS)
-        await self._end_some(self._posts, _LAST_SECONDS)
-
-    async def _end_some(self, posts: list[Post], seconds: float) -> None:
-        for post in posts:
-            if post.life is None:
-                continue
-            if post.life.is_program:
-                post.life.kill(signal.SIGTERM)
-            else:
-                post.life.send(Stop())
-        if await self._all_gone(posts, seconds):
-            return
-        self._signal(posts, signal.SIGTERM)
-        if await self._all_gone(posts, _TERMINATE_SECONDS):
-            return
-        self._signal(posts, signal.SIGKILL)
-        await self._all_gone(posts, _LAST_SECONDS)
-
-    def _signal(self, posts: list[Post], number: signal.Signals) -> None:
-        for post in posts:
-            if post.life is not None:
-                log.warning("process did not end", role=post.role.name, pid=post.life.pid, signal=number.name)
-                post.life.kill(number)
-
-    async def _all_gone(self, posts: list[Post], seconds: float) -> bool:
-        with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while any(post.life is not None for post in posts):
-                    self._someone_died.clear()
-                    await self._someone_died.wait()
-        return all(post.life is None for post in posts)
+        await end_all(self._posts, self._someone_died)
 
 
 def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -1,0 +1,75 @@
+"""A place in the table of processes that is to be filled at all times, and how long it stays empty after a death."""
+
+import asyncio
+import os
+import time
+from dataclasses import dataclass
+
+import msgspec
+
+from appliance.supervisor.child import Plan
+from appliance.supervisor.life import Life, program_environment
+from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.users import account_of
+
+LOUD_AFTER = 5  # short lives in a row
+_BACKOFF = (0.0, 0.2, 0.5, 1.0)
+_LONG_LIFE_SECONDS = 10.0
+
+
+@dataclass
+class Post:
+    """A role, or one of several of it, and who fills it now."""
+
+    role: Role
+    index: int
+    life: Life | None = None
+    lives: int = 0
+    short_lives: int = 0  # in a row
+    due: asyncio.TimerHandle | None = None
+
+    @property
+    def is_vacant(self) -> bool:
+        """Nobody fills it, and nobody is about to."""
+        return self.life is None and self.due is None
+
+    @property
+    def keeps_dying(self) -> bool:
+        """Its last lives were short, so many that somebody must be told."""
+        return self.short_lives >= LOUD_AFTER
+
+    def bury(self, life: Life) -> float:
+        """Note the death of who filled it; the seconds that it lived."""
+        self.life = None
+        lived = time.monotonic() - life.started
+        self.short_lives = self.short_lives + 1 if lived < _LONG_LIFE_SECONDS else 0
+        return lived
+
+    def delay(self) -> float:
+        """The seconds until it is to be filled again: none after a long life."""
+        return _BACKOFF[min(max(self.short_lives - 1, 0), len(_BACKOFF) - 1)]
+
+    def plan(self, facts: Facts, lifeline: int) -> Plan:
+        """How its next life is to be started; `lifeline` is the child's end."""
+        role = self.role
+        home = str(facts.part(role.part))
+        plan = Plan(
+            parent=os.getpid(),
+            lifeline=lifeline,
+            account=account_of(role.user, group=role.group),
+            home=home,
+            network=role.network,
+            files=role.files,
+            entry=role.entry,
+            index=self.index if role.indexed else None,
+            path=str(role.path(facts)) if role.path else None,
+            capabilities=role.capabilities,
+            takes_secret=role.secret is not None,
+            secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
+        )
+        if role.program is None:
+            return plan
+        program = role.program(facts)
+        return msgspec.structs.replace(
+            plan, argv=program.argv, environment=program_environment(home, dict(program.environment))
+        )
