@@ -3,11 +3,13 @@
 Invariants:
 
 1. Nothing that comes from a node or a browser is parsed here. From a child come only the messages in
-   `_COMMANDS`; a child that sends anything else is killed and started again.
+   `_FROM_ANY` and `_FROM_CONTROL`; a child that sends anything else is killed and started again.
 2. A process that dies is started again within a second; one that does not answer for five seconds is killed.
-3. Whenever one end of a link is new, both ends get a fresh link; a new control gets every kept socket
+3. Once nodes may connect, nothing that a process says of itself or dies of ends the appliance, but the end that
+   control was granted; who cannot serve (a full disk) is tried again, after a second at most.
+4. Whenever one end of a link is new, both ends get a fresh link; a new control gets every kept socket
    back first, then its links, then who is running.
-4. Ending takes less than five seconds, whatever the children do, and leaves no process behind.
+5. Ending takes less than five seconds, whatever the children do, and leaves no process behind.
 """
 
 import asyncio
@@ -231,14 +233,18 @@ class Supervisor:
             case Ready(detail):
                 self._child_ready(life, detail)
             case Failed(said):
-                reason = _printable(said)
-                if next(post for post in self._posts if post.life is life).role.dispensable:
-                    log.error("process cannot serve", role=life.role, reason=reason)
-                    life.kill()
-                else:
-                    self.stop(reason)  # which says it, as the last line
+                self._cannot_serve(life, _printable(said))
             case _:
                 self._control_said(life, message, descriptors)
+
+    def _cannot_serve(self, life: Life, reason: str) -> None:
+        """Before nodes may connect, it is for the person who starts the appliance; later the next life may succeed."""
+        post = next(one for one in self._posts if one.life is life)
+        if self._is_ready or post.role.dispensable:
+            log.error("process cannot serve", role=life.role, reason=reason)
+            life.kill()
+        else:
+            self.stop(reason)  # which says it, as the last line
 
     def _control_said(self, life: Life, message: Message, descriptors: tuple[int, ...]) -> None:
         match message:

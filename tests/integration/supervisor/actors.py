@@ -69,6 +69,17 @@ def failing(lifeline_fd: int, config: Path) -> None:
     asyncio.run(_Failing("control", lifeline_fd, RelayLink).run())
 
 
+def failing_again(lifeline_fd: int, config: Path) -> None:
+    """A control that serves at first, and of whose next lives three cannot (a full disk)."""
+    lives = config.parent.parent / "control" / "lives"
+    with lives.open("a") as file:
+        file.write(".")
+    if 1 < lives.stat().st_size < 5:
+        asyncio.run(_Failing("control", lifeline_fd, RelayLink).run())
+    else:
+        control(lifeline_fd, config)
+
+
 def dying(lifeline_fd: int, config: Path) -> None:
     """A control that dies as soon as it lives."""
     sys.exit(3)

@@ -246,6 +246,19 @@ def test_why_control_cannot_serve_is_what_the_user_reads(start: Any) -> None:
     running.until_childless()
 
 
+def test_what_cannot_serve_later_is_tried_again_and_ends_nothing(start: Any) -> None:
+    """Nodes are connected: a control that finds the disk full is started again until it finds room, and why is said."""
+    running = start("control=failing_again").until_ready()
+    os.kill(running.pid("control"), signal.SIGKILL)
+    for restarts in (1, 2, 3):
+        pid = running.pid("control", restarts=restarts)
+        said = running.process.wait_for(event="process cannot serve", role="control")
+        assert said["reason"].startswith("policy.ini:3: unknown section [Nods]")
+        running.process.wait_for(event="process died", pid=pid)
+    assert running.echo() == running.pid("control", restarts=4)
+    assert running.process.stop(with_signal=signal.SIGTERM) == 0
+
+
 def test_a_control_that_never_lives_is_an_error(start: Any) -> None:
     """When control dies again and again before nodes could ever connect, the start fails and says so."""
     running = start("control=dying")
