@@ -32,6 +32,8 @@ from appliance.supervisor.backup_contents import (
     kept_parts,
     trouble_with,
 )
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import refuse_half_restored
 
 _HEADER, _HASH = 8, 32  # bytes, of the signer's memory
 _FORMAT = tarfile.GNU_FORMAT  # a large database has its size in the one header
@@ -45,6 +47,10 @@ def back_up(state: Path, file: Path) -> list[str]:
 
     Raises `BackupError`.
     """
+    try:
+        refuse_half_restored(state)
+    except StartError as error:
+        raise BackupError(str(error)) from None
     if not (state / AUDIT_LOG).exists():
         raise BackupError(f"{state} has no audit log: it is no state directory of an appliance (--state)")
     try:
@@ -62,11 +68,10 @@ def back_up(state: Path, file: Path) -> list[str]:
             archive.close()
             raw.flush()
             os.fsync(raw.fileno())
-    except (OSError, sqlite3.Error) as error:
+    except BaseException as error:  # Ctrl-C, too
         file.unlink()
-        raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
-    except BackupError:
-        file.unlink()
+        if isinstance(error, (OSError, sqlite3.Error)):
+            raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
         raise
     return names
 

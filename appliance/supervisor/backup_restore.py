@@ -18,11 +18,10 @@ from pathlib import Path
 
 from appliance.supervisor.backup_archive import checked_archive
 from appliance.supervisor.backup_contents import BackupError
-from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import account_of
 
-_MARK = "restoring"
 _SPARE = 64 << 20  # bytes of a disk that are left for others
 _MOST = 64 << 30
 
@@ -43,15 +42,6 @@ def restore(file: Path, state: Path) -> list[str]:
     return [entry.name for entry in entries]
 
 
-def refuse_half_restored(state: Path) -> None:
-    """To be called before `state` is used. Raises `StartError` where `restore` did not come to its end."""
-    if (state / _MARK).exists():
-        raise StartError(
-            f"{state}: a backup was not put back to its end: remove it, and `rosrv restore` once more"
-            " (while that is still at work, wait)"
-        )
-
-
 def _room(state: Path) -> int:
     """Bytes that a backup may have on the disk that `state` is, or will be, on."""
     here = state.absolute()
@@ -67,8 +57,7 @@ def _marked(state: Path) -> Iterator[None]:
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)
-    mark = state / _MARK
-    os.close(os.open(mark, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
+    mark = set_mark(state)
     try:
         yield
     except BaseException:

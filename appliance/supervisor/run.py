@@ -13,6 +13,7 @@ from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
+from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.state import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
@@ -54,6 +55,7 @@ def run_appliance(
             mediation=settings.mediation,
         )
     keep_supervisors()
+    refuse_half_restored(settings.state)
     state = StateDirectory(settings.state)
     try:
         settings = _with_ports(settings)

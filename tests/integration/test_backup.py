@@ -78,3 +78,18 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
         assert new.audit(event="signature refused") == []
     finally:
         new.close()
+
+
+def test_a_half_restored_state_is_not_started() -> None:
+    """`rosrv up` on what a torn restore left ends with the thing to do, and changes nothing there."""
+    appliance = Appliance()
+    try:
+        appliance.state.mkdir(mode=0o711)
+        (appliance.state / "restoring").touch()
+        command = [ROSRV, "up", "--isolation", "none", "--state", str(appliance.state)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 1
+        assert "was not put back to its end: remove it, and `rosrv restore` once more" in done.stderr
+        assert [one.name for one in appliance.state.iterdir()] == ["restoring"]
+    finally:
+        appliance.close()

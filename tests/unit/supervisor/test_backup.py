@@ -189,3 +189,25 @@ def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: st
     with pytest.raises(BackupError, match="see who put it there"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_an_interrupted_backup_leaves_no_file(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in the middle: under the name that was asked for there is a whole backup or none."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(backup, "_copy_file", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert [one.name for one in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
+    """What a torn restore left is no appliance's state."""
+    (state / "restoring").touch()
+    with pytest.raises(BackupError, match="was not put back to its end"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()

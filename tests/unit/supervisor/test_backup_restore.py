@@ -10,8 +10,9 @@ import pytest
 
 from appliance.supervisor import backup_restore
 from appliance.supervisor.backup_contents import BackupError
-from appliance.supervisor.backup_restore import refuse_half_restored, restore
+from appliance.supervisor.backup_restore import restore
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import refuse_half_restored
 from tests.support.requirements import need_root
 
 LOG = "control/audit.db"
