@@ -168,8 +168,9 @@ class Supervisor:
     async def _until_answering(self, post: Post) -> None:
         deadline = time.monotonic() + _START_SECONDS
         while time.monotonic() < deadline and not self._stopping.is_set():
-            if post.life is not None and await self._answers(1.0):
-                post.life.heard()
+            life = post.life
+            if life is not None and await self._answers(1.0) and post.life is life:
+                life.heard()
                 return
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._stopping.wait(), 0.05)
