@@ -70,8 +70,12 @@ def test_dynamic_subscriptions(ros: RosSession) -> None:
         node.wait_for(event="received", data=f"round {number}")
         order(node, "unsubscribe", topic="/d")
     order(node, "subscribe", topic="/d")
+    node.wait_for_count(
+        2, event="received", data="round 4"
+    )  # rospy loses a publisher that goes while it connects
     for number in range(5):
         order(talker, "unadvertise", topic="/d")
+        order(node, "abandoned", topic="/d")
         order(talker, "advertise", topic="/d", latch=True)
         order(talker, "publish", topic="/d", text=f"again {number}")
         node.wait_for(event="received", data=f"again {number}")

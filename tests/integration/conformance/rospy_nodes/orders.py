@@ -1,6 +1,7 @@
 """A rospy node that works with topics as told on standard input, one JSON object per line.
 
-{"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish", "topic": T, "text": X, "latch": B},
+{"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned", "topic": T, "text": X,
+"latch": B},
 {"do": "now"} (the time it believes), {"do": "log", "text": X} (to rosout); events `done`, `received`, `connected`.
 """
 
@@ -37,6 +38,15 @@ class Orders:
     def unsubscribe(self, told):
         """Stop listening."""
         self.subscribers.pop(told["topic"]).unregister()
+
+    def abandoned(self, told):
+        """Wait until it is connected to nobody: rospy takes a publisher that comes back before that for the old one."""
+        subscriber = self.subscribers[told["topic"]]
+        for _ in range(3000):
+            if not subscriber.get_num_connections():
+                return
+            rospy.sleep(0.01)
+        raise RuntimeError("still connected")
 
     def advertise(self, told):
         """Become a publisher."""
