@@ -6,8 +6,8 @@ Invariants:
 2. What the signer remembers is taken back to the checkpoints that the copy of the log has, so that a restored log can
    be signed on. (It is taken after the log, so it has all of them.)
 3. The file has keys in it: only its owner may read it. Nothing is written over, and nothing unfinished is left.
-4. Root reads in folders of users whose processes may have fallen to a stranger: a link is never followed, and a file
-   that is not the user's own is an error.
+4. Root reads in folders of users whose processes may have fallen to a stranger: with root's rights a link is never
+   followed, and a file that is not the user's own is an error.
 """
 
 import errno
@@ -32,6 +32,7 @@ from appliance.supervisor.backup_contents import (
     kept_parts,
     trouble_with,
 )
+from appliance.supervisor.backup_database import copy_database
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 
@@ -87,7 +88,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
                 if trouble := trouble_with(name, os.fstat(descriptor).st_size):
                     raise BackupError(f"{name} {trouble}: see who put it there, and take it away")
                 if is_database(name):
-                    _copy_database(state / name, copy)
+                    copy_database(state / name, os.fstat(descriptor), copy)
                 else:
                     _copy_file(name, file, copy, last)
             if name == AUDIT_LOG:
@@ -162,14 +163,6 @@ def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> N
 
 def _raise(error: OSError) -> None:
     raise error
-
-
-def _copy_database(path: Path, copy: Path) -> None:
-    with (
-        closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=30)) as source,
-        closing(sqlite3.connect(copy)) as target,
-    ):
-        source.backup(target)
 
 
 def _last_checkpoint(log: Path) -> dict[str, int]:

@@ -1,12 +1,14 @@
 """Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
 
 import os
+import shutil
 import sqlite3
 import stat
 import subprocess
 import sys
 import tarfile
 import tempfile
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -211,3 +213,60 @@ def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> 
     with pytest.raises(BackupError, match="was not put back to its end"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
+
+
+@pytest.fixture
+def owned(state: Path) -> Iterator[Path]:
+    """The state where its users can reach it, and `control` its user's own; root makes the backup."""
+    need_root()
+    place = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
+    place.chmod(0o711)
+    owned = Path(shutil.move(state, place / "state"))
+    owned.chmod(0o711)
+    for path in (*(owned / "control").iterdir(), owned / "control"):
+        os.chown(path, 61011, 61014)
+    yield owned
+    shutil.rmtree(place)
+
+
+def test_databases_in_use_are_copied_as_their_user(owned: Path, tmp_path: Path) -> None:
+    """What is still in the write-ahead log is in the backup, and no file of root's is left beside the database."""
+    with closing(sqlite3.connect(owned / "control" / "state.db")) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("INSERT INTO thing VALUES ('fresh')")
+        connection.commit()
+        for path in (owned / "control").iterdir():
+            os.chown(path, 61011, 61014)
+        before = (os.geteuid(), os.getegid(), os.getgroups())
+        back_up(owned, tmp_path / "backup.tar.gz")
+        assert (os.geteuid(), os.getegid(), os.getgroups()) == before
+        assert {path.stat().st_uid for path in (owned / "control").iterdir()} == {61011}
+    with tarfile.open(tmp_path / "backup.tar.gz") as archive:
+        archive.extract("control/state.db", tmp_path)
+    with closing(sqlite3.connect(tmp_path / "control" / "state.db")) as connection:
+        assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",), ("fresh",)]
+
+
+def test_a_database_that_becomes_a_link_gives_nothing_of_roots_away(
+    owned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put in its place after it was looked at, a link is followed with no more rights than its user has."""
+    secret = owned.parent / "secret.db"
+    with closing(sqlite3.connect(secret)) as connection:
+        connection.execute("CREATE TABLE secret (value TEXT)")
+        connection.commit()
+    secret.chmod(0o600)
+    opened = backup._opened
+
+    def swapped(state: Path, name: str) -> int | None:
+        descriptor = opened(state, name)
+        if name == "control/state.db":
+            (state / name).unlink()
+            (state / name).symlink_to(secret)
+        return descriptor
+
+    monkeypatch.setattr(backup, "_opened", swapped)
+    with pytest.raises(BackupError, match=r"control/state\.db cannot be read by user id 61011"):
+        back_up(owned, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+    assert os.geteuid() == 0
