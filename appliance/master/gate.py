@@ -1,7 +1,7 @@
 """The one decision point: the policy first, then the binding of claims to hosts, then the limits per host.
 
-`Gate.decide` is a function of the running policy and the registry; it forwards nothing and records nothing. A
-question that only the network can answer (is the node that holds this name still there?) is returned as
+`Gate.decide` is a function of the running policy, the registry and the parameters; it forwards nothing and records
+nothing. A question that only the network can answer (is the node that holds this name still there?) is returned as
 `Contest`, and asked again with the answer.
 """
 
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Call, Caller, Identity, Touch
+from appliance.master.parameters import Tree, standing_at
 from appliance.master.registry import Incarnation, Life, Registry
 from appliance.policy import Policy
 from appliance.policy.model import Category, Decision, Request
-from appliance.ros.names import resolve_parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,13 @@ class Gate:
             return Category.COMMAND, call.command or call.name
         return call.category, str(arguments[call.resource])
 
-    def decide(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | Contest:
-        """Whether `caller` may make this call with these canonical arguments."""
+    def decide(
+        self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
+    ) -> Decision | Contest:
+        """Whether `caller` may make this call with these canonical arguments, while `tree` are the parameters."""
         if caller.own:
             return Decision(True, None, "the appliance's own node")
-        decision = self._by_policy(caller, call, arguments)
+        decision = self._by_policy(caller, call, arguments, tree)
         if not decision.allowed:
             return decision
         if call.identity is Identity.NOBODY or not caller.caller_id:
@@ -79,7 +81,7 @@ class Gate:
 
     # --- the policy ---
 
-    def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision:
+    def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree) -> Decision:
         policy = self._policy()
         host, caller_id = caller.peer.host, caller.caller_id
         category, resource = self.asked(call, arguments)
@@ -89,20 +91,27 @@ class Gate:
                 decision, policy.decide(Request(host, caller_id, Category.COMMAND, call.command))
             )
         if decision.allowed and call.touches is not None and policy.has_section(Category.READ):
-            decision = _both(decision, self._parameter(policy, caller, call.touches, arguments))
+            decision = _both(decision, self._parameter(policy, caller, call, arguments, tree))
         if decision.allowed and call.identity is Identity.NODE:
             decision = _both(decision, policy.decide(Request(host, caller_id, Category.NODE, caller_id)))
         return decision
 
     def _parameter(
-        self, policy: Policy, caller: Caller, touches: Touch, arguments: tuple[object, ...]
+        self, policy: Policy, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
     ) -> Decision:
-        category = Category.READ if touches is Touch.READ else Category.WRITE
-        key = str(arguments[-1] if touches is Touch.READ else arguments[0])
-        resolved = resolve_parameter(key, caller.caller_id)
-        return policy.decide_parameter(
-            Request(caller.peer.host, caller.caller_id, category, resolved), subtree=True
+        """Everything the call touches: the key, what is below it, and what a value below a value takes the place of."""
+        category = Category.READ if call.touches is Touch.READ else Category.WRITE
+        host, caller_id = caller.peer.host, caller.caller_id
+        key = str(arguments[-1] if category is Category.READ else arguments[0])
+        there, in_the_way = standing_at(tree, key)
+        value = arguments[1] if category is Category.WRITE and len(arguments) > 1 else None
+        decision = policy.decide_parameter(
+            Request(host, caller_id, category, key),
+            namespace=isinstance(value, dict) or (isinstance(there, dict) and not call.name.startswith("un")),
         )
+        if value is not None and in_the_way is not None and decision.allowed:
+            decision = _both(decision, policy.decide(Request(host, caller_id, category, in_the_way)))
+        return decision
 
     # --- the binding of claims ---
 

@@ -145,6 +145,23 @@ def _parts(key: str) -> list[str]:
     return [part for part in key.split("/") if part]
 
 
+def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
+    """What `key` (canonical) has, None for nothing; and its parent that has a value and is no namespace, if any.
+
+    Such a parent is in the way: ROSMaster replaces it by a namespace when something below it is set.
+    """
+    node: Value = tree
+    passed = ""
+    for part in _parts(key):
+        if not isinstance(node, dict):
+            return None, passed
+        node = node.get(part)
+        if node is None:
+            return None, None
+        passed += f"/{part}"
+    return node, None
+
+
 async def get_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`getParam(caller_id, key)`."""
     return await master.rosmaster.call("getParam", caller.caller_id, str(arguments[0]))

@@ -226,7 +226,7 @@ class Pipeline:
 
     async def _gone(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Incarnation | None:
         """The incarnation that holds the name the caller wants, if its node is gone."""
-        outcome = self._master.gate.decide(caller, call, arguments)
+        outcome = self._master.gate.decide(caller, call, arguments, self._master.parameters.tree)
         if isinstance(outcome, Contest) and await self._master.liveness.is_gone(outcome.holder):
             return outcome.holder
         return None
@@ -237,7 +237,7 @@ class Pipeline:
         obstacle = self._master.recorder.obstacle
         if obstacle is not None:
             return Decision(False, None, obstacle)
-        outcome = self._master.gate.decide(caller, call, arguments)
+        outcome = self._master.gate.decide(caller, call, arguments, self._master.parameters.tree)
         return contested(outcome, outcome.holder is gone) if isinstance(outcome, Contest) else outcome
 
     async def _perform(self, call: Call, caller: Caller, arguments: tuple[object, ...]) -> Value:

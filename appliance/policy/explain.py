@@ -24,6 +24,8 @@ class Explanation:
 
     `through` are the words of the deciding rule's value that mean the host (empty for a denial). `node`
     explains the `[Nodes]` right where the call needs that too; `allowed` is the answer to the whole call.
+    `namespace` is the denial of a parameter that is allowed, should it hold other parameters: that is known when
+    the call comes.
     """
 
     request: Request
@@ -31,6 +33,7 @@ class Explanation:
     through: tuple[str, ...]
     lost: tuple[LostRule, ...]
     node: "Explanation | None" = None
+    namespace: Decision | None = None
 
     @property
     def allowed(self) -> bool:
@@ -52,7 +55,10 @@ def explain(policy: Policy, request: Request) -> Explanation:
         if rule is not winner
     )
     node = explain(policy, node_request(request)) if needs_node_rule(request) else None
-    return Explanation(request, decision, through, lost, node)
+    namespace = policy.decide_parameter(request, namespace=True) if parameter and decision.allowed else None
+    if namespace is not None and namespace.allowed:
+        namespace = None
+    return Explanation(request, decision, through, lost, node, namespace)
 
 
 def render(explanation: Explanation) -> Iterator[str]:
@@ -72,6 +78,8 @@ def _render_one(explanation: Explanation) -> Iterator[str]:
     yield f"  rule: {decision.rule or 'no rule'}"
     if explanation.through:
         yield f"  the host is in: {', '.join(explanation.through)}"
+    if explanation.namespace is not None:
+        yield f"  but denied while it is a namespace: {explanation.namespace.reason}"
     for lost in explanation.lost:
         yield f"  lost: {lost.rule}, which would {'allow' if lost.grants else 'deny'}: {lost.why}"
 

@@ -72,3 +72,16 @@ def test_text_says_decision_and_place() -> None:
         "denied: 10.0.0.9 is not among the hosts that may call getPid: only ocu (10.0.0.5)"
     )
     assert lines[1] == "  rule: [Commands] default (p.ini:11)"
+
+
+def test_what_depends_on_a_namespace_is_said() -> None:
+    """An exact key is the right to a value; that it is none to a namespace of that name is told with the answer."""
+    policy = compile_policy("[Parameters]\nread /arm = 10.0.0.5\nread /leg/** = 10.0.0.5\n", file="p.ini")
+    host = ipaddress.ip_address("10.0.0.5")
+    lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/arm"))))
+    assert lines[0].startswith("allowed")
+    assert any(
+        line.startswith("  but denied while it is a namespace: 10.0.0.5 may not read") for line in lines
+    )
+    lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/leg"))))
+    assert not any("namespace" in line for line in lines)

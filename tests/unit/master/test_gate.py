@@ -1,0 +1,117 @@
+"""What the gate decides on parameters: the key, what is below it, and what a write would take the place of."""
+
+import ipaddress
+from typing import Any
+
+import pytest
+
+from appliance.master.call import Caller
+from appliance.master.calls import MASTER_CALLS
+from appliance.master.gate import Contest, Gate, HostLimits
+from appliance.master.http import Peer
+from appliance.master.registry import Registry
+from appliance.policy import compile_policy
+from appliance.policy.model import Decision
+
+ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
+BASE = """
+[Groups]
+ocu = 10.0.0.5
+adm = 10.0.0.9
+[Nodes]
+default = *
+[Commands]
+default = *
+[Parameters]
+"""
+LIMITED = """
+read default   = *
+write default  = adm
+write /arm/**  = adm ocu
+write /arm/max = adm
+"""
+EXACT = """
+read /arm      = ocu
+read default   = adm
+write /arm     = ocu
+write default  = adm
+"""
+
+
+class NobodyIsKept:
+    """A journal that keeps nothing."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_: None
+
+
+def gate(rules: str) -> Gate:
+    """The gate under a policy with these rules for parameters, and nobody registered."""
+    policy = compile_policy(BASE + rules, file="test.ini")
+    return Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+
+
+def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -> Decision:
+    """The decision on a call, while ROSMaster has the parameters `tree`."""
+    peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
+    decision = gate(rules).decide(Caller(peer, "/me", 0), MASTER_CALLS[method], arguments, tree or {})
+    assert not isinstance(decision, Contest)
+    return decision
+
+
+@pytest.mark.parametrize("key", ["/arm/max/x", "/arm/max/x/y"])
+def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) -> None:
+    """ROSMaster makes a namespace of a value when something below it is set: that is a write of the value."""
+    tree = {"arm": {"max": 5, "speed": 1}}
+    denied = ask(LIMITED, OPERATOR, "setParam", key, 0, tree=tree)
+    assert not denied.allowed
+    assert denied.rule is not None
+    assert denied.rule.key == "write /arm/max"
+    assert "/arm/max" in denied.reason
+    assert ask(LIMITED, ADMIN, "setParam", key, 0, tree=tree).allowed
+    assert ask(LIMITED, OPERATOR, "setParam", "/arm/speed/x", 0, tree=tree).allowed
+
+
+def test_what_is_no_value_is_in_nobodys_way() -> None:
+    """Below a namespace, or where nothing is, the key itself decides."""
+    for tree in ({}, {"arm": {}}, {"arm": {"max": {"y": 1}}}):
+        assert ask(LIMITED, OPERATOR, "setParam", "/arm/max/x", 0, tree=tree).allowed
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("getParam", ("/arm",)),
+        ("hasParam", ("/arm",)),
+        ("setParam", ("/arm", 0)),
+        ("deleteParam", ("/arm",)),
+    ],
+)
+def test_an_exact_key_is_no_right_to_a_namespace(method: str, arguments: tuple[Any, ...]) -> None:
+    """While /arm is a value, `/arm = ocu` is for it; what is in a namespace /arm is decided by `default`."""
+    assert ask(EXACT, OPERATOR, method, *arguments, tree={"arm": 7}).allowed
+    assert ask(EXACT, OPERATOR, method, *arguments, tree={}).allowed
+    denied = ask(EXACT, OPERATOR, method, *arguments, tree={"arm": {"speed": 7}})
+    assert not denied.allowed
+    assert denied.rule is not None
+    assert denied.rule.key.endswith(" default")
+
+
+def test_a_dictionary_is_a_namespace_before_it_is_there() -> None:
+    """Who sets a dictionary sets all that is in it, and needs the right to all of it."""
+    assert not ask(EXACT, OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
+    assert ask(EXACT + "write /arm/** = ocu\n", OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
+    assert ask(EXACT, OPERATOR, "setParam", "/arm", [{"speed": 1}]).allowed
+
+
+def test_without_the_section_everything_is_as_it_was() -> None:
+    """A policy that has no [Parameters] decides by [Commands] alone."""
+    rules = "[Clients]\ndefault = *\n"
+    tree = {"arm": {"max": 5}}
+    text = BASE.replace("[Parameters]\n", "") + rules
+    policy = compile_policy(text, file="test.ini")
+    peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
+    here = Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+    decision = here.decide(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0), tree)
+    assert isinstance(decision, Decision)
+    assert decision.allowed
