@@ -341,7 +341,7 @@ def _open_audit(settings: Settings, signing: Signing, held_by: Callable[[list[in
 
 
 async def _restore(base: Foundation, parts: Parts) -> None:
-    """Bring back the nodes that were there before a restart, with their ports and grants."""
+    """Bring back the nodes of before a restart, with their ports and grants, as far as the policy allows."""
     registry, places = parts.master.registry, parts.places
     for name, sock in base.sockets.items():
         if name.startswith("port:"):
@@ -360,3 +360,5 @@ async def _restore(base: Foundation, parts: Parts) -> None:
             continue
         claimed |= set(incarnation.ports)
     places.close_unclaimed(claimed)
+    # The file was changed while the appliance was down, or control died while it carried out a change.
+    base.policies.changed(base.policies.current)

@@ -60,6 +60,24 @@ def test_what_was_taken_is_remembered_over_a_crash_of_control(
     listener.wait_for(event="received", publisher="/voice", since=after)
 
 
+def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that_run(
+    appliance: Appliance, ros: RosSession
+) -> None:
+    """The file is edited between a stop and a start: what it no longer allows is taken from the nodes at the start."""
+    listener = ros.listener("rospy", "/chatter")
+    ros.talker("roscpp", "/chatter", name="voice")
+    listener.wait_for(event="received")
+    appliance.stop()
+    appliance.policy_file.write_text(NO_CHATTER)
+    appliance.start()
+    wait_until(lambda: appliance.audit("--event", "revoked", resource="/chatter"))
+    said = ros.run("rostopic", "info", "/chatter").stdout
+    assert "/voice" not in said.partition("Subscribers")[0]
+    appliance.rosrv("policy", "rollback")
+    after = listener.mark()
+    listener.wait_for(event="received", publisher="/voice", since=after)
+
+
 def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
     """As `rosrv policy reload` does; a file with errors changes nothing, and the log says what is wrong."""
     assert appliance.process is not None

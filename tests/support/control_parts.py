@@ -1,0 +1,263 @@
+"""Registry, graph, revocation, liveness and reconcile loop of control, connected as control connects them.
+
+Around them stand the relays, ROSMaster, the deliveries to nodes, and the nodes themselves: they remember what they
+were told and answer as a test has them answer. Nothing is sent over a network.
+"""
+
+import asyncio
+import ipaddress
+from typing import Any, cast
+
+from appliance.master.call import Answer
+from appliance.master.client import CallFailedError, RefusedError
+from appliance.master.core import Master
+from appliance.master.delivery import NodeCall
+from appliance.master.gate import Gate, HostLimits
+from appliance.master.graph import Graph
+from appliance.master.liveness import Liveness, LivenessSettings
+from appliance.master.parameters import ParameterMirror
+from appliance.master.reconcile import Reconciler
+from appliance.master.registration import withdraw
+from appliance.master.registry import Incarnation, Kind, Registration, Registry, new_key
+from appliance.master.revocation import Revocation
+from appliance.master.rosmaster import RosMaster
+from appliance.policy import compile_policy
+from appliance.ros.uris import node_uri, parse_node_uri
+from appliance.ros.xmlrpc import Limits, Value
+from appliance.store.state import PermissionRow
+
+HOST = ipaddress.ip_address("10.0.0.5")
+POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Commands]\ndefault=*\n"
+OPEN = POLICY.format("", "")
+_INNER_PORT = 9
+_TABLES = {"Publisher": Kind.PUBLICATION, "Subscriber": Kind.SUBSCRIPTION, "Service": Kind.SERVICE}
+
+
+class Nothing:
+    """Takes every call and does nothing."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given, **_named: None
+
+
+class Records:
+    """The recorder: what happened, as (event, resource)."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, str | None]] = []
+
+    def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
+        """As `Recorder`."""
+        self.events.append((event, resource))
+        return "id"
+
+
+class Deliveries:
+    """What nodes were told: (node's name, method, parameters)."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, str, tuple[Value, ...]]] = []
+
+    def push(self, incarnation: Incarnation, call: NodeCall) -> None:
+        """As `Delivery`."""
+        self.told.append((incarnation.name, call.method, call.parameters))
+
+    def drop(self, _incarnation: Incarnation) -> None:
+        """As `Delivery`."""
+
+
+class Grants(Nothing):
+    """The relays: only the grants are kept."""
+
+    def __init__(self) -> None:
+        self.rows: list[PermissionRow] = []
+
+    def permissions(self) -> list[PermissionRow]:
+        """As `RelayControl`."""
+        return list(self.rows)
+
+    def revoke(self, row: PermissionRow) -> None:
+        """As `RelayControl`."""
+        self.rows.remove(row)
+
+
+class HiddenMaster:
+    """ROSMaster: who registered what under which URI, the parameters, and every call it got."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Value, ...]] = []
+        self.tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in _TABLES.values()}
+        self.nodes: dict[str, str] = {}
+        self.parameters: dict[str, Value] = {"run_id": "1"}
+        self.away = False
+
+    async def call(self, method: str, *params: Value) -> Answer:
+        """One call, which takes a turn of the loop."""
+        await asyncio.sleep(0)
+        if self.away:
+            raise CallFailedError("away")
+        self.calls.append((method, *params))
+        for beginning in ("register", "unregister"):
+            kind = _TABLES.get(method.removeprefix(beginning))
+            if kind is not None and method.startswith(beginning):
+                return self._change(beginning, kind, *(str(one) for one in params))
+        return self._answer(method, params)
+
+    def _answer(self, method: str, params: tuple[Value, ...]) -> Answer:
+        if method == "lookupNode" and params[1] not in self.nodes:
+            return [-1, "unknown", ""]
+        asked = str(params[-1])
+        values: dict[str, Value] = {
+            "getPid": 4711,
+            "getSystemState": [
+                [[resource, list(nodes)] for resource, nodes in table.items() if nodes]
+                for table in self.tables.values()
+            ],
+            "lookupNode": self.nodes.get(asked),
+            "getTopicTypes": [],
+            "hasParam": asked[1:] in self.parameters,
+            "getParam": dict(self.parameters),
+            "subscribeParam": self.parameters.get(asked[1:], {}),
+            "unsubscribeParam": 1,
+            "setParam": 0,
+        }
+        return [1, "", values[method]]
+
+    def _change(self, how: str, kind: Kind, name: str, resource: str, *rest: str) -> Answer:
+        table = self.tables[kind].setdefault(resource, {})
+        if how == "register":
+            table[name] = self.nodes[name] = rest[-1]
+            return [1, "", []]
+        return [1, "", int(table.pop(name, None) is not None)]
+
+    def has(self, kind: Kind, resource: str) -> list[str]:
+        """Who has registered it."""
+        return list(self.tables[kind].get(resource, {}))
+
+
+class Inner:
+    """The faces: inner URIs only."""
+
+    def __init__(self, registry: Registry) -> None:
+        self._registry = registry
+
+    def inner_uri(self, incarnation: Incarnation) -> str:
+        """As `Faces`."""
+        return node_uri("127.0.0.1", _INNER_PORT, f"/{incarnation.key}/")
+
+    def by_inner_uri(self, text: str) -> Incarnation | None:
+        """As `Faces`."""
+        return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
+
+
+class Clients:
+    """Calls to nodes: those in `silent` do not answer, those in `gone` refuse connections."""
+
+    def __init__(self) -> None:
+        self.silent: set[str] = set()
+        self.gone: set[str] = set()
+
+    def client(self, incarnation: Incarnation) -> "Clients":
+        """As `Liveness.client`."""
+        self._asked = incarnation.name
+        return self
+
+    async def call(self, _method: str, *_params: Value) -> Value:
+        """As `XmlRpcClient`."""
+        if self._asked in self.gone:
+            raise RefusedError("nobody is there")
+        if self._asked in self.silent:
+            raise CallFailedError("no answer")
+        return [1, "", 1]
+
+
+class Modes:
+    """Everything is relayed under stand-ins."""
+
+    def hides_publishers(self, _topic: str) -> bool:
+        """As `Mediation`."""
+        return True
+
+
+class ControlParts:
+    """The parts, with an open policy; `policy(text)` brings another into force, `settle()` waits for what follows."""
+
+    def __init__(self, journal: Any = None) -> None:
+        self._not_ours = asyncio.all_tasks()  # the test's own
+        self.current = compile_policy(OPEN, file="policy")
+        self.registry = Registry(journal if journal is not None else Nothing())
+        self.records, self.deliveries, self.relay = Records(), Deliveries(), Grants()
+        self.hidden, self.faces, self.clients = HiddenMaster(), Inner(self.registry), Clients()
+        self.closed: list[str] = []
+        self.graph = Graph(
+            self.registry,
+            cast(Any, self.relay),
+            cast(Any, self.deliveries),
+            cast(Any, self.records),
+            cast(Any, Modes()),
+            closed=lambda one: self.closed.append(one.key),
+        )
+        self.rosmaster = RosMaster(1, lost=lambda: None, limits=Limits(), hold=1.0)
+        self.rosmaster._calls = cast(Any, self.hidden)
+        self.reconciler = Reconciler(
+            self.rosmaster,
+            self.registry,
+            cast(Any, self.faces),
+            self.graph,
+            ParameterMirror({}, lambda: None),
+            cast(Any, self.records),
+            own_parameters=dict,
+        )
+        self.master = cast(Master, self)  # what `Revocation` and `withdraw` use of one is here
+        self.gate = Gate(lambda: self.current, self.registry, HostLimits())
+        self.recorder = self.records
+        self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
+        self.liveness = self._make_liveness()
+
+    def _make_liveness(self) -> Liveness:
+        async def withdraw_all(incarnation: Incarnation, registrations: list[Registration]) -> None:
+            for one in registrations:
+                await withdraw(self.master, incarnation, one.kind, one.resource)
+
+        liveness = Liveness(
+            self.registry,
+            self.graph,
+            LivenessSettings(silent=0.0),
+            Limits(),
+            withdraw=withdraw_all,
+            put_back=self.reconciler.put_back,
+        )
+        cast(Any, liveness).client = self.clients.client
+        return liveness
+
+    def node(self, name: str, number: int = 1) -> Incarnation:
+        """A node on the robot that has registered nothing yet; `number` tells its lives apart."""
+        uri = f"http://10.0.0.5:{4000 + number}/"
+        node = Incarnation(new_key(), name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+        self.registry.add(node)
+        return node
+
+    async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
+        """ROSMaster takes a registration, and control writes it down."""
+        await self.reconciler._register(node, Registration(kind, resource, detail, 0))
+        self.graph.registered(node, kind, resource, detail)
+
+    def policy(self, text: str) -> int:
+        """This policy comes into force; how much was taken back."""
+        self.current = compile_policy(text, file="policy")
+        return self.revocation.redecide()
+
+    async def round(self) -> None:
+        """One round of the reconcile loop."""
+        await self.reconciler._round()
+
+    async def look(self, node: Incarnation) -> None:
+        """Look at a node now, to the end of what follows from it."""
+        await self.liveness._look(node)
+        await self.settle()
+
+    async def settle(self) -> None:
+        """Wait until everything that was begun is done."""
+        while others := asyncio.all_tasks() - self._not_ours:
+            await asyncio.wait(others, timeout=5.0)
+            assert all(task.done() for task in others), "it does not end"
