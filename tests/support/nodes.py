@@ -51,6 +51,7 @@ class RosSession:
             "ROS_HOME": str(self.home),
             "ROS_LOG_DIR": str(self.home / "log"),
             "PYTHONUNBUFFERED": "1",
+            "PYTHONFAULTHANDLER": "1",  # one that does not end says where it stands
             "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
         }
 

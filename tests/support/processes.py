@@ -166,8 +166,10 @@ class Process:
                 event["text"] if set(event) == {"text"} else json.dumps(event) for event in self.events
             )
 
-    def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 10) -> int:
-        """End the process: by the signal, and when it does not listen, by SIGKILL to its own session."""
+    def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
+        """End the process: by the signal, and when it does not listen, by SIGABRT (a Python program then says where it
+        stands) and SIGKILL to its own session.
+        """
         if self.popen.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self.popen.stdin.close()  # a program that waits for its next order ends by this
@@ -177,6 +179,9 @@ class Process:
                 self.popen.wait(timeout)
             except subprocess.TimeoutExpired:
                 self.deaf = True
+                self.popen.send_signal(signal.SIGABRT)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self.popen.wait(5)
                 self.kill()
         status = int(self.popen.wait(timeout))
         for reader in self._readers:
