@@ -60,6 +60,7 @@ class Life:
             [
                 sys.executable,
                 "-P",
+                "-s",  # its home is a part of the state: no place to take code from
                 "-m",
                 "appliance.supervisor.child",
                 role,

@@ -92,7 +92,7 @@ def roles_of(
             user="rosmaster",
             part="rosmaster",
             program=lambda facts: Program(
-                (str(SYSTEM_PYTHON), str(rosmaster), "--core", "-p", str(facts.rosmaster_port)),
+                (str(SYSTEM_PYTHON), "-s", str(rosmaster), "--core", "-p", str(facts.rosmaster_port)),
                 {
                     "ROS_IP": "127.0.0.1",  # rosmaster binds loopback only because of this
                     "ROS_MASTER_URI": f"http://127.0.0.1:{facts.rosmaster_port}",

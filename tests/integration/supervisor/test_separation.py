@@ -1,6 +1,8 @@
 """What each process's user may read and write of the state directory, tried as that user."""
 
+import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,3 +64,28 @@ def test_there_is_something_to_find(appliance: Appliance) -> None:
     """The keys and tables that must not be found are there, so that not finding them says something."""
     for name in ("signer/ca.key", "signer/audit.key", "api/key.pem", "control/state.db", *LOG):
         assert (appliance.state / name).is_file(), name
+
+
+def test_nothing_in_a_part_is_run_at_the_next_start() -> None:
+    """Code that a fallen process, or a backup, put where Python looks in a user's home is not loaded by any process."""
+    need_root()
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    running = Appliance(options=("--api", "127.0.0.1:0"))
+    try:
+        running.start()
+        parts = [path for path in running.state.iterdir() if path.is_dir() and path.name != "run"]
+        assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}
+        assert running.stop() == 0
+        for part in parts:
+            packages = part / ".local" / "lib" / version / "site-packages"
+            packages.mkdir(parents=True)
+            (packages / "planted.pth").write_text(
+                f"import os; os.close(os.open({str(part / 'ran')!r}, os.O_CREAT))\n"
+            )
+            for path in (*packages.parents, packages, packages / "planted.pth"):
+                if part in path.parents:
+                    os.chown(path, part.stat().st_uid, part.stat().st_gid)
+        running.start()
+        assert [path.name for path in parts if (path / "ran").exists()] == []
+    finally:
+        running.close()

@@ -21,6 +21,13 @@ def test_rosmaster_is_told_to_hide() -> None:
     assert program.argv[-2:] == ("-p", "12311")
 
 
+def test_rosmaster_runs_nothing_of_its_home() -> None:
+    """The folder that the state keeps for it is no place from which Python takes code."""
+    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosmaster")
+    assert role.program is not None
+    assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
+
+
 def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
     """The message has the command that installs it."""
     with pytest.raises(StartError, match="apt install python3-rosmaster"):
