@@ -17,6 +17,7 @@ from appliance.config_sources import resolve
 from appliance.master.robot import own_address
 from appliance.policy import PolicyError, compile_policy
 from appliance.policy.policy import DEFAULT_PORTS
+from appliance.supervisor.errors import StartError
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.run import run_appliance
@@ -95,6 +96,7 @@ def _node_ports(file: Path) -> range:
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
+    """Say that nodes may connect. Raises `StartError`, with nothing said, when the first token can be kept nowhere."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -123,10 +125,11 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     try:
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:  # nobody reads it, the disk it goes to is full, the terminal is gone
         kept = None if said.token is None else str(_keep_token(settings.state, said.token))
-        log.warning("nobody reads standard output", first_token=kept, line=None if said.token else line)
-    with contextlib.suppress(BrokenPipeError):
+        shown = None if said.token else line
+        log.warning("standard output takes nothing", error=error.strerror, first_token=kept, line=shown)
+    with contextlib.suppress(OSError):
         typer.echo("".join(f"{one}\n" for one in more), err=True, nl=False)
 
 
@@ -141,9 +144,21 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
+    """Write the first token where only its owner reads it. Raises `StartError`; nothing is left of it then."""
     path = state / "first-token"
-    path.unlink(missing_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(token + "\n")
+    try:
+        path.unlink(missing_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        try:
+            os.write(descriptor, f"{token}\n".encode())
+        except OSError:
+            path.unlink()
+            raise
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise StartError(
+            f"the first access token cannot be written to {path}: {error.strerror}; make it possible and start again: "
+            "the next start makes another token"
+        ) from error
     return path

@@ -102,7 +102,7 @@ class Supervisor:
         enclosure: Enclosure | None = None,
         listeners: Mapping[str, socket.socket] | None = None,
     ) -> None:
-        """`admin` is handed to control; `ready` is called once, when nodes may connect.
+        """`admin` is handed to control; `ready` is called once, when nodes may connect; it may raise `StartError`.
 
         `listeners` are the sockets of the roles that listen; they stay open here over a role's death, so that
         connections wait for its next life.
@@ -193,6 +193,7 @@ class Supervisor:
                 post.life = Life(post.role.name, post.index, plan, here, self._reports)
         except OSError as error:
             here.close()
+            post.short_lives += 1
             log.error("process cannot be started", role=post.role.name, error=str(error))
             self._fill_later(post)
             return
@@ -313,8 +314,12 @@ class Supervisor:
             if post.role.after == life.role and post.is_vacant:
                 self._fill(post)
         if not self._is_ready:
+            try:
+                self._ready(said)
+            except StartError as error:
+                self.stop(str(error))
+                return
             self._is_ready = True
-            self._ready(said)
             life.send(Announced())
 
     async def _route(self, life: Life, host: str) -> None:

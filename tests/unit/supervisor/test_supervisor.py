@@ -1,33 +1,51 @@
 """Tests of `appliance.supervisor.supervisor` where a moment matters that real processes hit seldom."""
 
 import asyncio
+import errno
 import socket
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import pytest
 
+from appliance.supervisor import supervisor as module
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.life import Life
 from appliance.supervisor.roles import Facts, Role
-from appliance.supervisor.supervisor import Supervisor
+from appliance.supervisor.supervisor import ControlReady, Supervisor
 
+READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "secret")
+CONTROL = Role(name="control", user="rosrv", part="control", entry="m:f")
 ROSMASTER = Role(name="rosmaster", user="rosmaster", part="rosmaster", entry="m:f", asks=True)
 
 
 class StandIn:
     """A life that only counts how often it was heard."""
 
+    alive = True
+    role = "control"
+
     def __init__(self) -> None:
         self.heard_of = 0
+        self.told: list[str] = []
+
+    def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
+        """Noted by its kind."""
+        self.told.append(type(message).__name__)
 
     def heard(self) -> None:
         """Counted."""
         self.heard_of += 1
 
 
-def made(tmp_path: Path, role: Role) -> Supervisor:
+def made(
+    tmp_path: Path, role: Role, ready: Callable[[ControlReady], None] = lambda _said: None
+) -> Supervisor:
     """A supervisor of one process, not started."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
-    return Supervisor((role,), facts, admin=admin, ready=lambda _said: None)
+    return Supervisor((role,), facts, admin=admin, ready=ready)
 
 
 def test_a_master_that_dies_while_it_is_asked_is_asked_again(
@@ -42,19 +60,57 @@ def test_a_master_that_dies_while_it_is_asked_is_asked_again(
         asked = asyncio.Event()
 
         async def answers(_seconds: float) -> bool:
-            if post.life is first:
+            if not asked.is_set():
                 post.life = None  # it died while it was asked
                 asked.set()
             return True
 
         monkeypatch.setattr(supervisor, "_answers", answers)
-        post.life = first  # type: ignore[assignment]  a stand-in
+        post.life = cast(Life, first)
         waiting = asyncio.create_task(supervisor._until_answering(post))
         async with asyncio.timeout(20):
             await asked.wait()
-            post.life = second  # type: ignore[assignment]  a stand-in
+            post.life = cast(Life, second)
             await waiting
         return first, second
 
     first, second = asyncio.run(scene())
     assert (first.heard_of, second.heard_of) == (0, 1)
+
+
+def test_a_first_token_that_cannot_be_kept_ends_the_start_in_words(tmp_path: Path) -> None:
+    """Control is not told that it was announced, so the next start makes another; nobody waits for a ready line."""
+
+    def ready(_said: ControlReady) -> None:
+        raise StartError("the first access token cannot be written")
+
+    async def scene() -> StandIn:
+        supervisor, control = made(tmp_path, CONTROL, ready), StandIn()
+        await supervisor._control_ready(cast(Life, control), READY)
+        assert supervisor._failure == "the first access token cannot be written"
+        assert not supervisor._is_ready
+        return control
+
+    assert "Announced" not in asyncio.run(scene()).told
+
+
+def test_a_machine_without_processes_is_not_asked_in_a_tight_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that cannot even be made is tried again as one that dies at once is: slower each time."""
+
+    def none_left(*_arguments: object) -> Life:
+        raise OSError(errno.EAGAIN, "no process can be made")
+
+    async def scene() -> list[float]:
+        supervisor = made(tmp_path, CONTROL)
+        monkeypatch.setattr(module, "Life", none_left)
+        (post,), delays = supervisor._posts, []
+        for _ in range(5):
+            supervisor._fill(post)
+            assert post.due is not None
+            delays.append(round(post.due.when() - asyncio.get_running_loop().time(), 1))
+            post.due.cancel()
+        return delays
+
+    assert asyncio.run(scene()) == [0.0, 0.2, 0.5, 1.0, 1.0]

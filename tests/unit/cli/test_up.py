@@ -1,0 +1,70 @@
+"""Tests of what `rosrv up` says when nodes may connect."""
+
+import errno
+import io
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from appliance.cli.up import _announce
+from appliance.config import Settings
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.supervisor import ControlReady
+
+READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "secret")
+
+
+class Full(io.StringIO):
+    """Standard output on a full disk."""
+
+    def flush(self) -> None:
+        """Says so."""
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_the_first_token_is_in_its_file_before_the_line_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who waits for the line finds the file, readable for its owner only."""
+    _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
+    kept = tmp_path / "first-token"
+    assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
+    said = capsys.readouterr()
+    assert said.out.count("\n") == 1
+    assert str(kept) in said.err
+
+
+def test_a_first_token_that_cannot_be_written_is_an_error_in_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No line says that nodes may connect; the error names the file and what to do."""
+    with pytest.raises(StartError, match=r"gone/first-token: No such file.*next start makes another"):
+        _announce(READY, Settings(state=tmp_path / "gone", api="off"), as_json=False)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_token_that_is_half_written_is_no_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk: the error, and nothing is left that looks like a token."""
+
+    def full(_descriptor: int, _data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("appliance.cli.up.os.write", full)
+    with pytest.raises(StartError, match="No space left on device"):
+        _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_standard_output_that_takes_nothing_does_not_end_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_json: bool
+) -> None:
+    """Nodes may connect whether anybody reads it or not; the token is in its file then, also with --json."""
+    monkeypatch.setattr(sys, "stdout", Full())
+    with capture_logs() as said:
+        _announce(READY, Settings(state=tmp_path, api="off"), as_json=as_json)
+    assert (tmp_path / "first-token").read_text() == "secret\n"
+    assert said[0]["first_token"] == str(tmp_path / "first-token")
