@@ -115,6 +115,7 @@ class _Wires:
         self.reconciler: Later[Reconciler] = Later("the reconcile loop")
         self.pipeline: Later[Pipeline] = Later("the pipeline")
         self.master: Later[Master] = Later("the master")
+        self.revocation: Later[Revocation] = Later("the revocation")
 
     def node_troubled(self, incarnation: Incarnation, why: str) -> None:
         _log.info("a node could not be told", node=incarnation.name, why=why)
@@ -128,6 +129,9 @@ class _Wires:
 
     async def revive(self, incarnation: Incarnation) -> None:
         await self.liveness().revive(incarnation)
+
+    def returned(self, incarnation: Incarnation) -> None:
+        self.revocation().returned(incarnation)
 
     def rosmaster_lost(self) -> None:
         self.master().rosmaster.shut()
@@ -244,6 +248,7 @@ def _make_liveness(base: Foundation, wires: _Wires, reach: _Reach, reconciler: R
         value_limits(settings),
         withdraw=wires.withdraw,
         put_back=reconciler.put_back,
+        returned=wires.returned,
     )
 
 
@@ -293,7 +298,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
         )
         base.monitors.records.told = said.reported
     reconciler = wires.reconciler()
-    revocation = Revocation(master, put_back=reconciler.put_back)
+    revocation = wires.revocation.fill(Revocation(master, put_back=reconciler.put_back))
     base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
     base.hosts.ports.machines = lambda: Counter(
         str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own

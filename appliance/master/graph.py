@@ -13,7 +13,7 @@ from appliance.audit.record import Severity
 from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.mediation import Mediation
 from appliance.master.recorder import Recorder
-from appliance.master.registry import Incarnation, Kind, Registration, Registry
+from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.policy.model import Decision
 
@@ -87,9 +87,8 @@ class Graph:
         )
         self.unregistered(incarnation, registration.kind, registration.resource)
         self._registry.shelve(incarnation, registration)
-        if registration.kind is Kind.SUBSCRIPTION:
-            # Neither client library drops a publisher for anything but a list without it.
-            self._delivery.push(incarnation, NodeCall("publisherUpdate", (registration.resource, [])))
+        if registration.kind is Kind.SUBSCRIPTION and incarnation.life is Life.LIVE:
+            self._empty(incarnation, registration.resource)
 
     def granted_again(self, incarnation: Incarnation, registration: Registration) -> None:
         """What the policy took back is at ROSMaster again."""
@@ -139,6 +138,11 @@ class Graph:
                 self.tell(registration.resource)
             elif registration.kind is Kind.SUBSCRIPTION:
                 self._tell_one(incarnation, registration.resource, always=True)
+        for kind, topic in incarnation.shelf:
+            if (
+                kind is Kind.SUBSCRIPTION
+            ):  # taken while it was away, or before and it may not have heard of it
+                self._empty(incarnation, topic)
         self._recorder.happened(
             "node returned",
             f"{incarnation.name} answers again",
@@ -197,6 +201,10 @@ class Graph:
         uris = self._publishers_for(subscriber, topic)
         subscriber.told_lists[topic] = uris
         return list(uris)
+
+    def _empty(self, subscriber: Incarnation, topic: str) -> None:
+        """Neither client library drops a publisher for anything but a list without it."""
+        self._delivery.push(subscriber, NodeCall("publisherUpdate", (topic, [])))
 
     def _tell_one(self, subscriber: Incarnation, topic: str, *, always: bool) -> None:
         uris = self._publishers_for(subscriber, topic)

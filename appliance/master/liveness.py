@@ -36,7 +36,10 @@ class LivenessSettings:
 
 
 class Liveness:
-    """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster."""
+    """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster.
+
+    `returned(incarnation)` hears of a node that was away, once what it had counts again.
+    """
 
     def __init__(
         self,
@@ -47,6 +50,7 @@ class Liveness:
         *,
         withdraw: Callable[[Incarnation, list[Registration]], Awaitable[None]],
         put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        returned: Callable[[Incarnation], None],
     ) -> None:
         self._registry = registry
         self._graph = graph
@@ -54,6 +58,7 @@ class Liveness:
         self._limits = limits
         self._withdraw = withdraw
         self._put_back = put_back
+        self._returned = returned
         self._answered: dict[str, float] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._slots = asyncio.Semaphore(_AT_ONCE)
@@ -95,7 +100,12 @@ class Liveness:
     async def revive(self, incarnation: Incarnation) -> None:
         """A shadow registers: it is there again, and so is all it had. Raises `CallFailedError`."""
         self._answered[incarnation.key] = time.monotonic()
-        await self._put_back(incarnation, self._graph.returned(incarnation))
+        await self._put_back(incarnation, self._bring_back(incarnation))
+
+    def _bring_back(self, incarnation: Incarnation) -> list[Registration]:
+        registrations = self._graph.returned(incarnation)
+        self._returned(incarnation)
+        return registrations
 
     async def _look(self, incarnation: Incarnation) -> None:
         async with self._slots:
@@ -145,8 +155,7 @@ class Liveness:
         elif age > self._settings.shadow:
             self._forget(incarnation)
         elif answered and self._registry.holder(incarnation.name) is None:
-            registrations = self._graph.returned(incarnation)
-            await self._tell(self._put_back, incarnation, registrations)
+            await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
 
     async def _tell(
         self,

@@ -1,4 +1,4 @@
-"""After a change of the policy, everything that is live is decided again.
+"""After a change of the policy, what nodes have is decided again: those that live, and those that are away for now.
 
 What is no longer allowed is taken back, and remembered: what is allowed again (a rollback, a change that was not
 confirmed in time) is put back, because a ROS 1 node never registers twice.
@@ -16,7 +16,7 @@ from appliance.master.allocation import TOPIC
 from appliance.master.client import CallFailedError
 from appliance.master.core import Master
 from appliance.master.registration import withdraw
-from appliance.master.registry import Incarnation, Kind, Registration
+from appliance.master.registry import Incarnation, Kind, Life, Registration
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.store.state import PermissionRow
 
@@ -44,11 +44,10 @@ class Revocation:
     def redecide(self) -> int:
         """Take back what the running policy no longer allows; how much that was."""
         count = 0
-        for incarnation, registration in list(self._master.registry.in_order()):
+        for incarnation, registration in self._registrations():
             decision = self._decide(incarnation, registration)
             if not decision.allowed:
-                self._master.graph.revoked(incarnation, registration, decision)
-                self._tell(incarnation, registration)
+                self._take_back(incarnation, registration, decision)
                 count += 1
         for row in self._master.relay.permissions():
             decision = self._decide_permission(row)
@@ -62,10 +61,9 @@ class Revocation:
     def expel(self, host: Address, reason: str) -> int:
         """Take back all that a host has, whatever the policy says; how much that was."""
         decision, count = Decision(False, None, reason), 0
-        for incarnation, registration in list(self._master.registry.in_order()):
+        for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
-                self._master.graph.revoked(incarnation, registration, decision)
-                self._tell(incarnation, registration)
+                self._take_back(incarnation, registration, decision)
                 count += 1
         for row in self._master.relay.permissions():
             if row.host == str(host):
@@ -74,15 +72,35 @@ class Revocation:
                 count += 1
         return count
 
+    def returned(self, incarnation: Incarnation) -> None:
+        """A node that was away is back: it gets what was taken from it and has been granted again meanwhile."""
+        if self._master.registry.holder(incarnation.name) in (None, incarnation):
+            self._give_back(incarnation)
+
+    def _registrations(self) -> list[tuple[Incarnation, Registration]]:
+        """Every registration that counts now or will when its node is back, in the order they were made."""
+        pairs = [
+            (one, each)
+            for one in self._master.registry.all()
+            if one.life is not Life.REPLACED
+            for each in one.registrations.values()
+        ]
+        return sorted(pairs, key=lambda pair: pair[1].order)
+
+    def _take_back(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> None:
+        self._master.graph.revoked(incarnation, registration, decision)
+        if incarnation.life is Life.LIVE:  # else ROSMaster has been told
+            self._tell(incarnation, registration)
+
     def _grant_again(self) -> None:
         """Put back what an earlier policy took from running nodes and this one grants: they never register twice."""
-        registry = self._master.registry
-        for incarnation in registry.live():
-            if registry.holder(incarnation.name) not in (None, incarnation):
-                continue
-            back = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
-            if back:
-                self._in_background(self._put_back_now(incarnation, sorted(back, key=lambda one: one.order)))
+        for incarnation in self._master.registry.live():
+            self.returned(incarnation)
+
+    def _give_back(self, incarnation: Incarnation) -> None:
+        back = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
+        if back:
+            self._in_background(self._put_back_now(incarnation, sorted(back, key=lambda one: one.order)))
 
     async def _put_back_now(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
         await self._told(self._put_back(incarnation, registrations), incarnation)

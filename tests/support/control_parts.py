@@ -180,7 +180,7 @@ class Modes:
 
 
 class ControlParts:
-    """The parts, with an open policy; `policy(text)` brings another into force, `settle()` waits for what follows."""
+    """The parts, with an open policy; `reload(text)` brings another into force, `settle()` waits for what follows."""
 
     def __init__(self, journal: Any = None) -> None:
         self._not_ours = asyncio.all_tasks()  # the test's own
@@ -209,6 +209,7 @@ class ControlParts:
             own_parameters=dict,
         )
         self.master = cast(Master, self)  # what `Revocation` and `withdraw` use of one is here
+        self.policy = lambda: self.current
         self.gate = Gate(lambda: self.current, self.registry, HostLimits())
         self.recorder = self.records
         self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
@@ -226,6 +227,7 @@ class ControlParts:
             Limits(),
             withdraw=withdraw_all,
             put_back=self.reconciler.put_back,
+            returned=self.revocation.returned,
         )
         cast(Any, liveness).client = self.clients.client
         return liveness
@@ -242,7 +244,7 @@ class ControlParts:
         await self.reconciler._register(node, Registration(kind, resource, detail, 0))
         self.graph.registered(node, kind, resource, detail)
 
-    def policy(self, text: str) -> int:
+    def reload(self, text: str) -> int:
         """This policy comes into force; how much was taken back."""
         self.current = compile_policy(text, file="policy")
         return self.revocation.redecide()
