@@ -9,13 +9,15 @@ Invariants:
 1. A topic (a service) is carried by exactly one relay at any time, for all its publishers.
 2. What is carried stays where it is for as long as it can: a plan moves as few running monitors as possible, then as
    few topics and services that are carried now. Only then loads are evened out.
-3. The allocation survives the death of control, as connections in the relays do.
+3. In one plan no relay both gives up and gets monitored topics: who gets some can have their monitors before it carries
+   them, and who gives some up keeps its monitors until it carries them no longer.
+4. The allocation survives the death of control, as connections in the relays do.
 """
 
 import json
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from appliance.master.specifications import Checked
@@ -56,6 +58,8 @@ class Plan:
     resources: Mapping[Resource, int] = field(default_factory=dict)
     moves: tuple[Move, ...] = ()
     moved_files: frozenset[str] = frozenset()
+    losing: frozenset[int] = frozenset()
+    """Relays that give up monitors, or topics and services that may have had some."""
 
 
 class Allocation:
@@ -91,14 +95,48 @@ class Allocation:
 
     def plan(self, checked: Checked, carried: Collection[Resource] = ()) -> Plan:
         """The allocation for these specifications, while these topics and services are carried."""
-        before, carried = self._plan, set(carried)
+        carried = set(carried)
+        groups = groups_of(checked)
+        homes = self._homes(groups, carried)
+        plan = self._planned(groups, homes, carried)
+        if plan.losing & self._gaining(plan):
+            homes = self._one_way(groups, homes, carried)
+            plan = self._planned(groups, homes, carried)
+        return plan
+
+    def _homes(self, groups: Sequence[Group], carried: Collection[Resource]) -> list[int]:
+        """For each group the relay where it costs least."""
+        homes: list[int] = []
+        loads = [0] * self.relays
+        for group in groups:
+            costs = [(*self._cost(group, one, carried), loads[one], one) for one in range(self.relays)]
+            homes.append(min(costs)[-1])
+            loads[homes[-1]] += group.specifications
+        return homes
+
+    def _one_way(
+        self, groups: Sequence[Group], homes: Sequence[int], carried: Collection[Resource]
+    ) -> list[int]:
+        """The same, but all groups for which something moves are on one relay: nothing leaves it."""
+        moving = [
+            self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
+        ]
+
+        def cost(relay: int) -> tuple[int, int]:
+            costs = [
+                self._cost(group, relay, carried) for group, one in zip(groups, moving, strict=True) if one
+            ]
+            return sum(files for files, _ in costs), sum(resources for _, resources in costs)
+
+        target = min(range(self.relays), key=cost)
+        return [target if one else home for one, home in zip(moving, homes, strict=True)]
+
+    def _planned(self, groups: Sequence[Group], homes: Sequence[int], carried: set[Resource]) -> Plan:
+        """The plan with these groups on these relays."""
+        before = self._plan
         files: dict[str, int] = {}
         resources: dict[Resource, int] = {}
-        loads = [0] * self.relays
-        for group in groups_of(checked):
-            costs = [(*self._cost(group, one, carried), loads[one], one) for one in range(self.relays)]
-            relay = min(costs)[-1]
-            loads[relay] += group.specifications
+        for group, relay in zip(groups, homes, strict=True):
             files.update(dict.fromkeys(group.files, relay))
             resources.update(dict.fromkeys(group.resources, relay))
         for resource in carried:  # what no specification touches stays where it is
@@ -111,7 +149,12 @@ class Allocation:
             if (source := self._of(before.resources, resource)) != (target := self._of(resources, resource))
         )
         moved = frozenset(name for name, relay in files.items() if before.files.get(name, relay) != relay)
-        return Plan(files, resources, moves, moved)
+        losing = {before.files[name] for name in moved}
+        losing |= {move.source for move in moves if (move.kind, move.name) in before.resources}
+        return Plan(files, resources, moves, moved, frozenset(losing))
+
+    def _gaining(self, plan: Plan) -> set[int]:
+        return {plan.files[name] for name in plan.moved_files} | {move.target for move in plan.moves}
 
     def adopt(self, plan: Plan) -> None:
         """This is the allocation from now on."""

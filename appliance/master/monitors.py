@@ -334,6 +334,7 @@ class Monitors:
             raise
         self._keep(sources, checked, who=keeper, note=note, by=who, before=previous)
         await self._store.settled()
+        await self._stating.all_taken()
         self.published()
         added, changed, removed = sources.difference(previous)
         return Replaced(self.revision, before, added, changed, removed, list(checked.warnings), moved)

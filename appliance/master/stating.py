@@ -1,9 +1,11 @@
 """Has the relays take the specifications: each those files that are its own, all of them or none.
 
-A load is tried first: every relay is told what it is to have, before anything is carried elsewhere. When all have
-taken it, what moves is withdrawn where it was, the allocation changes, and it is placed where its monitors are now:
-no message goes past its monitors. A monitor whose file moves begins in its initial state on the other relay (its
-variables are in the memory of the one it was on); one that is declared `hold` then holds its topics.
+A load is tried first: every relay that gives nothing up is told what it is to have, before anything is carried
+elsewhere; so is one that comes meanwhile. When all have taken it, what moves is withdrawn where it was, the allocation
+changes, and it is placed where its monitors are now: no message goes past its monitors. Those that give something up
+are told then; a load is over when they have said so (`all_taken`). A monitor whose file moves begins in its initial
+state on the other relay (its variables are in the memory of the one it was on); one that is declared `hold` then holds
+its topics.
 """
 
 import asyncio
@@ -19,6 +21,8 @@ from appliance.master.recorder import Recorder
 from appliance.master.specifications import Checked, Sources, SpecificationsRefusedError
 
 _RELAY_SECONDS = 15.0
+_TRIES = 5  # while nodes that are affected register and go
+_SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,8 @@ class Stating:
         self._now = Revision()
         self._known: set[int] = set()  # relays that had specifications before
         self._fresh: set[int] = set()  # relays that have not answered since they are there
+        self._coming: tuple[Revision, Plan] | None = None  # being tried
+        self._answers: dict[int, asyncio.Future[list[str]]] = {}  # of those that gave something up
         self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}
         self._refusals: dict[int, list[str]] = {}
         self._held: dict[int, set[str]] = {}
@@ -80,6 +86,9 @@ class Stating:
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
+        if self._coming is not None and relay not in self._coming[1].losing:
+            coming, plan = self._coming
+            return self._statement(coming, relay, _of(plan), plan.moved_files, restarted=restarted)
         return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted)
 
     def relay_of(self, monitor: str) -> int:
@@ -103,42 +112,77 @@ class Stating:
         Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.carried_now())
-        await self._try(coming, plan)
-        return self._settle(coming, plan)
+        for _ in range(_TRIES):
+            await self._try(coming, plan)
+            tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
+            if plan == tried:
+                return self._settle(coming, plan)
+            for relay in plan.losing - tried.losing:
+                self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+        self._restate()
+        raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
+
+    async def all_taken(self) -> None:
+        """Wait until the relays that gave something up have what is in force, or one of them fails to (`refused`)."""
+        answers, self._answers = self._answers, {}
+        if answers:
+            await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
+        for relay, answer in answers.items():
+            if not answer.done():
+                self._refusals[relay] = [_SILENT]
+                self._waiting.pop((relay, self._now.number), None)
 
     async def _try(self, coming: Revision, plan: Plan) -> None:
         answers: dict[int, asyncio.Future[list[str]]] = {}
-        losing = {self.allocation.of_file(name) for name in plan.moved_files}
+        self._coming = (coming, plan)
         for relay in range(self.allocation.relays):
-            if relay in losing:
+            if relay in plan.losing:
                 continue  # it goes on with what it has until its topics are withdrawn
-            answer = asyncio.get_running_loop().create_future()
-            self._waiting[relay, coming.number] = answer
-            if self.relays.send(self._statement(coming, relay, _of(plan), plan.moved_files), relay):
-                answers[relay] = answer
+            statement = self._statement(coming, relay, _of(plan), plan.moved_files)
+            self._ask(relay, statement, answers)
         try:
             findings = await self._findings(list(answers.values()))
         finally:
-            for relay in range(self.allocation.relays):
+            self._coming = None
+            for relay in answers:
                 self._waiting.pop((relay, coming.number), None)
         if findings:
             self._restate()
             raise SpecificationsRefusedError(findings)
 
+    def _ask(
+        self,
+        relay: int,
+        statement: messages.SpecificationsStated,
+        answers: dict[int, asyncio.Future[list[str]]],
+    ) -> None:
+        """Tell a relay, and have its answer among these if it is there."""
+        if self.relays.send(statement, relay):
+            answers[relay] = asyncio.get_running_loop().create_future()
+            self._waiting[relay, statement.revision] = answers[relay]
+
     async def _findings(self, answers: list[asyncio.Future[list[str]]]) -> list[str]:
         try:
             said = await asyncio.wait_for(asyncio.gather(*answers), _RELAY_SECONDS)
         except TimeoutError:
-            return [f"a relay does not answer within {_RELAY_SECONDS:g} s; try again"]
+            return [f"{_SILENT}; try again"]
         return [finding for findings in said for finding in findings]
 
     def _settle(self, coming: Revision, plan: Plan) -> list[str]:
-        """Between two messages of every relay's link: nothing is awaited here."""
+        """Between two messages of every relay's link: nothing is awaited here.
+
+        Those that have it already say so again.
+        """
         self._now = coming
         self.relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
-        self._restate()  # those that lose monitors, and one that came in between and was told the revision before
-        self.relays.place(plan.moves)
+        for relay in range(self.allocation.relays):
+            statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
+            if relay in plan.losing:
+                self._ask(relay, statement, self._answers)
+            else:
+                self.relays.send(statement, relay)
+        self.relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
         self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:

@@ -105,3 +105,31 @@ def test_monitors_that_run_move_only_when_they_must_and_the_fewest() -> None:
     assert [(move.kind, move.name) for move in plan.moves] == [(TOPIC, "/b")]
     allocation.adopt(plan)
     assert allocation.plan(checked(**first), carried).moved_files == frozenset()
+
+
+def test_what_moves_moves_one_way() -> None:
+    """A relay that gets topics can try their monitors first, because it gives up none of its own."""
+    allocation = Allocation(2)
+    first = {name: spec(name, f"/{name}") for name in "abcd"}
+    allocation.adopt(allocation.plan(checked(**first)))
+    assert [allocation.of_file(f"{name}.rv") for name in "abcd"] == [0, 1, 0, 1]
+    crossed = checked(**first, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d"))
+    carried = {(TOPIC, f"/{name}") for name in "abcd"}
+    plan = allocation.plan(crossed, carried)
+    assert {move.target for move in plan.moves} == {0}
+    assert (plan.moved_files, plan.losing) == (frozenset({"b.rv", "d.rv"}), frozenset({1}))
+    assert set(plan.files.values()) == {0}
+
+
+def test_a_relay_whose_topic_gets_its_monitor_elsewhere_gives_something_up() -> None:
+    """Although no file moves: its monitors stay until it does not carry the topic any more."""
+    allocation = Allocation(2)
+    files = {"a": spec("a", "/a"), "b": spec("b", "/b")}
+    allocation.adopt(allocation.plan(checked(**files)))
+    changed = checked(a=spec("a", "/other"), b=spec("b", "/b", "/a"))
+    plan = allocation.plan(changed, {(TOPIC, "/a"), (TOPIC, "/b")})
+    assert (plan.moves, plan.moved_files, plan.losing) == (
+        (Move(TOPIC, "/a", 0, 1),),
+        frozenset[str](),
+        frozenset({0}),
+    )

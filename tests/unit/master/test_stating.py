@@ -157,13 +157,73 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
     assert world.fleet.story == [
         ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
         ("withdrawn", "/b", 1),
-        ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ()),
+        ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
         ("stated", 1, 2, [], ()),
         ("placed", "/b", 0),
     ]
     assert [reason for event, reason in world.records if event == "topics moved"] == [
         "/b is carried by another relay process; b began in the initial state there"
     ]
+
+
+async def test_what_would_cross_goes_one_way_and_is_tried_first(world: World) -> None:
+    """Two loads in one that join monitors of both relays: every topic is placed where its monitors are already."""
+    files = {name: spec(name, f"/{name}") for name in "abcd"}
+    await world.stating.take(revision(2, **files))
+    world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
+    world.fleet.story.clear()
+    await world.stating.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
+    tried = world.fleet.story[0]
+    assert tried[:2] == ("stated", 0)
+    assert {"a.rv", "b.rv", "c.rv", "d.rv", "x.rv", "y.rv"} == set(tried[3])
+    assert {one[2] for one in world.fleet.story if one[0] == "placed"} == {0}
+
+
+async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_is_placed(
+    world: World,
+) -> None:
+    """It would carry topics past the monitors that moved to it until it has compiled them."""
+    relay, world.fleet.away = 0, {0}
+    stated: list[messages.SpecificationsStated] = []
+
+    def answer(at: int, statement: messages.SpecificationsStated) -> messages.Message:
+        world.fleet.away = set()
+        stated.append(world.stating.statement(relay))
+        return messages.SpecificationsTaken(statement.revision, [], [])
+
+    world.files["c"] = spec("c", "/c")
+    world.fleet.answer = answer
+    await world.stating.take(revision(2, **world.files))
+    assert stated[0].revision == 2
+
+
+async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: World) -> None:
+    """One that does not say so within the time is told of as one that has other specifications in force."""
+    world.fleet.answer = lambda relay, statement: (
+        None if relay == 1 else messages.SpecificationsTaken(statement.revision, [], [])
+    )
+    await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    over = asyncio.ensure_future(world.stating.all_taken())
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not over.done()
+    world.stating.received(messages.SpecificationsTaken(2, [], []), 1)
+    await over
+    assert world.stating.refused == []
+
+
+async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: World) -> None:
+    """The plan was made without it: another is made, and tried, before anything is carried elsewhere."""
+    world.fleet.carried = set()
+
+    def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
+        world.fleet.carried = {(TOPIC, "/b")}
+        return messages.SpecificationsTaken(statement.revision, [], [])
+
+    world.fleet.answer = answer
+    await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    assert ("withdrawn", "/b", 1) in world.fleet.story
+    assert world.fleet.story[-1] == ("placed", "/b", 0)
 
 
 async def test_held_monitors_and_rows_of_both(world: World) -> None:
