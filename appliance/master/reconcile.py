@@ -5,7 +5,7 @@ Whatever happened (ROSMaster died, control died, a call was cut in its middle) i
 - a ROSMaster that is new is told everything again, in the original order, while calls wait at the door;
 - a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it
   carries the key of a known incarnation (it was granted, and control died before it was written down), and
-  unregistered otherwise;
+  unregistered otherwise, as when the policy has taken it and ROSMaster is not told yet;
 - after a rebuild, or when a relay is new, every subscriber gets each of its lists once.
 """
 
@@ -184,7 +184,12 @@ class Reconciler:
 
     async def _settle(self, kind: Kind, resource: str, name: str, inner: str | None) -> None:
         incarnation = self._faces.by_inner_uri(inner) if inner is not None else None
-        if incarnation is not None and incarnation.life is Life.LIVE and kind is not Kind.SERVICE:
+        if (
+            incarnation is not None
+            and incarnation.life is Life.LIVE
+            and kind is not Kind.SERVICE
+            and (kind, resource) not in incarnation.shelf
+        ):
             types = dict(
                 cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", _NAME))[2])
             )
