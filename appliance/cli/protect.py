@@ -160,10 +160,17 @@ class _Checked:
 def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
     results = [scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)]
     opened = any(result.open for result in results)
-    unknown = not all(result.answered for result in results)
+    unknown = not all(result.answered and not result.untried for result in results)
     state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
     addresses = [
-        {"address": one.address, "open": one.open, "refused": one.refused, "silent": one.silent}
+        {
+            "address": one.address,
+            "open": one.open,
+            "refused": one.refused,
+            "silent": one.silent,
+            "untried": one.untried,
+            "obstacle": one.obstacle or None,
+        }
         for one in results
     ]
     report = {
@@ -206,6 +213,11 @@ def _sentence(result: ScanResult, ports: PortRange) -> str:
         named = ", ".join(str(port) for port in result.open[:_SHOWN])
         more = f" and {len(result.open) - _SHOWN} more" if len(result.open) > _SHOWN else ""
         return f"{result.address}: OPEN: TCP {named}{more} of {ports}\n"
+    if result.untried:
+        return (
+            f"{result.address}: {result.untried} ports of {ports} could not be tried: {result.obstacle}; whether they "
+            "are closed is not known. Does this machine have a route there (ip route get)?\n"
+        )
     if not result.answered:
         return (
             f"{result.address}: no port of {ports} answered: the machine is off, or drops what it refuses; "

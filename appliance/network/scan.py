@@ -3,9 +3,11 @@
 Many connections are attempted at once, without waiting for one another; each has its own time limit, so
 the whole scan is bounded by `len(ports) / AT_ONCE * seconds`. An open connection is reset at once and
 carries nothing.
+
+A connection that fails before a packet leaves (no way to the network, a rule of this machine's own) says nothing of
+the port: it is neither open nor closed. Its outcome is what `connect` returned; the socket shows none later.
 """
 
-import contextlib
 import errno
 import os
 import resource
@@ -21,6 +23,7 @@ from appliance.network.namespaces import NetworkError
 AT_ONCE = 256  # connections, fewer where the process may not open as many files
 _OTHER_FILES = 32
 _REFUSED = (errno.ECONNREFUSED, errno.ECONNRESET)
+_UNDER_WAY = (0, errno.EINPROGRESS)
 _SILENT = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EACCES, errno.EPERM)
 
 
@@ -32,6 +35,8 @@ class ScanResult:
     open: tuple[int, ...]
     refused: int  # ports that answered with a reset
     silent: int  # ports that did not answer in time, or that the network said cannot be reached
+    untried: int = 0  # ports to which no packet could be sent from here
+    obstacle: str = ""  # why, of the last of them
 
     @property
     def answered(self) -> bool:
@@ -59,49 +64,80 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
-    """Try to connect to each port, at most `seconds` each."""
-    waiting, opened = iter(ports), []
-    refused = silent = 0
+    """Try to connect to each port, at most `seconds` each.
+
+    Raises: NetworkError for an address that this machine cannot use, or an outcome that says nothing of a port.
+    """
+    attempts, waiting = _Attempts(address, seconds), iter(ports)
     with selectors.DefaultSelector() as selector:
-        pending: dict[socket.socket, tuple[int, float]] = {}
         try:
-            while _fill(selector, pending, waiting, address, seconds):
-                for client, outcome in _outcomes(selector, pending):
-                    port, _ = pending.pop(client)
-                    selector.unregister(client)
-                    client.close()
-                    if outcome == 0:
-                        opened.append(port)
-                    elif outcome in _REFUSED:
-                        refused += 1
-                    elif outcome in _SILENT:
-                        silent += 1
-                    else:
-                        raise NetworkError(f"scanning {address} port {port}: {os.strerror(outcome)}")
+            while attempts.start(selector, waiting):
+                for client, outcome in _outcomes(selector, attempts.pending):
+                    attempts.settle(selector, client, outcome)
         finally:
-            for client in pending:
+            for client in attempts.pending:
                 client.close()
-    return ScanResult(address, tuple(sorted(opened)), refused, silent)
+    return attempts.result()
 
 
-def _fill(
-    selector: selectors.BaseSelector,
-    pending: dict[socket.socket, tuple[int, float]],
-    ports: Iterator[int],
-    address: str,
-    seconds: float,
-) -> bool:
-    """Start connections until AT_ONCE are under way; tell whether there are any."""
-    at_once = max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES))
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    while len(pending) < at_once and (port := next(ports, None)) is not None:
-        client = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+class _Attempts:
+    """The connections of one scan: those under way, and what became of the others."""
+
+    def __init__(self, address: str, seconds: float) -> None:
+        self.pending: dict[socket.socket, tuple[int, float]] = {}  # port and deadline
+        self._address, self._seconds = address, seconds
+        self._family = socket.AF_INET6 if ":" in address else socket.AF_INET
+        self._opened: list[int] = []
+        self._refused = self._silent = self._untried = 0
+        self._obstacle = ""
+
+    def start(self, selector: selectors.BaseSelector, ports: Iterator[int]) -> bool:
+        """Start connections until AT_ONCE are under way; tell whether there are any."""
+        at_once = max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES))
+        while len(self.pending) < at_once and (port := next(ports, None)) is not None:
+            client = self._socket()
+            outcome = client.connect_ex((self._address, port))
+            if outcome in _UNDER_WAY:
+                self.pending[client] = (port, time.monotonic() + self._seconds)
+                selector.register(client, selectors.EVENT_WRITE)
+                continue
+            client.close()
+            if outcome in _SILENT:
+                self._untried += 1
+                self._obstacle = os.strerror(outcome)
+            else:
+                self._count(port, outcome)
+        return bool(self.pending)
+
+    def settle(self, selector: selectors.BaseSelector, client: socket.socket, outcome: int) -> None:
+        """Take the outcome of a connection that was under way."""
+        port, _ = self.pending.pop(client)
+        selector.unregister(client)
+        client.close()
+        self._count(port, outcome)
+
+    def result(self) -> ScanResult:
+        """What was seen."""
+        opened = tuple(sorted(self._opened))
+        return ScanResult(self._address, opened, self._refused, self._silent, self._untried, self._obstacle)
+
+    def _count(self, port: int, outcome: int) -> None:
+        if outcome == 0:
+            self._opened.append(port)
+        elif outcome in _REFUSED:
+            self._refused += 1
+        elif outcome in _SILENT:
+            self._silent += 1
+        else:
+            raise NetworkError(f"scanning {self._address} port {port}: {os.strerror(outcome)}")
+
+    def _socket(self) -> socket.socket:
+        try:
+            client = socket.socket(self._family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        except OSError as error:
+            raise NetworkError(f"scanning {self._address}: {error.strerror}") from error
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        pending[client] = (port, time.monotonic() + seconds)
-        selector.register(client, selectors.EVENT_WRITE)
-        with contextlib.suppress(OSError):  # in progress, or its outcome is read from the socket
-            client.connect((address, port))
-    return bool(pending)
+        return client
 
 
 def _outcomes(
@@ -124,9 +160,9 @@ def _outcomes(
 def _is_own(address: str) -> bool:
     """A machine reaches its own addresses with themselves as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((address, 9))
-        except OSError:
-            return False  # no way there: the scan will say so
-        return str(probe.getsockname()[0]) == address
+            return str(probe.getsockname()[0]) == address
+    except OSError:
+        return False  # no way there: the scan will say so

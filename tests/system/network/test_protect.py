@@ -208,6 +208,19 @@ def test_a_machine_that_does_not_answer_is_not_called_closed(lab: Lab, robot: Ho
     assert json.loads(protect(attacker, *arguments, "--json", status=2))["state"] == "unknown"
 
 
+@pytest.mark.parametrize("address", ["192.0.2.7", "2001:db8::7"])
+def test_a_network_without_a_way_is_not_called_open(attacker: Host, address: str) -> None:
+    """From a machine that has no route there nothing is tried: neither open nor closed, and the reason is told."""
+    arguments = ("--check", address, "--ports", "40000-40010", "--json")
+    report = json.loads(protect(attacker, *arguments, status=2))
+    (seen,) = report["addresses"]
+    assert (report["state"], seen["open"], seen["untried"]) == ("unknown", [], 11)
+    assert seen["obstacle"] == "Network is unreachable"
+    words = protect(attacker, *arguments[:-1], status=2)
+    assert "11 ports" in words
+    assert "could not be tried: Network is unreachable" in words
+
+
 def test_a_check_of_itself_is_refused(robot: Host) -> None:
     """From the machine itself everything is open by design, so a check there is an error, not a finding."""
     for address in (robot.address, robot.address6, "localhost"):

@@ -1,5 +1,6 @@
 """Tests of `rosrv protect` as a verb of the command."""
 
+import json
 from typing import Any
 
 import pytest
@@ -84,3 +85,24 @@ def test_what_a_check_saw_is_told_where_an_appliance_is_named(monkeypatch: pytes
     assert isinstance(told, HostPorts)
     assert (told.name, told.state, told.open) == ("ocu", "open", [40001])
     assert "the ports of ocu are open" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("result", "status", "state", "words"),
+    [
+        (ScanResult("192.0.2.7", (), 98, 0, 2, "Operation not permitted"), 2, "unknown", "2 ports of"),
+        (ScanResult("192.0.2.7", (40001,), 0, 0, 99, "Network is unreachable"), 1, "open", "OPEN: TCP 40001"),
+        (ScanResult("192.0.2.7", (), 100, 0), 0, "closed", "closed: no port"),
+    ],
+)
+def test_ports_that_could_not_be_tried_are_not_closed(
+    monkeypatch: pytest.MonkeyPatch, result: ScanResult, status: int, state: str, words: str
+) -> None:
+    """One port that no packet was sent to, and the machine's state is unknown; one that is open, and it is open."""
+    monkeypatch.setattr("appliance.cli.protect.scan", lambda *_arguments: result)
+    check = ["protect", "--check", "192.0.2.7", "--ports", "40000-40099"]
+    done = CliRunner().invoke(app, check)
+    assert done.exit_code == status
+    assert words in done.stdout
+    said = json.loads(CliRunner().invoke(app, [*check, "--json"]).stdout)
+    assert (said["state"], said["addresses"][0]["untried"]) == (state, result.untried)

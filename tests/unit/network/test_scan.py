@@ -1,5 +1,7 @@
 """Tests of the port scan on loopback."""
 
+import errno
+import os
 import resource
 import socket
 from pathlib import Path
@@ -30,6 +32,64 @@ def test_few_files_make_a_scan_slower_and_no_error() -> None:
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert len(result.open) == 300
+
+
+class Stuck(socket.socket):
+    """A socket whose connection fails at once, before a packet leaves."""
+
+    number = errno.ENETUNREACH
+
+    def connect_ex(self, _address: object) -> int:
+        """As the kernel answers: the socket itself shows nothing of it later."""
+        return self.number
+
+    def connect(self, address: object) -> None:
+        """The same, raised."""
+        raise OSError(self.connect_ex(address), "stuck")
+
+
+@pytest.mark.parametrize("number", [errno.ENETUNREACH, errno.EPERM, errno.EACCES, errno.EHOSTUNREACH])
+def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """No way to the network, or a rule of this machine's own: it is told, with the reason."""
+    monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
+    monkeypatch.setattr(Stuck, "number", number)
+    result = scan("192.0.2.7", [1, 2, 3], seconds=10)
+    assert (result.open, result.refused, result.silent, result.untried) == ((), 0, 0, 3)
+    assert not result.answered
+    assert result.obstacle == os.strerror(number)
+
+
+@pytest.mark.parametrize("number", [errno.EADDRNOTAVAIL, errno.EINVAL])
+def test_an_address_that_cannot_be_used_is_an_error_in_words(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """The error names the address and port, and what stood in the way."""
+    monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
+    monkeypatch.setattr(Stuck, "number", number)
+    with pytest.raises(NetworkError, match=f"192.0.2.7 port 1: {os.strerror(number)}"):
+        scan("192.0.2.7", [1, 2, 3], seconds=10)
+
+
+def test_a_machine_without_a_family_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """IPv6 is off here: an error in words, for the scan and for the look at whose address it is."""
+
+    def none_of_it(*_arguments: object) -> socket.socket:
+        raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+
+    monkeypatch.setattr("appliance.network.scan.socket.socket", none_of_it)
+    with pytest.raises(NetworkError, match=r"2001:db8::7.*Address family not supported"):
+        scan("2001:db8::7", [1], seconds=10)
+    assert addresses_of("2001:db8::7") == ("2001:db8::7",)
+
+
+def test_a_link_without_a_zone_is_an_error_in_words() -> None:
+    """The kernel itself: a link-local address is no place without its interface."""
+    if not Path("/proc/sys/net/ipv6").exists():
+        pytest.skip("no IPv6 here")
+    with pytest.raises(NetworkError, match="fe80::1 port 9"):
+        scan("fe80::1", [9], seconds=10)
 
 
 def test_a_scan_of_no_ports_ends() -> None:
