@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import msgspec
@@ -61,8 +62,8 @@ class RestLog:
 
     def export(self, wanted: Filter) -> Iterator[Entry]:
         """All records that match, the oldest first."""
-        with self._client.streamed("GET", f"{_PATH}/export", params=_parameters(wanted)) as answer:
-            for line in answer.iter_lines():
+        with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
+            for line in lines:
                 if line:
                     yield _entry(json.loads(line))
 
@@ -74,9 +75,13 @@ class RestLog:
         failures, pause = 0, threading.Event()
         while on:
             try:
-                for entry in self._stream(wanted, position):
-                    position, failures = entry.sequence, 0
-                    yield [entry]
+                with self._lines(
+                    "/stream", {**_parameters(wanted), "after": position}, _SILENCE_SECONDS
+                ) as said:
+                    failures = 0
+                    for entry in self._records(said):
+                        position = entry.sequence
+                        yield [entry]
             except _EndedError:
                 raise
             except NotRunningError:
@@ -107,29 +112,46 @@ class RestLog:
         return int(found[0]["sequence"]) if found else 0
 
     def _get(self, path: str, params: dict[str, Any], seconds: float = 60.0) -> dict[str, Any]:
-        try:
+        with self._refusals():
             return self._client.call("GET", _PATH + path, params=params, seconds=seconds)
+
+    @contextmanager
+    def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
+        """The lines of an answer while it comes; what is in them may be read inside."""
+        with (
+            self._refusals(),
+            self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
+        ):
+            yield answer.iter_lines()
+
+    @contextmanager
+    def _refusals(self) -> Iterator[None]:
+        """A refusal is told as it is when the log's file is read; so is an answer that is none."""
+        try:
+            yield
         except ProblemError as problem:
             if problem.status == 404:
                 raise _NothingThereError(str(problem)) from None
             if problem.status == 422:
                 raise FilterError("; ".join(problem.lines)) from None
             raise NotRunningError(f"{self._client.url}: {problem}") from None
+        except (msgspec.ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
+            if isinstance(error, FilterError):
+                raise
+            raise NotRunningError(
+                f"{self._client.url} is not the REST of an appliance: a line that is no record"
+            ) from None
 
-    def _stream(self, wanted: Filter, after: int) -> Iterator[Entry]:
-        params = {**_parameters(wanted), "after": after}
-        with self._client.streamed(
-            "GET", f"{_PATH}/stream", params=params, seconds=_SILENCE_SECONDS
-        ) as answer:
-            event = ""
-            for line in answer.iter_lines():
-                name, _colon, value = line.partition(": ")
-                if name == "event":
-                    event = value
-                elif name == "data" and event == "record":
-                    yield _entry(json.loads(value))
-                elif name == "data" and event == "end":
-                    raise _EndedError(f"{self._client.url}: {json.loads(value)['reason']}")
+    def _records(self, lines: Iterator[str]) -> Iterator[Entry]:
+        event = ""
+        for line in lines:
+            name, _colon, value = line.partition(": ")
+            if name == "event":
+                event = value
+            elif name == "data" and event == "record":
+                yield _entry(json.loads(value))
+            elif name == "data" and event == "end":
+                raise _EndedError(f"{self._client.url}: {json.loads(value)['reason']}")
 
 
 class _NothingThereError(Exception):
@@ -151,8 +173,10 @@ def _parameters(wanted: Filter) -> dict[str, Any]:
     return params
 
 
-def _entry(fields: dict[str, Any]) -> Entry:
-    """A record from its documented JSON object."""
+def _entry(fields: Any) -> Entry:
+    """A record from its documented JSON object. Raises `ValueError`, `KeyError` and `TypeError` for anything else."""
+    if not isinstance(fields, dict):
+        raise TypeError("not an object")
     own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
     time = str(fields["time"])
     own["time"] = int(time[1:-2]) if time.startswith("@") else parse_moment(time, 0)

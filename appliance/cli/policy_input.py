@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.query import Filter
+from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import RegistrationsWanted
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
@@ -119,5 +119,5 @@ def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
             if record.host is None or record.category not in set(Category) or record.resource is None:
                 continue
             yield request_of(record.host, record.caller_id or "", record.category, record.resource)
-    except (LogUnreadableError, NotRunningError) as error:
+    except (LogUnreadableError, NotRunningError, FilterError) as error:
         raise usage_error(str(error)) from error

@@ -11,7 +11,7 @@ import typer
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
-from appliance.audit.query import Filter
+from appliance.audit.query import Filter, FilterError
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import counted, printable, say_json
 from appliance.cli.policy_input import Robot, networks_of, request_of, usage_error
@@ -75,7 +75,7 @@ def _observations(appliance: Appliance, since: str | None) -> Iterator[Observati
             )
             detail = record.detail
             yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
-    except (LogUnreadableError, NotRunningError, MomentError) as error:
+    except (LogUnreadableError, NotRunningError, MomentError, FilterError) as error:
         raise usage_error(str(error)) from error
 
 

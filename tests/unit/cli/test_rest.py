@@ -159,6 +159,20 @@ def test_each_refusal_is_told(  # noqa: PLR0917  one column each
 
 
 @pytest.mark.parametrize(
+    "verb", [("audit", "export"), ("audit", "search"), ("audit", "tail"), ("policy", "learn")]
+)
+@pytest.mark.parametrize(("status", "kind"), [(422, "bad-input"), (503, "log-unreadable"), (500, "defect")])
+def test_a_log_that_cannot_be_read_is_told(
+    server: Server, verb: tuple[str, ...], status: int, kind: str
+) -> None:
+    """Exit status 2, as where the log's file cannot be read, and what REST says of it."""
+    server.problem(status, "no good", kind)
+    found = run(*verb, "--api", server.url)
+    assert found[0] == 2
+    assert "no good" in found[1]
+
+
+@pytest.mark.parametrize(
     ("status", "body"),
     [(200, b"<html>"), (200, b"[]"), (200, b"[" * 100_000), (404, b"nginx"), (500, b""), (302, b"")],
 )
