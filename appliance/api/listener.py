@@ -5,6 +5,9 @@ Invariants:
 1. At most `connections` are open, and `connections_per_host` of one peer; one more is closed at once.
 2. A connection whose TLS handshake, or whose next request's headers, take longer than `header_seconds` is closed;
    so is one whose headers are longer than `_HEAD_BYTES` (uvicorn would keep all of them).
+3. Whoever sends anything after an answer has as long to begin, and to end the headers of, the next request: neither
+   an empty line nor the rest of a body keeps a connection open.
+4. At most `_MOST_PIPELINED` requests of a connection wait behind the one that is being answered.
 """
 
 import asyncio
@@ -23,6 +26,7 @@ from appliance.config import ApiLimits
 
 _KEEP_ALIVE_SECONDS = 30
 _HEAD_BYTES = 64 << 10
+_MOST_PIPELINED = 16
 _END_SECONDS = 1.0
 
 
@@ -59,6 +63,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._visitor: str | None = None
         self._deadline: asyncio.TimerHandle | None = None
         self._head = 0  # bytes that came since headers are expected
+        self._leftover = False  # what came after an answer has not begun a request yet
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         """Serve a new connection, unless there are too many."""
@@ -83,19 +88,27 @@ class GuardedProtocol(HttpToolsProtocol):
         """Parse what came."""
         if self._visitor is None:
             return
-        if self._deadline is not None:
+        if self._deadline is not None and not self._leftover:
             self._head += len(data)
         super().data_received(data)
+        if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
+            # uvicorn has just put its own timer off; what came may be no request at all.
+            self._leftover = True
+            self._expect_headers()
         if self._deadline is not None and self._head > _HEAD_BYTES:
             self.transport.abort()
 
     def on_message_begin(self) -> None:
         """A request begins."""
         super().on_message_begin()
+        if self._leftover:
+            self._headers_are_there()
         self._expect_headers()
 
     def on_headers_complete(self) -> None:
-        """Its headers are there."""
+        """Its headers are there. Raises ValueError for one too many, which the parser makes a 400 of."""
+        if len(self.pipeline) >= _MOST_PIPELINED:
+            raise ValueError("too many requests wait")
         self._headers_are_there()
         super().on_headers_complete()
 
@@ -108,6 +121,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self._deadline.cancel()
             self._deadline = None
             self._head = 0
+            self._leftover = False
 
 
 class Listener:

@@ -141,3 +141,60 @@ def test_many_requests_on_one_connection_are_served() -> None:
             assert await reader.readexactly(1) == b"/"
 
     run(ApiLimits(), play)
+
+
+async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A connection whose first request was answered."""
+    reader, writer = await connect()
+    writer.write(request)
+    await reader.readuntil(b"\r\n\r\n")
+    assert await reader.readexactly(1) == b"/"
+    return reader, writer
+
+
+def test_what_comes_after_an_answer_holds_no_connection() -> None:
+    """Neither an empty line nor a body in drops keeps a connection; who sends a whole request is served."""
+
+    async def play(connect: Connect) -> None:
+        empty = await answered(connect, REQUEST)
+        body = await answered(connect, REQUEST[:-2] + b"Content-Length: 1000000\r\n\r\n")
+        begun = await answered(connect, REQUEST)
+        empty[1].write(b"\r\n")
+        body[1].write(b"x" * 100_000)
+        begun[1].write(b"\r\n")
+        begun[1].write(REQUEST)
+        assert (await begun[0].readline()).startswith(b"HTTP/1.1 200")
+        assert await cut_off(empty[0])
+        assert await cut_off(body[0])
+
+    run(ApiLimits(header_seconds=1.0), play)
+
+
+def test_the_rest_of_a_body_costs_nobody_the_connection() -> None:
+    """A body that goes on after its answer is passed over, however long, and the next request is served."""
+
+    async def play(connect: Connect) -> None:
+        reader, writer = await answered(connect, REQUEST[:-2] + b"Content-Length: 300000\r\n\r\n")
+        for _ in range(3):
+            writer.write(b"x" * 100_000)
+            await writer.drain()
+        assert await served(reader, writer)
+
+    run(ApiLimits(), play)
+
+
+def test_so_many_requests_wait_on_a_connection() -> None:
+    """A few that are sent together are answered in order; thousands are refused."""
+
+    async def play(connect: Connect) -> None:
+        reader, writer = await connect()
+        writer.write(REQUEST * 10)
+        for _ in range(10):
+            await reader.readuntil(b"\r\n\r\n")
+            assert await reader.readexactly(1) == b"/"
+        writer.write(b"GET / HTTP/1.1\r\n\r\n" * 3000)
+        text = await reader.read()
+        assert b"HTTP/1.1 400" in text
+        assert text.count(b"HTTP/1.1 200") < 100
+
+    run(ApiLimits(), play)
