@@ -118,7 +118,9 @@ class Policies:
         policy = self._compile(text, str(self.file))
         if last is not None and last.text == text:
             self._enforce(policy, last)
+            self._resume_confirmation()
         else:
+            self._end_confirmation()
             self._keep(policy, who=_DISK, note="read at start")
 
     def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
@@ -312,9 +314,8 @@ class Policies:
         if self._revert is not None:
             self._revert.cancel()
             self._revert = None
-        if self.confirm_by is not None:
-            self.confirm_by = None
-            self._store.save_setting("confirm", "")
+        self.confirm_by = None
+        self._store.save_setting("confirm", "")
 
     def _resume_confirmation(self) -> None:
         kept = self._store.settings().get("confirm", "")
