@@ -6,7 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
-from appliance.cli.host_kit import KitWriter, new_file, place, usage_error, wishes_of, write_script
+from appliance.cli.host_kit import KitWriter, place, wishes_of, write_script
+from appliance.cli.host_output import new_output, usage_error
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import seconds_of
@@ -30,7 +31,8 @@ _Days = Annotated[float, typer.Option(help="Days until the certificate ends")]
 _Out = Annotated[
     Path | None,
     typer.Option(
-        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh)"
+        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
+        " standard output"
     ),
 ]
 _Open = Annotated[
@@ -70,15 +72,17 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             raise usage_error(
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
-        path, seconds = new_file(out, f"rosrv-{name}-join.sh"), _seconds(within)
-        placed = place(running, wishes, as_json=as_json)
-        order = HostToken(name, placed.wishes.kept(), seconds, days, address, new=True)
-        write_script(path, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+        seconds = _seconds(within)
+        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
+            placed = place(running, wishes, as_json=as_json)
+            order = HostToken(name, placed.wishes.kept(), seconds, days, address, new=True)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
         return
-    writer = KitWriter(name, csr=csr, out=out)
-    placed = place(running, wishes, as_json=as_json)
-    order_kit = HostAdd(name, writer.request, days, address)
-    writer.write(running.ask_or_exit(order_kit, as_json=as_json), placed, as_json=as_json)
+    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        placed = place(running, wishes, as_json=as_json)
+        order_kit = HostAdd(name, writer.request, days, address)
+        writer.write(running.ask_or_exit(order_kit, as_json=as_json), placed, as_json=as_json)
 
 
 @app.command()
@@ -104,15 +108,17 @@ def kit(  # noqa: PLR0917  as above
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
-        path, seconds = new_file(out, f"rosrv-{name}-join.sh"), _seconds(within)
-        placed = place(running, wishes, as_json=as_json)
-        order = HostToken(name, placed.wishes.kept(), seconds, days)
-        write_script(path, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+        seconds = _seconds(within)
+        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
+            placed = place(running, wishes, as_json=as_json)
+            order = HostToken(name, placed.wishes.kept(), seconds, days)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
         return
-    writer = KitWriter(name, csr=csr, out=out)
-    placed = place(running, wishes, as_json=as_json)
-    body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
-    writer.write(body, placed, as_json=as_json)
+    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        placed = place(running, wishes, as_json=as_json)
+        body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
+        writer.write(body, placed, as_json=as_json)
 
 
 @app.command("list")

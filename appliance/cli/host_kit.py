@@ -1,8 +1,6 @@
 """What `rosrv host` writes for a host: its kit, or the script by which it enrols itself."""
 
-import os
 import re
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,8 @@ import typer
 
 from appliance.api.kits import Wishes, enrolment_of, kit_of
 from appliance.channel.admin import HostEndpoint
-from appliance.cli.output import moment, say, say_json
+from appliance.cli.host_output import Output, usage_error
+from appliance.cli.output import moment, say_json
 from appliance.cli.running import Appliance
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
@@ -19,12 +18,6 @@ from appliance.ipsec.requests import make_key, signing_request
 _ENDPOINT = re.compile(r"[A-Za-z0-9][A-Za-z0-9.:-]{0,252}")
 _LONGEST_REQUEST = 16 << 10
 _SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
-
-
-def usage_error(text: str) -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"rosrv host: {text}", err=True)
-    return typer.Exit(2)
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Wishes:
@@ -60,19 +53,11 @@ def place(running: Appliance, wishes: Wishes, *, as_json: bool) -> Placed:
     return Placed(replace(wishes, endpoint=body["endpoint"]), body["reason"])
 
 
-def new_file(out: Path | None, default: str) -> Path:
-    """Where to write; nothing that is there is replaced. Ends the program with 2."""
-    path = out or Path(default.replace("/", "_"))
-    if path.exists():
-        raise usage_error(f"{path} is there already: remove it, or name another with --out")
-    return path
-
-
 class KitWriter:
     """Checks everything that can be wrong before the appliance is asked, makes the key, writes the archive."""
 
-    def __init__(self, name: str, *, csr: Path | None, out: Path | None) -> None:
-        self._path = new_file(out, f"rosrv-{name}.tar.gz")
+    def __init__(self, output: Output, *, csr: Path | None) -> None:
+        self._output = output
         self._key: str | None = None
         if csr is None:
             key = make_key()
@@ -82,13 +67,13 @@ class KitWriter:
             self.request = _read_request(csr)
 
     def write(self, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
-        """Write the archive, for its owner only."""
-        wishes = placed.wishes
+        """Write the archive."""
+        wishes, output = placed.wishes, self._output
         again = (
             f"{body['name']} is enrolled, its kit is not written:"
             f" rosrv host kit {body['name']} --appliance {wishes.endpoint} --out FILE"
         )
-        _write(self._path, archive(kit_of(body, wishes, self._key)), again)
+        output.write(archive(kit_of(body, wishes, self._key)), again)
         if body["warning"]:
             typer.echo(f"rosrv: {body['warning']}", err=True)
         if not body["rest_url"]:
@@ -98,22 +83,23 @@ class KitWriter:
             )
         if as_json:
             where = {"endpoint": wishes.endpoint, "endpoint_reason": placed.reason}
-            say_json({key: body[key] for key in _SHOWN} | where | {"kit": str(self._path)})
+            say_json({key: body[key] for key in _SHOWN} | where | {"kit": str(output.path)})
             return
-        say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
-        say(
-            f"its kit: {self._path}" + ("" if self._key else " (without the private key, which the host has)")
+        output.say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
+        kit = "standard output" if output.is_standard else str(output.path)
+        output.say(
+            f"its kit: {kit}" + ("" if self._key else " (without the private key, which the host has)")
         )
         if placed.reason:
-            say(_taken(wishes.endpoint, placed.reason))
-        say("on the host: unpack it, then sudo ./join.sh")
+            output.say(_taken(wishes.endpoint, placed.reason))
+        output.say("on the host: unpack it, then sudo ./join.sh")
 
 
 def _taken(endpoint: str, reason: str) -> str:
     return f"the appliance is at {endpoint} ({reason}); another: --appliance"
 
 
-def write_script(path: Path, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
+def write_script(output: Output, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
     """Write the script of a host that was given a one-time token, and print the token."""
     try:
         script = body.get("script") or enrolment_of(body, placed.wishes).script()
@@ -122,30 +108,20 @@ def write_script(path: Path, body: dict[str, Any], placed: Placed, *, as_json: b
         raise typer.Exit(1) from None
     endpoint = body.get("endpoint", placed.wishes.endpoint)
     reason = body.get("endpoint_reason", placed.reason)
-    _write(path, script.encode(), "the token is lost: ask for another one")
+    output.write(script.encode(), "the token is lost: ask for another one")
     if as_json:
         shown = {key: body[key] for key in ("name", "address", "token", "token_expires")}
         where = {"endpoint": endpoint, "endpoint_reason": reason}
-        say_json(shown | where | {"script": str(path)})
+        say_json(shown | where | {"script": str(output.path)})
         return
-    sys.stdout.write(body["token"] + "\n")
+    output.say(body["token"])
     if reason:
         typer.echo(f"rosrv: {_taken(endpoint, reason)}", err=True)
     typer.echo(
         f"rosrv: {body['name']} is awaited as {body['address']} until {moment(body['token_expires'])}; the token is"
-        f" good once and shown only here.\nrosrv: on the host: sudo sh {path.name}   (it asks for the token)",
+        f" good once and shown only here.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
         err=True,
     )
-
-
-def _write(path: Path, data: bytes, lost: str) -> None:
-    try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-    except OSError as error:
-        typer.echo(f"rosrv: {path}: {error.strerror}; {lost}", err=True)
-        raise typer.Exit(1) from None
 
 
 def _read_request(path: Path) -> str:

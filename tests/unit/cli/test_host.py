@@ -1,6 +1,8 @@
 """Tests of `rosrv host` as a person sees it; with a running appliance: tests/system/ipsec."""
 
+import io
 import json
+import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +179,81 @@ def test_one_who_was_awaited_is_awaited_no_longer(asked: list[AdminRequest]) -> 
     """Revoked before it came, in other words than a host that was there."""
     assert "its one-time token opens nothing" in run("revoke", "laptop").stdout
     assert asked
+
+
+KIT: dict[str, Any] = {
+    "name": "laptop", "address": "10.113.11.2", "appliance": "10.113.11.1", "master": "http://10.113.11.1:11311",
+    "certificate": "C", "authority": "A", "serial": "1f", "expires": 1795164925.0, "warning": None, "pin": "p",
+    "rest_url": "https://10.113.11.1:8443", "rest_trouble": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", ["add", "kit"])
+@pytest.mark.parametrize("token", [(), ("--token",)])
+def test_what_cannot_be_written_is_not_ordered(
+    asked: list[AdminRequest], tmp_path: Path, verb: str, token: tuple[str, ...]
+) -> None:
+    """A new kit closes a tunnel and a token is shown once: neither happens when there is no place for what it gives."""
+    for out, said in (
+        (
+            tmp_path / "nowhere" / "kit",
+            "No such file or directory; name another: --out FILE, or --out - > FILE",
+        ),
+        (Path("/proc/kit"), "name another"),
+        (tmp_path, "is there already"),
+    ):
+        done = run(verb, "laptop", "--appliance", "10.0.0.1", *token, "--out", str(out))
+        assert done.exit_code == 2
+        assert said in done.stderr
+    assert asked == []
+
+
+def test_an_order_that_is_refused_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Nor does one that was interrupted; and the place is known to be good while the appliance is asked."""
+    out, interrupted = tmp_path / "kit", [False]
+
+    def refuse(_self: AdminSocket, _request: AdminRequest) -> AdminAnswer:
+        assert out.stat().st_mode & 0o777 == 0o600
+        assert out.stat().st_size >= 64 << 10
+        if interrupted[0]:
+            raise KeyboardInterrupt
+        return AdminAnswer(False, error="no", trouble="refused")
+
+    monkeypatch.setattr(AdminSocket, "ask", refuse)
+    for interrupted[0] in (False, True):
+        for flags in ((), ("--token",), ("--csr", str(tmp_path / "missing"))):
+            done = run("kit", "laptop", "--appliance", "10.0.0.1", "--out", str(out), *flags)
+            assert done.exit_code != 0
+            assert list(tmp_path.iterdir()) == []
+
+
+def test_a_kit_on_standard_output(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """`--out -`: the archive alone is on standard output, what is said beside it; the same bytes as in a file."""
+    monkeypatch.setattr(AdminSocket, "ask", lambda *_: AdminAnswer(True, KIT))
+    monkeypatch.chdir(tmp_path)
+    done = run("add", "laptop", "--appliance", "10.0.0.1", "--out", "-")
+    assert done.exit_code == 0, done.output
+    with tarfile.open(fileobj=io.BytesIO(done.stdout_bytes)) as archive:
+        assert any(name.endswith("join.sh") for name in archive.getnames())
+    assert "its kit: standard output" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+    done = run("add", "laptop", "--appliance", "10.0.0.1")
+    assert "its kit: rosrv-laptop.tar.gz" in done.stdout
+    with tarfile.open(tmp_path / "rosrv-laptop.tar.gz") as archive:
+        assert any(name.endswith("join.sh") for name in archive.getnames())
+    assert (tmp_path / "rosrv-laptop.tar.gz").read_bytes()[-4:] != bytes(4), "it has its own size"
+
+
+def test_a_script_on_standard_output(asked: list[AdminRequest]) -> None:
+    """The token then stands among what is said; `--json` would want standard output, too."""
+    done = run("add", "laptop", "--appliance", "10.0.0.1", "--token", "--out", "-")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("#!")
+    assert "rosrv-enrol_x" not in done.stdout
+    assert "rosrv-enrol_x" in done.stderr
+    assert "sudo sh rosrv-laptop-join.sh" in done.stderr
+    asked.clear()
+    refused = run("add", "laptop", "--appliance", "10.0.0.1", "--token", "--out", "-", "--json")
+    assert refused.exit_code == 2
+    assert "both want standard output" in refused.stderr
+    assert asked == []
