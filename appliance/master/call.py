@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from appliance.master.arguments import Parameter
 from appliance.master.http import Peer
 from appliance.master.registry import Incarnation
-from appliance.policy.model import Category
+from appliance.policy.model import Category, Decision
 from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
@@ -21,6 +21,11 @@ Answer = list[Value]
 """What a call returns: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
 
 Perform = Callable[["Master", "Caller", tuple[object, ...]], Awaitable[Value]]
+
+
+def denial_text(decision: Decision, record: str) -> str:
+    """What a denied caller is told: the reason, which names the rule and where it stands, and the record's id."""
+    return f"{decision.reason} [{record}]"
 
 
 class LimitReachedError(Exception):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.batch import Wanted
-from appliance.master.call import Answer, Caller, LimitReachedError
+from appliance.master.call import Answer, Caller, LimitReachedError, denial_text
 from appliance.master.client import CallFailedError
 from appliance.master.registration import incarnation_of
 from appliance.master.registry import Kind
@@ -164,7 +164,30 @@ def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
 
 async def get_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`getParam(caller_id, key)`."""
-    return await master.rosmaster.call("getParam", caller.caller_id, str(arguments[0]))
+    key = str(arguments[0])
+    answer = await master.rosmaster.call("getParam", caller.caller_id, key)
+    hidden = _hidden(master, caller, "getParam", key, answer)
+    return answer if hidden is None else [0, hidden, 0]
+
+
+def _hidden(master: "Master", caller: Caller, method: str, key: str, answer: Answer) -> str | None:
+    """What a caller is told in the place of a namespace that he may not read; None when there is nothing to hide.
+
+    It was decided before, by what was there then; ROSMaster answers with what is there now.
+    """
+    policy = master.policy()
+    if (
+        answer[0] != 1
+        or not isinstance(answer[2], dict)
+        or caller.own
+        or not policy.has_section(Category.READ)
+    ):
+        return None
+    request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
+    decision = policy.decide_parameter(request, namespace=bool(answer[2]))
+    if decision.allowed:
+        return None
+    return denial_text(decision, master.recorder.decided(caller, method, Category.READ.value, key, decision))
 
 
 async def has_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
@@ -285,6 +308,12 @@ async def subscribe_param(master: "Master", caller: Caller, arguments: tuple[obj
     answer = await master.rosmaster.call(
         "subscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
     )
+    hidden = _hidden(master, caller, "subscribeParam", key, answer)
+    if hidden is not None:
+        await master.rosmaster.call(
+            "unsubscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
+        )
+        return [0, hidden, 0]
     if answer[0] == 1:
         master.graph.registered(incarnation, Kind.PARAMETER, key, "")
     return answer

@@ -14,7 +14,7 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.master.arguments import KEY, NODE, SEARCH_KEY, SUBGRAPH, canonicalise, check_arity
-from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError
+from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError, Touch, denial_text
 from appliance.master.claims import Claims
 from appliance.master.client import CallFailedError
 from appliance.master.gate import Contest, contested
@@ -23,6 +23,7 @@ from appliance.master.parameters import IN_ORDER, in_order
 from appliance.master.places import NoPortError
 from appliance.master.recorder import NOT_RECORDED
 from appliance.master.registry import Incarnation
+from appliance.master.write_turns import WriteTurns
 from appliance.policy.model import Category, Decision
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
 from appliance.ros.names import check_caller_id, check_tool_id
@@ -50,6 +51,7 @@ class Pipeline:
         self._limits = limits
         self._offload = offload
         self._claims = Claims()
+        self._writes = WriteTurns()
 
     def handler(
         self, calls: Mapping[str, Call], *, own: bool = False, target: Incarnation | None = None
@@ -123,24 +125,32 @@ class Pipeline:
 
     async def _answer_run(self, calls: Mapping[str, Call], caller: Caller, run: list[Value]) -> list[Value]:
         """Each part is decided and recorded by itself; those that may be carried out are carried out in order."""
-        answers: list[Value] = []
-        ready: list[tuple[int, Caller, Call, tuple[object, ...]]] = []
-        for place, part in enumerate(run):
+        parts: list[_Allowed | Answer | dict[str, Value]] = []
+        for part in run:
             call = _part_of(part)
-            outcome = self._part_refused(caller, _FORM) if call is None else self._judge(calls, caller, *call)
-            if isinstance(outcome, _Allowed):
-                ready.append((place, *outcome))
-                answers.append(None)
-            else:
-                answers.append(outcome if isinstance(outcome, dict) else [outcome])
+            parts.append(
+                self._part_refused(caller, _FORM) if call is None else self._first_look(calls, caller, *call)
+            )
+        writes = [str(one.arguments[0]) for one in parts if isinstance(one, _Allowed) and _writes(one.call)]
+        async with self._writes.alone(writes):
+            return await self._carry_out_run(
+                [self._judge(one) if isinstance(one, _Allowed) else one for one in parts]
+            )
+
+    async def _carry_out_run(self, parts: "list[_Allowed | Answer | dict[str, Value]]") -> list[Value]:
+        answers: list[Value] = [None if isinstance(one, _Allowed) else _as_part(one) for one in parts]
+        ready = [(place, one) for place, one in enumerate(parts) if isinstance(one, _Allowed)]
         obstacle = await self._obstacle()
         if obstacle is not None:
-            for place, _caller, call_row, _arguments in ready:
-                answers[place] = [[0, obstacle, call_row.denial]]
+            for place, allowed in ready:
+                answers[place] = [[0, obstacle, allowed.call.denial]]
             return answers
-        outcomes = await in_order(self._master, [(who, row.name, given) for _place, who, row, given in ready])
-        for (place, who, row, _given), done in zip(ready, outcomes, strict=True):
-            answers[place] = [self._failed(row, who, done) if isinstance(done, Exception) else done]
+        wanted = [(one.caller, one.call.name, one.arguments) for _place, one in ready]
+        outcomes = await in_order(self._master, wanted)
+        for (place, one), done in zip(ready, outcomes, strict=True):
+            answers[place] = [
+                self._failed(one.call, one.caller, done) if isinstance(done, Exception) else done
+            ]
         return answers
 
     async def _answer_part(self, calls: Mapping[str, Call], caller: Caller, part: Value) -> Value:
@@ -170,6 +180,9 @@ class Pipeline:
         if not isinstance(understood, _Allowed):
             return understood
         caller, call, arguments = understood
+        if _writes(call) and self._decide(caller, call, arguments).allowed:
+            async with self._writes.alone((str(arguments[0]),)):
+                return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
         if call.identity is not Identity.NODE or caller.target is not None:
             return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
         gone = await self._gone(caller, call, arguments)
@@ -188,13 +201,17 @@ class Pipeline:
         except PeerError as error:
             return self._malformed(call, caller, params, error)
 
-    def _judge(
+    def _first_look(
         self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
     ) -> "_Allowed | Answer":
-        """Understood, decided and recorded: what may be carried out, or the answer."""
+        """Understood, and not denied as things are; else the answer. The call is decided when it is its turn."""
         understood = self._understand(calls, caller, method, params)
-        if not isinstance(understood, _Allowed):
-            return understood
+        if isinstance(understood, _Allowed) and not self._decide(*understood).allowed:
+            return self._judge(understood)
+        return understood
+
+    def _judge(self, understood: "_Allowed") -> "_Allowed | Answer":
+        """Decided and recorded: the same when it may be carried out, or the answer."""
         decision = self._decide(*understood)
         record = self._record(*understood, decision)
         return understood if decision.allowed else [0, denial_text(decision, record), understood.call.denial]
@@ -324,9 +341,14 @@ def _runs(parts: list[Value]) -> Iterator[list[Value]]:
         yield run
 
 
-def denial_text(decision: Decision, record: str) -> str:
-    """What a denied caller is told: the reason, which names the rule and where it stands, and the record's id."""
-    return f"{decision.reason} [{record}]"
+def _writes(call: Call) -> bool:
+    """Whether the call, whose first parameter is then the key, changes a parameter."""
+    return call.touches is Touch.WRITE
+
+
+def _as_part(answer: "Answer | dict[str, Value]") -> Value:
+    """An answer, or a fault, as it stands in the answer to a multicall."""
+    return answer if isinstance(answer, dict) else [answer]
 
 
 def _canonical(

@@ -9,6 +9,7 @@ from appliance.master.call import Caller
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.gate import Contest, Gate, HostLimits
 from appliance.master.http import Peer
+from appliance.master.parameters import Tree
 from appliance.master.registry import Registry
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
@@ -74,7 +75,8 @@ def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) ->
 
 def test_what_is_no_value_is_in_nobodys_way() -> None:
     """Below a namespace, or where nothing is, the key itself decides."""
-    for tree in ({}, {"arm": {}}, {"arm": {"max": {"y": 1}}}):
+    trees: list[Tree] = [{}, {"arm": {}}, {"arm": {"max": {"y": 1}}}]
+    for tree in trees:
         assert ask(LIMITED, OPERATOR, "setParam", "/arm/max/x", 0, tree=tree).allowed
 
 
@@ -107,7 +109,7 @@ def test_a_dictionary_is_a_namespace_before_it_is_there() -> None:
 def test_without_the_section_everything_is_as_it_was() -> None:
     """A policy that has no [Parameters] decides by [Commands] alone."""
     rules = "[Clients]\ndefault = *\n"
-    tree = {"arm": {"max": 5}}
+    tree: Tree = {"arm": {"max": 5}}
     text = BASE.replace("[Parameters]\n", "") + rules
     policy = compile_policy(text, file="test.ini")
     peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
