@@ -10,6 +10,7 @@ import socket
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import structlog
 
@@ -34,7 +35,7 @@ from appliance.master.mediation import Mediation
 from appliance.master.monitors import Monitors
 from appliance.master.moving import Moving
 from appliance.master.node_calls import NODE_CALLS
-from appliance.master.parameters import ParameterMirror
+from appliance.master.parameters import ParameterMirror, may_be_told
 from appliance.master.pipeline import Pipeline
 from appliance.master.places import Places
 from appliance.master.policies import Policies
@@ -323,7 +324,12 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
                 offload=int(base.settings.limits.offload_bytes),
             )
         ),
-        inner=InnerFace(reach.registry, reach.delivery, value_limits(base.settings)),
+        inner=InnerFace(
+            reach.registry,
+            reach.delivery,
+            value_limits(base.settings),
+            may_be_told=partial(may_be_told, master),
+        ),
     )
 
 

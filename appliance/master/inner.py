@@ -2,8 +2,11 @@
 
 The path of the request is the incarnation's key, which only ROSMaster was ever told. Lists of publishers are not
 taken from here (`graph` makes them from the registry, when it changes); a list for a topic is only the sign that
-ROSMaster saw a change.
+ROSMaster saw a change. A parameter is told to who may read it: ROSMaster tells all that comes to be below a key to
+those who subscribed to it, which was decided by what was there then.
 """
+
+from collections.abc import Callable
 
 import structlog
 
@@ -18,9 +21,17 @@ _log = structlog.get_logger()
 
 
 class InnerFace:
-    """Serves ROSMaster's calls to nodes."""
+    """Serves ROSMaster's calls to nodes. `may_be_told(node, key, value)`: whether it may have this parameter."""
 
-    def __init__(self, registry: Registry, delivery: Delivery, limits: Limits) -> None:
+    def __init__(
+        self,
+        registry: Registry,
+        delivery: Delivery,
+        limits: Limits,
+        *,
+        may_be_told: Callable[[Incarnation, str, Value], bool],
+    ) -> None:
+        self._may_be_told = may_be_told
         self._registry = registry
         self._delivery = delivery
         self._limits = limits
@@ -44,7 +55,8 @@ class InnerFace:
             case "publisherUpdate", _:
                 return [1, "", 0]
             case "paramUpdate", (_, str(key), value):
-                self._delivery.push(incarnation, NodeCall("paramUpdate", (key, value), size))
+                if self._may_be_told(incarnation, key.rstrip("/") or "/", value):
+                    self._delivery.push(incarnation, NodeCall("paramUpdate", (key, value), size))
                 return [1, "", 0]
             case "shutdown", (_, str(reason)):
                 self._delivery.push(incarnation, NodeCall("shutdown", (reason,)))

@@ -3,6 +3,7 @@
 The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
 """
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, cast
 
@@ -10,8 +11,9 @@ from appliance.master.arguments import ApiUri
 from appliance.master.batch import Wanted
 from appliance.master.call import Answer, Caller, LimitReachedError, denial_text
 from appliance.master.client import CallFailedError
+from appliance.master.http import Peer
 from appliance.master.registration import incarnation_of
-from appliance.master.registry import Kind
+from appliance.master.registry import Incarnation, Kind
 from appliance.policy.model import Category, Request
 from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.ros.xmlrpc import Value
@@ -188,6 +190,23 @@ def _hidden(master: "Master", caller: Caller, method: str, key: str, answer: Ans
     if decision.allowed:
         return None
     return denial_text(decision, master.recorder.decided(caller, method, Category.READ.value, key, decision))
+
+
+def may_be_told(master: "Master", incarnation: Incarnation, key: str, value: Value) -> bool:
+    """Whether a node that subscribed to `key`, or to something above it, may read its new value; a denial is recorded.
+
+    The value of a parameter that was deleted is an empty namespace.
+    """
+    policy = master.policy()
+    if incarnation.own or not policy.has_section(Category.READ):
+        return True
+    request = Request(incarnation.host, incarnation.name, Category.READ, key)
+    decision = policy.decide_parameter(request, namespace=isinstance(value, dict) and bool(value))
+    if not decision.allowed:
+        peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
+        caller = Caller(peer, incarnation.name, time.monotonic_ns())
+        master.recorder.decided(caller, "paramUpdate", Category.READ.value, key, decision)
+    return decision.allowed
 
 
 async def has_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
