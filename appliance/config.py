@@ -99,6 +99,10 @@ def _checked_endpoint(text: str) -> str:
     return str(address)
 
 
+def _none_if_empty(value: object) -> object:
+    return None if value == "" else value  # what compose hands on of a variable that is not set
+
+
 def _checked_name(text: str) -> str:
     if _NODE_NAME.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
@@ -254,7 +258,9 @@ class Ipsec(_Section):
         description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
     )
 
-    endpoint: Annotated[str, AfterValidator(_checked_endpoint)] | None = Field(
+    endpoint: Annotated[
+        Annotated[str, AfterValidator(_checked_endpoint)] | None, BeforeValidator(_none_if_empty)
+    ] = Field(
         default=None,
         description="address or name at which hosts reach the appliance from outside, for their kits;"
         " found out unless it is given here or with --appliance",

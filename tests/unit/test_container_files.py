@@ -5,6 +5,7 @@ from pathlib import Path
 
 import yaml
 
+from appliance.config_sources import resolve
 from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import NUMERIC_IDS
@@ -46,3 +47,18 @@ def test_each_right_has_its_reason_beside_it() -> None:
     ]
     assert len(lines) == len(granted())
     assert all(re.search(r"  # \w", line) for line in lines)
+
+
+def environment(**outside: str) -> dict[str, str]:
+    """What the appliance in compose.yaml is told, with these variables in `.env`."""
+    told = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["environment"]
+    return {
+        key: re.sub(r"\$\{(\w+):-(.*?)\}", lambda found: outside.get(found[1], found[2]), value)
+        for key, value in told.items()
+    }
+
+
+def test_the_endpoint_is_one_line_in_env() -> None:
+    """`ROSRV_ENDPOINT=192.168.1.20` in `.env` is what kits say; without it the configuration is right, too."""
+    assert resolve(None, environment(), {}).ipsec.endpoint is None
+    assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
