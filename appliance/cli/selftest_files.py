@@ -18,6 +18,7 @@ from appliance.master.declared import DeclaredHostsError, read_declared
 from appliance.master.specifications import SpecificationsRefusedError, check, read_folder
 from appliance.policy import PolicyError, compile_policy, run_cases
 from appliance.policy.policy import Policy
+from appliance.supervisor.state import foreign
 
 _LITTLE_SPACE, _NO_SPACE = 1 << 30, 50 << 20
 _SOON_DAYS = 30
@@ -112,6 +113,9 @@ def _state(state: Path) -> Iterator[Found]:
     mode = state.stat().st_mode
     if not stat.S_ISDIR(mode):
         yield fail("state", f"{state} is no directory", "name another: --state DIR")
+        return
+    if os.access(state, os.R_OK) and (reason := foreign(state)) is not None:
+        yield fail("state", reason, "name another, empty or to be made: --state DIR")
         return
     if mode & 0o022:
         yield fail("state", f"{state}: others may write (mode {mode & 0o777:o})", f"chmod 711 {state}")

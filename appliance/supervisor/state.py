@@ -1,5 +1,8 @@
 """The state directory: whose part is whose, who may look, and that only one appliance uses it at a time.
 
+A directory that is there already is taken, and closed to others, only where it is empty or an appliance's:
+`--state /tmp` would close /tmp to everybody.
+
 state/            0711  root: others may pass through, not look around
 state/lock        0600  held while an appliance runs; names its process id
 state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
@@ -20,6 +23,33 @@ from appliance.supervisor.roles import Role
 from appliance.supervisor.users import account_of
 
 ADMIN_SOCKET = "admin.sock"
+_LOCK = "lock"
+_RESTORED = Path("control", "state.db")  # a backup has no lock
+_OF_THE_DISK = "lost+found"
+_SHOWN = 3
+
+
+def foreign(path: Path) -> str | None:
+    """Why the directory at `path` is not taken for an appliance's state; None: it is one, is empty, or is not there.
+
+    Raises `OSError` where that cannot be seen.
+    """
+    if not path.is_dir():
+        return None
+    found = sorted(one.name for one in path.iterdir() if one.name != _OF_THE_DISK)
+    if not found or _has_lock(path) or (path / _RESTORED).is_file():
+        return None
+    more = " …" if len(found) > _SHOWN else ""
+    return f"{path} is no state directory of an appliance: it has {', '.join(found[:_SHOWN])}{more} in it"
+
+
+def _has_lock(path: Path) -> bool:
+    """Where everybody may write, anybody may make a file of that name."""
+    try:
+        lock = (path / _LOCK).lstat()
+    except FileNotFoundError:
+        return False
+    return stat.S_ISREG(lock.st_mode) and lock.st_uid in {os.geteuid(), path.stat().st_uid}
 
 
 class StateDirectory:
@@ -29,9 +59,12 @@ class StateDirectory:
         """Make the directory where needed and take its lock. Raises `StartError`."""
         self.path = path.absolute()
         try:
+            if (reason := foreign(self.path)) is not None:
+                raise StartError(f"{reason}; name another, empty or to be made, with --state DIR")
             self.path.mkdir(mode=0o711, parents=True, exist_ok=True)
             self.path.chmod(0o711)
-            self._lock = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._lock = os.open(self.path / _LOCK, flags, 0o600)
         except OSError as error:
             raise StartError(
                 f"state directory {self.path} cannot be used: {error.strerror}; name another with --state DIR"

@@ -93,7 +93,8 @@ def test_a_port_that_is_taken_is_a_failure_that_says_by_whom(place: Place) -> No
             and place.lines.append("hosts: hosts.yaml")),
         ("state", lambda place: place.state.write_text("a file")),
         ("state", lambda place: place.state.mkdir() or place.state.chmod(0o777)),
-        ("secrets", lambda place: (place.state / "signer").mkdir(parents=True)
+        ("state", lambda place: place.state.mkdir() or (place.state / "notes.txt").write_text("somebody else's")),
+        ("secrets", lambda place: (place.state / "signer").mkdir(parents=True) or (place.state / "lock").write_text("")
             or (place.state / "signer/audit.key").write_text("") or (place.state / "signer/audit.key").chmod(0o644)),
         ("configuration", lambda place: place.lines.append("polcy: x.ini")),
         ("certificate", lambda place: certificate(place.state, days=-1)),
@@ -147,4 +148,5 @@ def certificate(state: Path, days: int) -> None:
         .sign(key, hashes.SHA256())
     )
     (state / "api").mkdir(parents=True, exist_ok=True)
+    (state / "lock").write_text("")
     (state / "api" / "certificate.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))

@@ -63,6 +63,7 @@ def test_a_part_that_is_no_folder_is_refused(tmp_path: Path, kind: str) -> None:
     elsewhere.chmod(0o755)
     part = tmp_path / "state" / "control"
     part.parent.mkdir()
+    (part.parent / "lock").write_text("")
     part.write_text("") if kind == "file" else part.symlink_to(elsewhere)
     state = StateDirectory(tmp_path / "state")
     with pytest.raises(StartError, match="control is not a folder of user id"):
@@ -92,3 +93,54 @@ def test_a_part_that_a_group_may_pass(tmp_path: Path) -> None:
         assert (found.st_uid, found.st_gid) == (account_of("rosrv").uid, account_of("rosrv-api").gid)
     else:
         assert stat.S_IMODE(found.st_mode) == 0o700
+
+
+def folder(path: Path, *files: str) -> Path:
+    """A directory of mode 0755 with these files."""
+    path.mkdir()
+    path.chmod(0o755)
+    for name in files:
+        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).write_text("")
+    return path
+
+
+def test_a_directory_of_others_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    """`--state /tmp` must not close /tmp: the message says what is in it and what to name; its mode stays."""
+    theirs = folder(tmp_path / "theirs", "notes.txt", "a", "b", "c", "d")
+    with pytest.raises(
+        StartError, match=r"theirs is no state directory.* has a, b, c ….* name another"
+    ) as said:
+        StateDirectory(theirs)
+    assert "--state DIR" in str(said.value)
+    assert stat.S_IMODE(theirs.stat().st_mode) == 0o755
+    assert not (theirs / "lock").exists()
+
+
+@pytest.mark.parametrize("files", [(), ("lost+found/x",), ("lock",), ("control/state.db",)])
+def test_a_directory_that_is_the_appliances_is_taken(tmp_path: Path, files: tuple[str, ...]) -> None:
+    """An empty one, the root of a disk, one of an earlier life, and one that a backup was restored to."""
+    state = StateDirectory(folder(tmp_path / "state", *files))
+    assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
+    state.close()
+
+
+def test_a_lock_that_leads_elsewhere_is_not_followed(tmp_path: Path) -> None:
+    """Somebody who may write there could have any file of root's cut to nothing."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("kept")
+    state = folder(tmp_path / "state")
+    (state / "lock").symlink_to(elsewhere)
+    with pytest.raises(StartError, match="is no state directory"):
+        StateDirectory(state)
+    assert elsewhere.read_text() == "kept"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of others")
+def test_a_lock_of_somebody_else_makes_no_state_directory(tmp_path: Path) -> None:
+    """In a directory where everybody may write, a file of that name says nothing."""
+    theirs = folder(tmp_path / "theirs", "lock")
+    os.chown(theirs / "lock", 61099, 61099)
+    with pytest.raises(StartError, match="is no state directory"):
+        StateDirectory(theirs)
+    assert stat.S_IMODE(theirs.stat().st_mode) == 0o755
