@@ -90,11 +90,18 @@ class Graph:
         if registration.kind is Kind.SUBSCRIPTION and incarnation.life is Life.LIVE:
             self._empty(incarnation, registration.resource)
 
-    def granted_again(self, incarnation: Incarnation, registration: Registration) -> None:
-        """What the policy took back is at ROSMaster again."""
+    def granted_again(self, incarnation: Incarnation, registration: Registration) -> bool:
+        """What the policy took back counts again, and ROSMaster is to hear of it; False when another has it now."""
+        if registration.kind is Kind.SERVICE and self._others_offer(incarnation, registration.resource):
+            self._registry.unshelve(incarnation, registration.kind, registration.resource)
+            return False
         self.registered(incarnation, registration.kind, registration.resource, registration.detail)
         if registration.kind is Kind.SUBSCRIPTION:
             self.remind(incarnation, registration.resource)
+        return True
+
+    def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
+        return any(one is not incarnation for one in self._registry.registered(Kind.SERVICE, service))
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
         """Another incarnation took the name; ROSMaster tells the old one to shut down."""

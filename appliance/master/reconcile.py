@@ -127,11 +127,18 @@ class Reconciler:
                 return await call("subscribeParam", name, inner, resource)
 
     async def put_back(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
-        """Register what a returned node had."""
+        """Register what a returned node had, as far as it still has it when ROSMaster can be told.
+
+        What was taken from it meanwhile is left out; and an earlier life of a node would have ROSMaster end the later.
+        """
         try:
             async with self._rosmaster.alone():
-                for registration in registrations:
-                    await self._register(incarnation, registration)
+                for one in registrations:
+                    if (
+                        incarnation.life is Life.LIVE
+                        and (one.kind, one.resource) in incarnation.registrations
+                    ):
+                        await self._register(incarnation, one)
         except CallFailedError:
             self.wake()
             raise

@@ -29,7 +29,10 @@ _CATEGORIES = {
 
 
 class Revocation:
-    """Decides again what the registry and the relay's grants hold. `put_back(…)` tells ROSMaster."""
+    """Decides again what the registry and the relay's grants hold.
+
+    `put_back(incarnation, registrations)` tells ROSMaster of those that the node still has when it is their turn.
+    """
 
     def __init__(
         self,
@@ -42,20 +45,37 @@ class Revocation:
         self._last: asyncio.Task[None] | None = None
 
     def redecide(self) -> int:
-        """Take back what the running policy no longer allows; how much that was."""
+        """Take back what the running policy no longer allows; how much that was. What it grants again is put back."""
+        count = self._redecide(self._registrations(), self._master.relay.permissions())
+        self._grant_again()
+        return count
+
+    def redecide_for(self, host: Address, caller_id: str) -> int:
+        """The same for what one caller has: his call was decided before the policy changed, and carried out after."""
+        return self._redecide(
+            [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
+            [
+                row
+                for row in self._master.relay.permissions()
+                if row.host == str(host) and row.caller_id in {caller_id, ""}
+            ],
+        )
+
+    def _redecide(
+        self, registrations: list[tuple[Incarnation, Registration]], grants: list[PermissionRow]
+    ) -> int:
         count = 0
-        for incarnation, registration in self._registrations():
+        for incarnation, registration in registrations:
             decision = self._decide(incarnation, registration)
             if not decision.allowed:
                 self._take_back(incarnation, registration, decision)
                 count += 1
-        for row in self._master.relay.permissions():
+        for row in grants:
             decision = self._decide_permission(row)
             if not decision.allowed:
                 self._master.relay.revoke(row)
                 self._record(row, decision)
                 count += 1
-        self._grant_again()
         return count
 
     def expel(self, host: Address, reason: str) -> int:
@@ -98,14 +118,15 @@ class Revocation:
             self.returned(incarnation)
 
     def _give_back(self, incarnation: Incarnation) -> None:
-        back = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
+        """The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn."""
+        allowed = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
+        back = [
+            one
+            for one in sorted(allowed, key=lambda one: one.order)
+            if self._master.graph.granted_again(incarnation, one)
+        ]
         if back:
-            self._in_background(self._put_back_now(incarnation, sorted(back, key=lambda one: one.order)))
-
-    async def _put_back_now(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
-        await self._told(self._put_back(incarnation, registrations), incarnation)
-        for registration in registrations:
-            self._master.graph.granted_again(incarnation, registration)
+            self._in_background(self._told(self._put_back(incarnation, back), incarnation))
 
     def _decide(self, incarnation: Incarnation, registration: Registration) -> Decision:
         if incarnation.own:
@@ -134,11 +155,12 @@ class Revocation:
         return decision
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
-        self._in_background(
-            self._told(
-                withdraw(self._master, incarnation, registration.kind, registration.resource), incarnation
-            )
-        )
+        self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))
+
+    async def _withdraw(self, incarnation: Incarnation, registration: Registration) -> None:
+        kind, resource = registration.kind, registration.resource
+        if (kind, resource) not in incarnation.registrations:  # else it has been granted again
+            await withdraw(self._master, incarnation, kind, resource)
 
     def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
         """After what is under way: ROSMaster hears of changes in the order they were made."""

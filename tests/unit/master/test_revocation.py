@@ -3,7 +3,9 @@
 import pytest
 
 from appliance.master.registry import Kind, Life
+from appliance.policy import compile_policy
 from appliance.ros.xmlrpc import Value
+from appliance.store.state import PermissionRow
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -74,3 +76,76 @@ async def test_a_revoked_host_keeps_nothing_of_nodes_that_are_away() -> None:
     await world.look(node)
     assert world.revocation.expel(node.host, "the host was revoked") == 1
     assert not node.registrations
+
+
+async def test_given_and_taken_again_at_once_is_taken() -> None:
+    """Of two quick reloads the last one counts, in the registry and at ROSMaster."""
+    world = await parts()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/secret")
+    world.reload(NO_SECRET)
+    await world.settle()
+    world.reload(OPEN)
+    world.reload(NO_SECRET)
+    await world.settle()
+    assert (node.resources(Kind.PUBLICATION), world.hidden.has(Kind.PUBLICATION, "/secret")) == ([], [])
+    world.reload(OPEN)
+    world.reload(NO_SECRET)
+    world.reload(OPEN)
+    await world.settle()
+    assert node.resources(Kind.PUBLICATION) == ["/secret"]
+    assert world.hidden.has(Kind.PUBLICATION, "/secret") == ["/n"]
+
+
+async def test_nothing_is_given_back_to_a_life_that_is_over() -> None:
+    """A node that was started anew while its earlier life's registration is put back keeps its name."""
+    world = await parts()
+    first, second = world.node("/n", 1), world.node("/n", 2)
+    await world.register(first, Kind.PUBLICATION, "/secret")
+    await world.register(first, Kind.PUBLICATION, "/plain")
+    world.reload(NO_SECRET)
+    await world.settle()
+    world.reload(OPEN)
+    await world.register(second, Kind.PUBLICATION, "/plain")
+    await world.settle()
+    assert lives(world) == [Life.REPLACED, Life.LIVE]
+    assert world.registry.holder("/n") is second
+    assert second.resources(Kind.PUBLICATION) == ["/plain"]
+    assert world.hidden.has(Kind.PUBLICATION, "/secret") == []
+    assert world.hidden.nodes["/n"] == world.faces.inner_uri(second)
+
+
+async def test_a_service_that_another_offers_meanwhile_stays_his() -> None:
+    """A provider whose offer is granted again does not take the service from the one that came after it."""
+    world = await parts()
+    first, second = world.node("/a", 1), world.node("/b", 2)
+    await world.register(first, Kind.SERVICE, "/s", "4101")
+    world.reload(OPEN + "[Services]\n")
+    world.reload(OPEN + "[Services]\ndefault=*\n/none=\n")
+    await world.settle()
+    assert first.resources(Kind.SERVICE) == ["/s"]
+    world.reload(OPEN + "[Services]\n")
+    await world.settle()
+    world.current = compile_policy(OPEN, file="policy")
+    await world.register(second, Kind.SERVICE, "/s", "4102")
+    world.reload(OPEN)
+    await world.settle()
+    assert (first.resources(Kind.SERVICE), second.resources(Kind.SERVICE)) == ([], ["/s"])
+    assert world.hidden.has(Kind.SERVICE, "/s") == ["/b"]
+    assert not first.shelf
+
+
+async def test_only_what_one_caller_has_is_decided_again() -> None:
+    """After a call that was decided under an earlier policy: his registrations and grants, nobody else's."""
+    world = await parts()
+    node, other = world.node("/n", 1), world.node("/m", 2)
+    for one in (node, other):
+        await world.register(one, Kind.PUBLICATION, "/secret")
+    mine = PermissionRow(other.key, "topic", "/secret", str(node.host), "/n")
+    called = PermissionRow(other.key, "service", "/secret", str(node.host), "")
+    theirs = PermissionRow(node.key, "topic", "/secret", str(node.host), "/m")
+    world.relay.rows = [mine, called, theirs]
+    world.current = compile_policy(NO_SECRET + "[Clients]\n", file="policy")
+    assert world.revocation.redecide_for(node.host, "/n") == 3
+    assert (node.resources(Kind.PUBLICATION), other.resources(Kind.PUBLICATION)) == ([], ["/secret"])
+    assert world.relay.rows == [theirs]
