@@ -159,8 +159,8 @@ class MonitorSet:
         outcome = Outcome(time=time_ns)
         self._turn.now = time_ns
         self.began = tuple(monitor.name for monitor in monitors)
+        self._begin(monitors, time_ns, outcome)
         for monitor in monitors:
-            self._begin(monitor, time_ns, outcome)
             monitor.held = restarted and monitor.code.hold
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
             for timer in monitor.timers:
@@ -478,15 +478,21 @@ class MonitorSet:
 
     # The set
 
-    def _begin(self, monitor: Monitor, time_ns: int, outcome: Outcome) -> None:
-        monitor.context.budget = BUDGET
-        for running in monitor.properties:
-            running.run = running.code.property.start(time_ns)
-        try:
-            self._compiled.namespace[monitor.code.start]()
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of `init` and is recorded
-            self._fault(error, monitor, monitor.node.position, outcome)
-            monitor.broken = True
+    def _begin(self, monitors: Sequence[Monitor], time_ns: int, outcome: Outcome) -> None:
+        """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
+        for monitor in monitors:
+            monitor.context.budget = BUDGET
+            for running in monitor.properties:
+                running.run = running.code.property.start(time_ns)
+        beginning = list(monitors)
+        for stage in range(3):
+            for monitor in tuple(beginning):
+                try:
+                    self._compiled.namespace[monitor.code.start[stage]]()
+                except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
+                    self._fault(error, monitor, monitor.node.position, outcome)
+                    monitor.broken = True
+                    beginning.remove(monitor)
 
     def _take_over(self, monitor: Monitor, before: Monitor, compiled: Compiled) -> None:
         for name, code in monitor.code.variables.items():

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
+from appliance.rosmop.compile.conversion import convert
+from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.loops import charge
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
@@ -13,6 +15,7 @@ from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import shown
 from appliance.rosmop.types.resolve import resolve
 
+_LITERALS = (tree.Number, tree.Text, tree.Character, tree.Unary, tree.Name)
 _TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
 
 
@@ -65,26 +68,72 @@ def _known(
         return None
 
 
-def compile_start(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> str:
-    """Write the function that gives the shared variables their first values and runs `init`."""
+def compile_start(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification
+) -> tuple[str, ...]:
+    """Write the functions by which a specification begins: constants and zeros, first values, `init`.
+
+    Each is called for all specifications before the next one, because one may read another's variables.
+    """
+    scopes = [
+        _constants(shared, names, specification),
+        _first_values(shared, names, specification),
+        _start_scope(shared, names),
+    ]
+    for init in specification.inits:
+        write(scopes[-1], init.body)
+    if len(specification.inits) > 1:
+        raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
+    functions = tuple(shared.module.fresh("i") for _ in scopes)
+    for scope, function in zip(scopes, functions, strict=True):
+        _add(scope, f"def {function}():")
+    return functions
+
+
+def _start_scope(shared: Shared, names: SpecificationNames) -> Scope:
     scope = Scope(shared, names, "init")
     scope.drop_refused = "there is no message yet"
+    return scope
+
+
+def _constants(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
+    """What C++ calls static initialisation: the constants that are written down, zero for the rest."""
+    scope = _start_scope(shared, names)
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)
+            if variable is not None:
+                scope.written.add(variable.code)
+                code = _constant(scope, declarator, variable.type) or scope.codecs.zero(variable.type)
+                scope.lines.add(f"{variable.code} = {code}")
+    return scope
+
+
+def _constant(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> str | None:
+    """Code for a literal; what is wrong with it is found when it is compiled as a first value."""
+    if declarator.is_array or not isinstance(declarator.value, _LITERALS):
+        return None
+    try:
+        value = value_of(scope, declarator.value)
+        return None if value.constant is None else convert(scope, value, kind)
+    except SpecificationError:
+        return None
+
+
+def _first_values(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
+    scope = _start_scope(shared, names)
+    scope.below = set(names.variables)
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            variable = names.variables.get(declarator.name)
+            scope.below.discard(declarator.name)
             if variable is None:
                 continue
             try:
                 _first_value(scope, declaration, declarator, variable)
             except SpecificationError as error:
                 shared.findings += error.findings
-    for init in specification.inits:
-        write(scope, init.body)
-    if len(specification.inits) > 1:
-        raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
-    function = shared.module.fresh("i")
-    _add(scope, f"def {function}():")
-    return function
+    return scope
 
 
 def _first_value(

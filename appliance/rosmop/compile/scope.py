@@ -105,6 +105,7 @@ class Scope:
         self.read_message: Callable[[], str] | None = None
         self.whole_asked: str | None = None  # `MESSAGE` was read: the code's name for what is pending
         self.drop_refused: str | None = None  # why `DROP;` may not stand here
+        self.below: set[str] = set()  # shared variables whose declarations are still to come
         self.loops: list[Loop] = []
         self.written: set[str] = set()
         self.calls: set[str] = set()
@@ -142,6 +143,8 @@ class Scope:
         for block in reversed(self._blocks):
             if name in block:
                 return block[name]
+        if name in self.below:
+            raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
         own = self.names.variables.get(name)
         return own or self.shared.foreign(self.names, name, position)
 

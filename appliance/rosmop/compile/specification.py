@@ -50,12 +50,15 @@ class PropertyCode:
 
 @dataclass(frozen=True)
 class SpecificationCode:
-    """A compiled specification. `variables` are its shared variables: name in the text to name in the code."""
+    """A compiled specification. `variables` are its shared variables: name in the text to name in the code.
+
+    `start` are the functions by which it begins: constants and zeros, first values, `init`.
+    """
 
     name: str
     file: str
     hold: bool
-    start: str
+    start: tuple[str, ...]
     context: str
     events: tuple[EventCode, ...]
     properties: tuple[PropertyCode, ...]

@@ -1,0 +1,47 @@
+"""Specifications begin in the order of C++: constants, first values, `init`."""
+
+import pytest
+
+from appliance.rosmop.engine import MonitorSet
+from tests.unit.rosmop.acting import definitions, message, refused
+
+EVENT = "event e(int x) %s std_msgs/Int32 '{data:x}' { %s }"
+READERS = [
+    ("int a; init() { a = z; }", "5"),
+    ("int a = z;", "5"),
+    ("int a = y;", "0"),  # another's `init` comes after all first values
+    ("int a; init() { a = late; }", "6"),
+    ("int a = f(); int b = 3; int f() { return b + 1; }", "4"),
+    ("int a = f(); std::vector<int> b{3}; int f() { return b.size(); }", "0"),
+]
+
+
+@pytest.mark.parametrize(("before", "value"), READERS)
+def test_a_beginning_may_read_what_stands_elsewhere(before: str, value: str) -> None:
+    """Before any first value all variables are constants or zero; before any `init` all have their first values."""
+    other = "q() { int z = 5; int late = z + 1; int y; init() { y = 6; } " + EVENT % ("/u", "") + "}"
+    reader = "s() {" + before + EVENT % ("/t", 'ROS_INFO("%d", a);') + "}"
+    monitors = MonitorSet.load({"a.rv": reader, "b.rv": other}, definitions())
+    assert not monitors.start(0).faults
+    outcome = monitors.process("/t", message("std_msgs/Int32"), 1)
+    assert [line.text for line in outcome.log] == [value]
+
+
+@pytest.mark.parametrize("before", ["int a = b; int b = 3;", "int a = 2 * b, b = 3;"])
+def test_a_first_value_cannot_read_a_variable_that_is_declared_below(before: str) -> None:
+    """C++ does not know the name yet; zero in its place would be a surprise."""
+    found = refused("s() {" + before + EVENT % ("/t", "") + "}")
+    assert [finding.text for finding in found] == ["`b` is declared below; move its declaration up"]
+
+
+def test_what_faults_in_its_first_values_does_not_run_its_init() -> None:
+    """It has no state that `init` could go on from; the others begin all the same."""
+    text = (
+        'a() { int n; int m = 1 / n; init() { ROS_INFO("a"); } ' + EVENT % ("/t", "") + "} "
+        'b() { init() { ROS_INFO("b"); } ' + EVENT % ("/u", "") + "}"
+    )
+    monitors = MonitorSet.load({"x.rv": text}, definitions())
+    outcome = monitors.start(0)
+    assert [fault.text for fault in outcome.faults] == ["division by zero"]
+    assert [line.text for line in outcome.log] == ["b"]
+    assert [monitor.broken for monitor in monitors.monitors] == [True, False]
