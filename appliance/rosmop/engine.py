@@ -29,6 +29,7 @@ from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
 from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.reach import reached, redefined
 from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
@@ -184,22 +185,23 @@ class MonitorSet:
     def succeed(self, before: "MonitorSet", time_ns: int) -> Outcome:
         """Take the place of another set, as `replaced` says; `began` names those that begin with this one."""
         known = {monitor.name: monitor for monitor in before.monitors}
-        if not before._same_types(self.definitions):
-            known = {}
+        others = redefined(before.definitions, self.definitions)
         fresh = []
         for monitor in self.monitors:
             earlier = known.get(monitor.name)
-            if earlier is not None and earlier.node == monitor.node:
+            if (
+                earlier is not None
+                and earlier.node == monitor.node
+                and (not others or others.isdisjoint(reached(monitor.node, self.definitions)))
+            ):
                 self._take_over(monitor, earlier, before._compiled)
             else:
                 fresh.append(monitor)
         self._index()
-        return self._start(fresh, time_ns, None, restarted=False)
-
-    def _same_types(self, definitions: Definitions) -> bool:
-        mine = self.definitions
-        both = set(mine.message_types) & set(definitions.message_types)
-        return mine is definitions or all(mine.message(name) == definitions.message(name) for name in both)
+        outcome = self._start(fresh, time_ns, None, restarted=False)
+        for monitor in fresh:  # only an operator lets the topics go on
+            monitor.held = monitor.code.hold and monitor.name in known and known[monitor.name].held
+        return outcome
 
     def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
         """Let the events of a monitor happen, or not; raises KeyError.

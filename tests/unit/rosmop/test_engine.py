@@ -709,3 +709,37 @@ def test_a_changed_message_type_begins_anew() -> None:
         {"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 y\nint32 x\n"}), 2
     )
     assert printed(other.process("/t", b"\1\0\0\0" * 2, 3)) == ["1"]
+
+
+def test_only_what_uses_a_changed_message_type_begins_anew() -> None:
+    """However deep it is in it, and however it is named; an unrelated definition ends no state."""
+    texts = {
+        "deep": "nested() { int n; event e() /a own/Outer '{}' { n++; ROS_INFO(\"%d\", n); } }",
+        "kept": "kept() { int n; event e() /b own/Other '{}' { n++; ROS_INFO(\"%d\", n); } }",
+        "value": "value() { own::T v; int n; event e() /c own/Other '{}' { n++; ROS_INFO(\"%d\", n); } }",
+    }
+    files = {"own/T.msg": "int32 x\n", "own/Outer.msg": "own/T[] all\n", "own/Other.msg": "int32 x\n"}
+    monitors = MonitorSet.load(texts, Definitions.from_files(files))
+    monitors.start(0)
+    for topic in ("/a", "/b", "/c"):
+        monitors.process(topic, b"\0\0\0\0", 1)
+    files["own/T.msg"] = "int32 y\nint32 x\n"
+    other, _ = monitors.replaced(texts, Definitions.from_files(files), 2)
+    assert other.began == ("nested", "value")
+    counts = [printed(other.process(topic, b"\0\0\0\0", 3)) for topic in ("/a", "/b", "/c")]
+    assert counts == [["1"], ["2"], ["1"]]
+
+
+def test_only_an_operator_lets_the_topics_of_a_held_monitor_go_on() -> None:
+    """Neither an edit of it, nor of another, nor another definition of a message does; it may be declared otherwise."""
+    text = "hold a() {" + on("/t", "e", 'ROS_INFO("first");') + "} hold b() {" + on("/u") + "}"
+    monitors = load(text)
+    monitors.start(0, restarted=True)
+    monitors.resume("b")
+    edited, _ = monitors.replaced({"x.rv": text.replace("first", "second")}, definitions(), 1)
+    assert (edited.monitor("a").held, edited.monitor("b").held) == (True, False)
+    assert edited.process("/t", number(0), 1).result == "dropped"
+    freed, _ = edited.replaced(
+        {"x.rv": text.replace("first", "second").replace("hold a", "a")}, definitions(), 2
+    )
+    assert freed.process("/t", number(0), 3).result == "passed"
