@@ -187,7 +187,8 @@ def write_continue(scope: Scope, position: Position) -> None:
         scope.lines.add("break")
         return
     if loop.step is not None:
-        loop.step()
+        with scope.around(loop):
+            loop.step()
     scope.lines.add("continue")
 
 
@@ -196,7 +197,7 @@ def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
         raise SpecificationError.at(
             node.position, f"more than {MAX_NESTED} loops inside each other; use helper functions"
         )
-    scope.loops.append(loop)
+    scope.enter(loop)
 
 
 def _leave_unless(scope: Scope, node: tree.Expression) -> None:

@@ -45,10 +45,14 @@ class SpecificationNames:
 
 @dataclass(eq=False)
 class Loop:
-    """A loop or switch around the current statement: the lines a `continue` needs before it."""
+    """A loop or switch around the current statement: the lines a `continue` needs before it.
+
+    `blocks` are the names that the step sees: those around the loop, not those around the `continue`.
+    """
 
     is_switch: bool
     step: Callable[[], None] | None = None
+    blocks: list[dict[str, Variable]] = field(default_factory=list)
     continued: str | None = None  # of a switch: the flag that tells the loop around it to continue
 
 
@@ -120,6 +124,18 @@ class Scope:
         self._blocks.append({})
         yield
         self._blocks.pop()
+
+    def enter(self, loop: Loop) -> None:
+        """A loop or switch begins here."""
+        loop.blocks = self._blocks.copy()
+        self.loops.append(loop)
+
+    @contextmanager
+    def around(self, loop: Loop) -> Iterator[None]:
+        """Names are those that the loop sees."""
+        inner, self._blocks = self._blocks, loop.blocks
+        yield
+        self._blocks = inner
 
     def declare(self, variable: Variable) -> None:
         """A name of the innermost block."""
