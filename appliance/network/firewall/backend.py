@@ -33,6 +33,10 @@ class Backend(Protocol):
     def name(self) -> str:
         """`nft` or `iptables`."""
 
+    @property
+    def families(self) -> tuple[Family, ...]:
+        """The families that the rules are put in force for: those that the kernel has."""
+
     def install(self, rules: tuple[Rule, ...]) -> None:
         """Replace the appliance's rules by these, whatever was left there before; foreign rules stay as
         they are.

@@ -13,7 +13,7 @@ from appliance.network.firewall.backend import Backend, FirewallError, RuleCount
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.proof import prove
-from appliance.network.firewall.rules import FirewallSettings, Rule, appliance_rules
+from appliance.network.firewall.rules import Family, FirewallSettings, Rule, appliance_rules
 from appliance.network.namespaces import Namespace, require_network_admin
 
 BackendChoice = Literal["auto", "nft", "iptables"]
@@ -90,10 +90,14 @@ class Firewall:
 
     def report(self) -> FirewallReport:
         """Say which rules are in force, with their counters."""
-        counters = self._backend.counters() if self._backend is not None else ()
+        backend = self._backend
+        if backend is None:
+            return FirewallReport(
+                backend=None, rules=statuses(self._rules, ()), not_used=tuple(self._not_used)
+            )
         return FirewallReport(
-            backend=self._backend.name if self._backend is not None else None,
-            rules=statuses(self._rules, counters),
+            backend=backend.name,
+            rules=statuses(self._rules, backend.counters(), backend.families),
             not_used=tuple(self._not_used),
         )
 
@@ -136,10 +140,13 @@ class Firewall:
                 self._not_used.append(reason)
 
 
-def statuses(rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...]) -> tuple[RuleStatus, ...]:
+def statuses(
+    rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
+) -> tuple[RuleStatus, ...]:
     """Join the rules with what the kernel says of them; the counts of both families are added up.
 
-    A rule is in force when the kernel has it at least once for each family it is for (or once for both).
+    A rule is in force when the kernel has it at least once for each family it is for (or once for both), of those
+    that the kernel has at all (`families`).
     """
     present: Counter[tuple[str, str]] = Counter()
     packets: Counter[tuple[str, str]] = Counter()
@@ -156,7 +163,7 @@ def statuses(rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...]) -> tupl
             rule=rule.describe(),
             packets=packets[(rule.chain.value, rule.purpose)],
             octets=octets[(rule.chain.value, rule.purpose)],
-            in_force=present[(rule.chain.value, rule.purpose)] >= len(rule.families()),
+            in_force=present[(rule.chain.value, rule.purpose)] >= len({*rule.families()} & {*families}),
         )
         for rule in rules
     )

@@ -51,6 +51,11 @@ class IptablesBackend:
     def __init__(self, namespace: Namespace) -> None:
         self._namespace = namespace
 
+    @property
+    def families(self) -> tuple[Family, ...]:
+        """Without IPv6 where the kernel was started without it."""
+        return self._namespace.run(_families)
+
     def install(self, rules: tuple[Rule, ...]) -> None:
         """Replace the appliance's chains, one family after the other."""
         translating = [rule.purpose for rule in rules if rule.chain in NAT_CHAINS]

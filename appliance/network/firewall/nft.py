@@ -10,7 +10,16 @@ import subprocess
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
-from appliance.network.firewall.rules import HOOKS, NAT_CHAINS, Chain, Interface, PortRange, Rule, Verdict
+from appliance.network.firewall.rules import (
+    HOOKS,
+    NAT_CHAINS,
+    Chain,
+    Family,
+    Interface,
+    PortRange,
+    Rule,
+    Verdict,
+)
 from appliance.network.namespaces import Namespace
 
 TABLE = "rosrv"
@@ -27,6 +36,7 @@ class NftBackend:
     """The rules of one namespace in nftables."""
 
     name = "nft"
+    families: tuple[Family, ...] = (4, 6)  # a table of `inet` has both, whatever the kernel was started with
 
     def __init__(self, namespace: Namespace) -> None:
         self._namespace = namespace

@@ -291,6 +291,20 @@ def flood(host: Host, targets: list[tuple[str, int]]) -> int:
         return len(clients)
 
 
+def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
+    protected: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every rule is in the one family that there is: the report is intact, until one is taken away."""
+    monkeypatch.setattr("appliance.network.firewall.iptables._families", lambda: (4,))
+    protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # nobody can listen on it either
+    firewall = Firewall(protected.namespace, "iptables")
+    firewall.install(settings(11312, tunnel_only=("10.77.0.9", "fd77::9")))
+    assert firewall.report().intact
+    run_in(protected, "iptables-legacy -D OUTPUT 1")
+    assert not firewall.report().intact
+    firewall.remove()
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_report_counts_and_misses_what_was_taken_away(protected: Host, backend: BackendChoice) -> None:
     """The report names the rules with their packets, and is no longer intact once someone flushes them."""

@@ -136,6 +136,16 @@ def test_a_rule_is_in_force_only_with_all_its_families() -> None:
     assert not statuses((rule,), (RuleCounter("ROSRV-OUT", None, "p", 0, 0),))[0].in_force
 
 
+def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
+    """Where there is no IPv6, a rule for both is in force with IPv4's, and one for IPv6 alone has nothing to refuse."""
+    both = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP)
+    six = Rule(chain=Chain.IN, purpose="six", verdict=Verdict.DROP, source="fd00::/8")
+    four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
+    assert [one.in_force for one in statuses((both, six), (four,), families=(4,))] == [True, True]
+    assert [one.in_force for one in statuses((both, six), (), families=(4,))] == [False, True]
+    assert [one.in_force for one in statuses((both, six), (four,))] == [False, False]
+
+
 def test_a_rule_describes_itself() -> None:
     """The description has the matches and the verdict in words of netfilter."""
     _, owner, _ = inner_port("ROSMaster port", 11312, "control", 61011)
