@@ -369,6 +369,11 @@ class Settings(_Section):
     api_networks: list[IPvAnyNetwork] = Field(
         default=[], description="who may connect to REST besides this machine (the firewall's rule)"
     )
+    api_published: bool = Field(
+        default=True,
+        description="off: other machines cannot reach the port although it listens (a container that publishes it on"
+        " loopback), so that hosts cannot enrol themselves",
+    )
     api_names: list[str] = Field(
         default=[],
         description="names and addresses for the certificate; other names are refused, addresses are not",

@@ -28,13 +28,23 @@ def rest_place(settings: Settings) -> RestPlace:
         return RestPlace(None, "isolation: none has no tunnels", None)
     everywhere = settings.isolation == "netns" or host in ("0.0.0.0", "::")  # noqa: S104  compared only
     inner = port if everywhere else None
+    trouble = _trouble_outside(settings, host, port, everywhere=everywhere)
+    return RestPlace(None if trouble else port, trouble, inner)
+
+
+def _trouble_outside(settings: Settings, host: str, port: int, *, everywhere: bool) -> str:
+    """Why other machines cannot reach it, and what to do; empty where they can."""
     if not everywhere and is_loopback(host):
-        trouble = f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
-        return RestPlace(None, trouble, inner)
+        return f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
+    if not settings.api_published:
+        return (
+            "other machines cannot reach REST (api_published: off). For hosts to enrol themselves publish port"
+            f" {port} of the container on an address of this machine, name their network in ROSRV_API_NETWORKS, and set"
+            " ROSRV_API_PUBLISHED (docs/enrol-a-laptop.md); a kit, without --token, needs none of it"
+        )
     if not settings.api_networks:
-        trouble = (
+        return (
             "only this machine may connect to REST: set `api_networks` to the network from which hosts enrol"
             " themselves, such as [192.168.1.0/24]"
         )
-        return RestPlace(None, trouble, inner)
-    return RestPlace(port, "", inner)
+    return ""

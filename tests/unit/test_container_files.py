@@ -6,6 +6,7 @@ from pathlib import Path
 import yaml
 
 from appliance.config_sources import resolve
+from appliance.master.rest_place import rest_place
 from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import NUMERIC_IDS
@@ -62,3 +63,19 @@ def test_the_endpoint_is_one_line_in_env() -> None:
     """`ROSRV_ENDPOINT=192.168.1.20` in `.env` is what kits say; without it the configuration is right, too."""
     assert resolve(None, environment(), {}).ipsec.endpoint is None
     assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
+
+
+def test_no_script_is_written_that_cannot_reach_rest() -> None:
+    """While REST is published on loopback a host cannot enrol itself by a token: that is said, and what to do."""
+    published = [
+        port
+        for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]
+        if port.endswith(":8443")
+    ]
+    assert published == ["127.0.0.1:8443:8443"]
+    listens = {"ROSRV_API": "0.0.0.0:8443", "ROSRV_ISOLATION": "container"}  # as in the Dockerfile
+    place = rest_place(resolve(None, listens | environment(), {}))
+    assert place.port is None
+    assert "ROSRV_API_PUBLISHED" in place.trouble
+    override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
+    assert rest_place(resolve(None, listens | environment() | override, {})).port == 8443

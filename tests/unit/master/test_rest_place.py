@@ -19,6 +19,10 @@ NET = ["192.168.1.0/24"]
         ({"api": "127.0.0.1:8443", "isolation": "container", "api_networks": NET}, "api: 0.0.0.0:8443"),
         ({"api": "0.0.0.0:8443", "isolation": "container"}, "api_networks"),
         ({"api": "127.0.0.1:8443", "isolation": "netns"}, "api_networks"),
+        (
+            {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False},
+            "publish port 8443 of the container on an address of this machine",
+        ),
     ],
 )
 def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], trouble: str) -> None:
@@ -45,3 +49,9 @@ def test_who_can_be_reached(settings: dict[str, Any], port: int, inner: int | No
 def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
     """The defaults are enough for hosts in tunnels; only enrolling themselves needs a network to be named."""
     assert rest_place(Settings(isolation="netns")).inner_port == 8443
+
+
+def test_a_port_that_is_not_published_is_there_for_tunnels() -> None:
+    """They end in the container, past what its engine publishes."""
+    settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
+    assert rest_place(Settings.model_validate(settings)).inner_port == 8443
