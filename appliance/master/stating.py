@@ -9,6 +9,8 @@ its topics.
 """
 
 import asyncio
+import itertools
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -57,7 +59,10 @@ class Stating:
         self._fresh: set[int] = set()  # relays that have not answered since they are there
         self._coming: tuple[Revision, Plan] | None = None  # being tried
         self._answers: dict[int, asyncio.Future[list[str]]] = {}  # of those that gave something up
-        self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}
+        self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}  # by relay and statement
+        self._numbers = itertools.count(
+            time.monotonic_ns()
+        )  # relays may outlive control: no number comes again
         self._refusals: dict[int, list[str]] = {}
         self._held: dict[int, set[str]] = {}
         self._rows: dict[int, list[messages.MonitorRow]] = {}
@@ -130,7 +135,7 @@ class Stating:
         for relay, answer in answers.items():
             if not answer.done():
                 self._refusals[relay] = [_SILENT]
-                self._waiting.pop((relay, self._now.number), None)
+                self._stop_waiting(relay)
 
     async def _try(self, coming: Revision, plan: Plan) -> None:
         answers: dict[int, asyncio.Future[list[str]]] = {}
@@ -145,7 +150,7 @@ class Stating:
         finally:
             self._coming = None
             for relay in answers:
-                self._waiting.pop((relay, coming.number), None)
+                self._stop_waiting(relay)
         if findings:
             self._restate()
             raise SpecificationsRefusedError(findings)
@@ -159,7 +164,7 @@ class Stating:
         """Tell a relay, and have its answer among these if it is there."""
         if self.relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
-            self._waiting[relay, statement.revision] = answers[relay]
+            self._waiting[relay, statement.statement] = answers[relay]
 
     async def _findings(self, answers: list[asyncio.Future[list[str]]]) -> list[str]:
         try:
@@ -234,6 +239,7 @@ class Stating:
             restarted,
             self._on_fault,
             tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
+            next(self._numbers),
         )
 
     # --- what the relays say ---
@@ -241,20 +247,20 @@ class Stating:
     def received(self, message: messages.Message, relay: int) -> None:
         """A message of a relay about its monitors."""
         match message:
-            case messages.SpecificationsTaken(number, began, held):
-                self._taken(relay, number, began, held)
-            case messages.SpecificationsRefused(number, findings):
-                self._refused(relay, number, findings)
+            case messages.SpecificationsTaken(_, began, held, statement):
+                self._taken(relay, statement, began, held)
+            case messages.SpecificationsRefused(number, findings, statement):
+                self._refused(relay, number, findings, statement)
             case messages.MonitorsCounted(rows):
                 self._rows[relay] = rows
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
         """A relay is gone: what it has not answered is refused, since it may have died of it."""
-        for at, number in [one for one in self._waiting if one[0] == relay]:
-            self._answer(at, number, ["a relay process ended while it took them: try again"])
+        for at, statement in [one for one in self._waiting if one[0] == relay]:
+            self._answer(at, statement, ["a relay process ended while it took them: try again"])
 
-    def _taken(self, relay: int, number: int, began: list[str], held: list[str]) -> None:
+    def _taken(self, relay: int, statement: int, began: list[str], held: list[str]) -> None:
         self._refusals.pop(relay, None)
         self._held[relay] = set(held)
         if relay in self._fresh and began:
@@ -269,9 +275,9 @@ class Stating:
                 held=held,
             )
         self._fresh.discard(relay)
-        self._answer(relay, number, [])
+        self._answer(relay, statement, [])
 
-    def _refused(self, relay: int, number: int, findings: list[str]) -> None:
+    def _refused(self, relay: int, number: int, findings: list[str], statement: int) -> None:
         if number == self._now.number:
             self._refusals[relay] = findings
         self._recorder.happened(
@@ -280,10 +286,14 @@ class Stating:
             severity=Severity.ALARM,
             findings=findings,
         )
-        self._answer(relay, number, findings or ["the relay gives no reason"])
+        self._answer(relay, statement, findings or ["the relay gives no reason"])
 
-    def _answer(self, relay: int, number: int, findings: list[str]) -> None:
-        waiting = self._waiting.pop((relay, number), None)
+    def _stop_waiting(self, relay: int) -> None:
+        for one in [one for one in self._waiting if one[0] == relay]:
+            del self._waiting[one]
+
+    def _answer(self, relay: int, statement: int, findings: list[str]) -> None:
+        waiting = self._waiting.pop((relay, statement), None)
         if waiting is not None and not waiting.done():
             waiting.set_result(findings)
 

@@ -111,7 +111,7 @@ class Middle:
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
         self.schedule()
         self.changed()
-        self._reporter.send(SpecificationsTaken(message.revision, began, held))
+        self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.look_again()
@@ -119,7 +119,7 @@ class Middle:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
         self.changed()
-        self._reporter.send(SpecificationsRefused(message.revision, findings[:100]))
+        self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
         """Let the events of a monitor happen, or not; an unknown name is fine (it is gone)."""

@@ -176,8 +176,9 @@ class MonitorSet:
     ) -> tuple["MonitorSet", Outcome]:
         """The set that takes this one's place, started.
 
-        Specifications with the same text keep their state, `init` included; but if a message type that is in
-        both sets of definitions has changed, all begin anew. Raises `SpecificationError`, and nothing changed.
+        Specifications with the same text keep their state, `init` included, unless a message type that they use has
+        another definition now. One that begins anew goes on holding its topics if it did and is still declared
+        `hold`. Raises `SpecificationError`, and nothing changed.
         """
         following = MonitorSet.load(sources, definitions, self._on_fault)
         return following, following.succeed(self, time_ns)

@@ -208,7 +208,8 @@ class SpecificationsStated(Message):
     `files` are pairs of name and text, in order; `definitions` are `.msg` and `.srv` files by name, besides ROS's own.
     `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
     takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
-    they come from another relay, and begin here.
+    they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
+    answer has, too: the same revision may be stated again.
     """
 
     revision: int
@@ -218,6 +219,7 @@ class SpecificationsStated(Message):
     restarted: bool
     on_fault: Literal["drop", "pass"] = "drop"
     moved: tuple[str, ...] = ()
+    statement: int = 0
 
 
 class MonitorSwitched(Message):
@@ -239,6 +241,7 @@ class SpecificationsTaken(Message):
     revision: int
     began: list[str]
     held: list[str]
+    statement: int = 0
 
 
 class SpecificationsRefused(Message):
@@ -246,6 +249,7 @@ class SpecificationsRefused(Message):
 
     revision: int
     findings: list[str]
+    statement: int = 0
 
 
 class OwnHeaderStated(Message):

@@ -59,9 +59,13 @@ class Taking(NoRelays):
         """It answers in the next turn of the loop."""
         self.desk.sent.append(message)
         if isinstance(message, messages.SpecificationsStated):
-            answer: messages.Message = messages.SpecificationsTaken(message.revision, [], [])
+            answer: messages.Message = messages.SpecificationsTaken(
+                message.revision, [], [], message.statement
+            )
             if self.desk.findings:
-                answer = messages.SpecificationsRefused(message.revision, self.desk.findings)
+                answer = messages.SpecificationsRefused(
+                    message.revision, self.desk.findings, message.statement
+                )
             asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
         return True
 

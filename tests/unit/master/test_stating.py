@@ -37,16 +37,22 @@ def revision(number: int, **files: str) -> Revision:
     return Revision(number, sources, check(sources))
 
 
+def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTaken:
+    """A relay's answer."""
+    return messages.SpecificationsTaken(statement.revision, [], [], statement.statement)
+
+
 class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
     def __init__(self, stating: Stating) -> None:
         self.stating = stating
         self.story: list[tuple[Any, ...]] = []
+        self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()
         self.away: set[int] = set()
         self.answer: Callable[[int, messages.SpecificationsStated], messages.Message | None] = (
-            lambda _relay, statement: messages.SpecificationsTaken(statement.revision, [], [])
+            lambda _relay, statement: taken(statement)
         )
 
     def send(self, message: messages.Message, relay: int) -> bool:
@@ -54,6 +60,7 @@ class Fleet:
         if relay in self.away:
             return False
         assert isinstance(message, messages.SpecificationsStated)
+        self.stated.append((relay, message))
         self.story.append(
             ("stated", relay, message.revision, [name for name, _ in message.files], message.moved)
         )
@@ -122,8 +129,8 @@ async def test_what_one_refuses_none_has(world: World) -> None:
 
     def answer(relay: int, statement: messages.SpecificationsStated) -> messages.Message:
         if relay == 1 and statement.revision == 2:
-            return messages.SpecificationsRefused(2, ["c.rv:1:1: error: no"])
-        return messages.SpecificationsTaken(statement.revision, [], [])
+            return messages.SpecificationsRefused(2, ["c.rv:1:1: error: no"], statement.statement)
+        return taken(statement)
 
     world.fleet.answer = answer
     with pytest.raises(SpecificationsRefusedError, match="no"):
@@ -136,9 +143,7 @@ async def test_what_one_refuses_none_has(world: World) -> None:
 
 async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
     """One that is away is told when it comes, and does not keep the others from it."""
-    world.fleet.answer = lambda relay, statement: (
-        None if relay == 1 else messages.SpecificationsTaken(statement.revision, [], [])
-    )
+    world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     taking = asyncio.ensure_future(world.stating.take(revision(2, **world.files, c=spec("c", "/b"))))
     while len(world.fleet.story) < 2:
         await asyncio.sleep(0)
@@ -189,7 +194,7 @@ async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_i
     def answer(at: int, statement: messages.SpecificationsStated) -> messages.Message:
         world.fleet.away = set()
         stated.append(world.stating.statement(relay))
-        return messages.SpecificationsTaken(statement.revision, [], [])
+        return taken(statement)
 
     world.files["c"] = spec("c", "/c")
     world.fleet.answer = answer
@@ -199,15 +204,13 @@ async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_i
 
 async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: World) -> None:
     """One that does not say so within the time is told of as one that has other specifications in force."""
-    world.fleet.answer = lambda relay, statement: (
-        None if relay == 1 else messages.SpecificationsTaken(statement.revision, [], [])
-    )
+    world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     over = asyncio.ensure_future(world.stating.all_taken())
     for _ in range(5):
         await asyncio.sleep(0)
     assert not over.done()
-    world.stating.received(messages.SpecificationsTaken(2, [], []), 1)
+    world.stating.received(taken([one for at, one in world.fleet.stated if at == 1][-1]), 1)
     await over
     assert world.stating.refused == []
 
@@ -218,12 +221,34 @@ async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: Wor
 
     def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
         world.fleet.carried = {(TOPIC, "/b")}
-        return messages.SpecificationsTaken(statement.revision, [], [])
+        return taken(statement)
 
     world.fleet.answer = answer
     await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     assert ("withdrawn", "/b", 1) in world.fleet.story
     assert world.fleet.story[-1] == ("placed", "/b", 0)
+
+
+async def test_an_answer_to_the_try_before_is_none_to_this_one(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two tries of one revision are two statements: one that came too late does not bring another text into force."""
+    monkeypatch.setattr("appliance.master.stating._RELAY_SECONDS", 0.01)
+    world.fleet.answer = lambda _relay, _statement: None
+    with pytest.raises(SpecificationsRefusedError, match="try again"):
+        await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+    late = [one for _, one in world.fleet.stated if one.revision == 2]
+    monkeypatch.setattr("appliance.master.stating._RELAY_SECONDS", 15)
+    again = asyncio.ensure_future(world.stating.take(revision(2, **world.files, d=spec("d", "/b"))))
+    await asyncio.sleep(0)
+    for relay, statement in enumerate(late):
+        world.stating.received(taken(statement), relay)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not again.done()
+    for relay, statement in world.fleet.stated[-2:]:
+        world.stating.received(taken(statement), relay)
+    await again
 
 
 async def test_held_monitors_and_rows_of_both(world: World) -> None:
