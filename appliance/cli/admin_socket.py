@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from appliance.cli.audit_source import AuditSource
 
 ADMIN_SOCKET = "admin.sock"
-_SECONDS = 30.0
+SECONDS = 60.0
+"""How long an answer may take: longer than control's slowest, a host that waits for charon, a set that is compiled."""
 
 
 class NotRunningError(Exception):
@@ -33,6 +34,7 @@ class AdminSocket:
 
     def ask(self, request: AdminRequest) -> AdminAnswer:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
+        line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
             raise NotRunningError(
@@ -40,10 +42,10 @@ class AdminSocket:
             )
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-                sock.settimeout(_SECONDS)
+                sock.settimeout(SECONDS)
                 sock.connect(str(path))
-                sock.sendall(msgspec.json.encode(request) + b"\n")
-                line = _read_line(sock)
+                sock.sendall(line + b"\n")
+                answer = _read_line(sock)
         except FileNotFoundError:
             raise NotRunningError(
                 f"{self.state}: no appliance runs with this state directory; start it: rosrv up"
@@ -55,10 +57,20 @@ class AdminSocket:
                 f"{self.state}: the appliance that used this state directory has ended"
             ) from None
         except TimeoutError:
-            raise NotRunningError(f"{path}: the appliance did not answer within {_SECONDS:g} s") from None
+            raise NotRunningError(f"{path}: the appliance did not answer within {SECONDS:g} s") from None
         except OSError as error:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
-        return msgspec.json.decode(line, type=AdminAnswer)
+        return msgspec.json.decode(answer, type=AdminAnswer)
+
+
+def encoded(request: AdminRequest) -> bytes:
+    """The request as it is sent. Raises `NotRunningError` for words that no appliance can be asked for."""
+    try:
+        return msgspec.json.encode(request)
+    except UnicodeEncodeError as error:
+        word = error.object[max(0, error.start - 20) : error.end + 20]
+        shown = word.encode("utf-8", "backslashreplace").decode()
+        raise NotRunningError(f"'{shown}' is not UTF-8: write it anew in that encoding") from None
 
 
 def _read_line(sock: socket.socket) -> bytes:

@@ -168,6 +168,11 @@ def _parameters(wanted: Filter) -> dict[str, Any]:
     for name in ("since", "until"):
         if name in params:
             params[name] = rfc3339(params[name])
+    for name, value in params.items():
+        try:
+            str(value).encode()
+        except UnicodeEncodeError:
+            raise FilterError(f"{name}: not valid Unicode") from None
     if "decision" in params:
         params["decision"] = list(wanted.decision)
     return params

@@ -20,9 +20,8 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_socket import SECONDS, NotRunningError
 
-_SECONDS = 60.0
 _CONNECT_SECONDS = 10.0
 _LONGEST_ERROR = 1 << 20
 _MAKE = "make one on its machine: rosrv token add NAME"
@@ -58,7 +57,7 @@ class RestClient:
             base_url=place.url,
             headers={"Authorization": f"Bearer {self._token}", "User-Agent": "rosrv"},
             verify=_context(authority) if place.secure else False,
-            timeout=httpx.Timeout(_SECONDS, connect=_CONNECT_SECONDS),
+            timeout=httpx.Timeout(SECONDS, connect=_CONNECT_SECONDS),
             trust_env=False,
             follow_redirects=False,
         )
@@ -70,7 +69,7 @@ class RestClient:
         *,
         params: Mapping[str, Any] | None = None,
         body: Any = None,
-        seconds: float | None = _SECONDS,
+        seconds: float | None = SECONDS,
         match: bool = False,
     ) -> dict[str, Any]:
         """The answer's body. `match`: whatever is in force is changed (`If-Match: *`)."""
@@ -95,7 +94,7 @@ class RestClient:
         *,
         params: Mapping[str, Any] | None = None,
         body: Any = None,
-        seconds: float | None = _SECONDS,
+        seconds: float | None = SECONDS,
         headers: Mapping[str, str] | None = None,
     ) -> Iterator[httpx.Response]:
         """An answer while it comes."""

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.cli.admin_socket import encoded
 from appliance.cli.rest import ProblemError, RestClient
 from appliance.cli.rest_orders import carry_out
 
@@ -20,6 +21,7 @@ class RestWay:
 
     def ask(self, request: AdminRequest) -> AdminAnswer:
         """Ask one thing. Raises `NotRunningError`."""
+        encoded(request)  # what cannot be written over the socket is not asked here either
         try:
             return AdminAnswer(True, carry_out(self.client, request))
         except ProblemError as problem:
