@@ -6,6 +6,7 @@ Invariants:
 2. Memory is bounded: `_BATCH` records and checkpoints at a time.
 3. The position moves only when the receiver has the batch; a failure is tried again, at growing distances, for ever.
 4. What was removed by retention before it could be sent is counted (`missed`) and told, not passed over.
+5. Of a log that was put back from a copy, what is recorded in the place of what had been sent is sent as well.
 """
 
 import sqlite3
@@ -103,18 +104,18 @@ class Forwarder:
         if position is not None and position.log != log_id:
             _log.warning("another audit log is forwarded from its beginning", log=log_id, before=position.log)
             position = None
-        self._position = position or Position(log_id, first - 1)
+        self._position = _in_log(self._path, position) if position else Position(log_id, first - 1)
         return self._position
 
     def _forward(self, position: Position) -> bool:
         """Whether there is more."""
-        first, head, log_id = _extent(self._path)
+        _first, head, log_id = _extent(self._path)
         if log_id != position.log or head < position.sequence:
             self._position = None
             raise LogUnreadableError(f"{self._path}: another log than before; it is looked at afresh")
         entries = search(self._path, Filter(), str(position.sequence), _BATCH, newest_first=False).entries
         checkpoints = signed_checkpoints(self._path, position.checkpoint, _BATCH)
-        missed = max(0, first - position.sequence - 1) if entries else 0
+        missed = entries[0].sequence - position.sequence - 1 if entries else 0
         if missed:
             _log.error("retention removed records before they were forwarded", count=missed)
         through = entries[-1].sequence if entries else position.sequence
@@ -125,7 +126,9 @@ class Forwarder:
         if messages:
             self._receiver.send(messages)
         last = ready[-1].number if ready else position.checkpoint
-        self._position = Position(position.log, through, last)
+        self._position = Position(
+            position.log, through, last, entries[-1].record.id if entries else position.record
+        )
         self.progress = Progress(
             sent=self.progress.sent + len(messages),
             sequence=through,
@@ -178,3 +181,31 @@ def _extent(path: Path) -> tuple[int, int, str]:
     except sqlite3.Error as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
     return int(first), int(last), str(log_id)
+
+
+def _in_log(path: Path, position: Position) -> Position:
+    """The position as far as the log has what it says. Raises `LogUnreadableError`.
+
+    A log that was put back from a copy went on from there: its ids are in order of time, so what is later than the
+    last record that was sent is new, whatever its sequence.
+    """
+    try:
+        with closing(open_for_reading(path)) as connection:
+            query = "SELECT id FROM record WHERE sequence = ?"
+            found = connection.execute(query, (position.sequence,)).fetchone()
+            query = "SELECT coalesce(max(sequence), 0) FROM record"
+            (head,) = connection.execute(query).fetchone()
+            is_there = not position.record or found is None or found[0] == position.record
+            if is_there and position.sequence <= head:
+                return position
+            query = "SELECT min(sequence) - 1 FROM record WHERE id > ?"
+            (before,) = (
+                connection.execute(query, (position.record,)).fetchone() if position.record else (None,)
+            )
+            sequence = min(position.sequence, head) if before is None else int(before)
+            query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?"
+            (number,) = connection.execute(query, (sequence,)).fetchone()
+    except sqlite3.Error as error:
+        raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
+    _log.warning("the audit log was put back from a copy: it is forwarded from there", sequence=sequence)
+    return Position(position.log, sequence, min(position.checkpoint, int(number)))

@@ -10,11 +10,15 @@ import msgspec
 
 
 class Position(msgspec.Struct, frozen=True):
-    """Of the log with this id: the last record's sequence and the last checkpoint's number that were sent."""
+    """Of the log with this id: the last record's sequence and the last checkpoint's number that were sent.
+
+    `record` is that record's id: by it a log that was put back from a copy is told from one that went on.
+    """
 
     log: str
     sequence: int = 0
     checkpoint: int = 0
+    record: str = ""
 
 
 def load_position(path: Path) -> Position | None:

@@ -37,9 +37,12 @@ class _Process:
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(
-            lifeline, messages.ForwardingLink, said=lambda _message: None, linked=self._report_anew
+            lifeline,
+            messages.ForwardingLink,
+            said=lambda _message: None,
+            linked=lambda: self._reports.anew(self._forwarder.progress),
         )
-        self._told: messages.ForwardingReported | None = None
+        self._reports = Reports(self._child.tell)
         self._ending = threading.Event()
         self._forwarder = make_forwarder(settings, Path.cwd() / "position.json")
 
@@ -53,7 +56,7 @@ class _Process:
         thread.start()
         self._child.attach(messages.Ready())
         while not self._child.ended.is_set():
-            self._report()
+            self._reports.tell(self._forwarder.progress)
             try:
                 await asyncio.wait_for(self._child.ended.wait(), _REPORT_SECONDS)
             except TimeoutError:
@@ -67,14 +70,28 @@ class _Process:
             self._ending.wait(self._forwarder.step())
         self._forwarder.close()
 
-    def _report(self) -> None:
-        message = report_of(self._forwarder.progress)
-        if message != self._told and self._child.tell(message):
+
+class Reports:
+    """Tells control how it stands. `send` says whether there was a control to tell.
+
+    Every control is told first what was told last: what was missed since then, or while there was none, it can tell
+    from what another control has recorded.
+    """
+
+    def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
+        self._send = send
+        self._told = report_of(Progress())
+
+    def tell(self, progress: Progress) -> None:
+        """If something is new, tell it."""
+        message = report_of(progress)
+        if message != self._told and self._send(message):
             self._told = message
 
-    def _report_anew(self) -> None:
-        self._told = None
-        self._report()
+    def anew(self, progress: Progress) -> None:
+        """There is another control."""
+        if self._send(self._told):
+            self.tell(progress)
 
 
 def make_forwarder(settings: Settings, kept: Path) -> Forwarder:

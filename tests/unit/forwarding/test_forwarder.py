@@ -1,7 +1,10 @@
 """Tests of forwarding a real log: at least once, in order, from where it was, whatever the receiver does."""
 
+import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +13,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
-from appliance.audit.search import search
+from appliance.audit.search import Page, search
 from appliance.audit.verify import verify
 from appliance.forwarding.forwarder import Chosen, Forwarder
 from appliance.forwarding.syslog import Formatter
@@ -266,3 +269,81 @@ def test_a_position_that_cannot_be_read(make_log: MakeLog, path: Path, kept: Kep
     assert one.step() > 0
     assert "position.json" in one.progress.trouble
     assert kept.lines == []
+
+
+def put_back(path: Path, copy: Path) -> None:
+    """The log as the copy has it."""
+    for file in path.parent.glob("audit.db*"):
+        file.unlink()
+    shutil.copy(copy, path)
+
+
+@pytest.mark.parametrize("later", [0, 2, 40])
+def test_a_log_that_was_put_back(
+    make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path, later: int
+) -> None:
+    """After a restore what is recorded from then on is sent, also in the place of what had been sent before."""
+    log = make_log(checkpoint_every=5)
+    record(log, 20)
+    log.close()
+    shutil.copy(path, tmp_path / "copy.db")
+    log = make_log(checkpoint_every=5)
+    record(log, 15)
+    log.close()
+    first = forwarder(path, kept)
+    run(first)
+    first.close()
+    put_back(path, tmp_path / "copy.db")
+    before = everything(path)[-1]
+    kept.lines.clear()
+    log = make_log(checkpoint_every=5)
+    record(log, later)
+    one = forwarder(path, kept)
+    run(one)
+    record(log, 10)
+    log.close()
+    run(one)
+    assert [number for number in everything(path) if number > before] == kept.sequences()
+    assert one.progress.trouble == ""
+    assert one.progress.missed == 0
+    sealed = [int(one.fields["number"]) for one in kept.messages if SYSLOG_ELEMENT in one.elements]
+    assert sealed
+    assert sealed[-1] == signed_checkpoints(path)[-1].number
+
+
+def test_a_position_without_the_record_is_held_against_the_end(
+    make_log: MakeLog, path: Path, kept: Kept
+) -> None:
+    """A position that an earlier version kept, ahead of the log, goes back to the log's end."""
+    log = make_log()
+    record(log, 5)
+    (last,) = everything(path)[-1:]
+    log_id = verify(path).log
+    position = {"log": log_id, "sequence": last + 50, "checkpoint": 7}
+    path.with_name("position.json").write_text(json.dumps(position))
+    one = forwarder(path, kept)
+    run(one)
+    record(log, 2)
+    run(one)
+    assert kept.sequences() == [last + 1, last + 2]
+
+
+def test_what_retention_takes_while_it_is_read(
+    make_log: MakeLog, path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Records that go between the look at the log's extent and the reading of it are counted as missed."""
+    log = make_log()
+    record(log, 30)
+    one = forwarder(path, kept)
+    one.step()
+    before = kept.sequences()[-1]
+    record(log, 30)
+
+    def removing(*arguments: Any, **named: Any) -> Page:
+        page = search(*arguments, **named)
+        return Page(page.entries[5:], page.cursor)
+
+    monkeypatch.setattr("appliance.forwarding.forwarder.search", removing)
+    one.step()
+    assert kept.sequences()[-1] > before
+    assert one.progress.missed == 5
