@@ -79,3 +79,13 @@ def test_no_script_is_written_that_cannot_reach_rest() -> None:
     assert "ROSRV_API_PUBLISHED" in place.trouble
     override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
     assert rest_place(resolve(None, listens | environment() | override, {})).port == 8443
+
+
+def test_a_flood_ends_in_the_container() -> None:
+    """Memory and processes are bounded, and what the relay may hold by itself is within that."""
+    appliance = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]
+    assert appliance["mem_limit"] == appliance["memswap_limit"] == "2g"
+    assert 100 <= appliance["pids_limit"] <= 1000
+    settings = resolve(None, environment(), {})
+    others = 500 << 20  # docs/network.md
+    assert 4 * settings.relay.memory_bytes + others < 2 << 30

@@ -188,7 +188,7 @@ def test_a_hanging_process_is_ended_by_the_right_to_kill(alone: Compose) -> None
 
 
 def test_no_other_right_is_given(alone: Compose) -> None:
-    """The list in compose.yaml is exactly what these tests prove to be needed, and the engine gives no more."""
+    """Rights, memory, processes: the list in compose.yaml is what these tests prove to be needed, and no more is given."""
     proven = {
         "NET_ADMIN",
         "SETUID",
@@ -203,4 +203,6 @@ def test_no_other_right_is_given(alone: Compose) -> None:
     assert {one.removeprefix("CAP_") for one in settings["CapAdd"]} == proven
     assert settings["ReadonlyRootfs"]
     assert not settings["Privileged"]
+    assert settings["Memory"] == settings["MemorySwap"] == 2 << 30
+    assert settings["PidsLimit"] == 512
     assert json.dumps(settings["SecurityOpt"]) == '["no-new-privileges:true"]'
