@@ -49,6 +49,7 @@ from appliance.master.reminders import Reminders
 from appliance.master.revocation import Revocation
 from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.policy.model import Address
 from appliance.ros.standard import standard_definitions
 from appliance.store.state import StateStore
 
@@ -133,6 +134,9 @@ class _Wires:
 
     def returned(self, incarnation: Incarnation) -> None:
         self.revocation().returned(incarnation)
+
+    def redecide_for(self, host: Address, caller_id: str) -> int:
+        return self.revocation().redecide_for(host, caller_id)
 
     def rosmaster_lost(self) -> None:
         self.master().rosmaster.shut()
@@ -280,6 +284,7 @@ def _make_master(
         addresses=reach.addresses,
         policy=lambda: base.policies.current,
         stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
+        redecide_for=wires.redecide_for,
     )
 
 

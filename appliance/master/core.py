@@ -16,13 +16,15 @@ from appliance.master.registry import Registry
 from appliance.master.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import Policy
+from appliance.policy.model import Address
 
 
 @dataclass(slots=True)
 class Master:
     """The parts of RVMaster; `port` is its own, `stop(reason)` ends the appliance.
 
-    `publish_as` is the node that publishes what monitors publish.
+    `publish_as` is the node that publishes what monitors publish; `redecide_for(host, caller_id)` takes back what
+    the policy in force does not allow one caller, after a call of his that was decided by an earlier one.
     """
 
     port: int
@@ -42,3 +44,4 @@ class Master:
     addresses: Addresses
     policy: Callable[[], Policy]
     stop: Callable[[str], None]
+    redecide_for: Callable[[Address, str], int]

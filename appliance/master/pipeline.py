@@ -219,13 +219,20 @@ class Pipeline:
     async def _carry_out(
         self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision
     ) -> Value:
+        policy = self._master.policy()
         record = self._record(caller, call, arguments, decision)
         obstacle = await self._obstacle()
         if obstacle is not None:
             return [0, obstacle, call.denial]
         if not decision.allowed:
             return [0, denial_text(decision, record), call.denial]
-        return await self._perform(call, caller, arguments)
+        answer = await self._perform(call, caller, arguments)
+        lasts = call.identity is Identity.NODE or call.category is Category.CALL
+        if (
+            lasts and self._master.policy() is not policy
+        ):  # it has waited: what it left may be allowed no longer
+            self._master.redecide_for(caller.peer.host, caller.caller_id)
+        return answer
 
     def _record(self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision) -> str:
         category, resource = self._master.gate.asked(call, arguments)

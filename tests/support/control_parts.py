@@ -8,22 +8,28 @@ import asyncio
 import ipaddress
 from typing import Any, cast
 
-from appliance.master.call import Answer
+from appliance.master.allocation import SERVICE
+from appliance.master.arguments import ApiUri
+from appliance.master.call import Answer, Caller
+from appliance.master.calls import MASTER_CALLS
 from appliance.master.client import CallFailedError, RefusedError
 from appliance.master.core import Master
 from appliance.master.delivery import NodeCall
 from appliance.master.gate import Gate, HostLimits
 from appliance.master.graph import Graph
+from appliance.master.http import HttpRequest, Peer
 from appliance.master.liveness import Liveness, LivenessSettings
 from appliance.master.parameters import ParameterMirror
+from appliance.master.pipeline import Pipeline
 from appliance.master.reconcile import Reconciler
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Kind, Registration, Registry, new_key
 from appliance.master.revocation import Revocation
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import compile_policy
+from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri
-from appliance.ros.xmlrpc import Limits, Value
+from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
 from appliance.store.state import PermissionRow
 
 HOST = ipaddress.ip_address("10.0.0.5")
@@ -45,6 +51,17 @@ class Records:
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str | None]] = []
+
+        self.strict = False
+        self.obstacle: str | None = None
+        self.meter = Nothing()
+
+    def decided(
+        self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
+    ) -> str:
+        """As `Recorder`."""
+        self.events.append(("allow" if decision.allowed else "deny", resource))
+        return "id"
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
         """As `Recorder`."""
@@ -75,6 +92,14 @@ class Grants(Nothing):
     def permissions(self) -> list[PermissionRow]:
         """As `RelayControl`."""
         return list(self.rows)
+
+    def grant_service(self, provider: Incarnation, service: str, host: Address) -> None:
+        """As `RelayControl`."""
+        self.rows.append(PermissionRow(provider.key, SERVICE, service, str(host), ""))
+
+    def port(self, incarnation: Incarnation, _kind: Kind, _resource: str) -> int:
+        """As `RelayControl`."""
+        return incarnation.relay_port
 
     def revoke(self, row: PermissionRow) -> None:
         """As `RelayControl`."""
@@ -115,6 +140,7 @@ class HiddenMaster:
             ],
             "lookupNode": self.nodes.get(asked),
             "getTopicTypes": [],
+            "lookupService": next(iter(self.tables[Kind.SERVICE].get(asked, {}).values()), ""),
             "hasParam": asked[1:] in self.parameters,
             "getParam": dict(self.parameters),
             "subscribeParam": self.parameters.get(asked[1:], {}),
@@ -126,7 +152,8 @@ class HiddenMaster:
     def _change(self, how: str, kind: Kind, name: str, resource: str, *rest: str) -> Answer:
         table = self.tables[kind].setdefault(resource, {})
         if how == "register":
-            table[name] = self.nodes[name] = rest[-1]
+            table[name] = rest[0] if kind is Kind.SERVICE else rest[-1]
+            self.nodes[name] = rest[-1]
             return [1, "", []]
         return [1, "", int(table.pop(name, None) is not None)]
 
@@ -136,10 +163,26 @@ class HiddenMaster:
 
 
 class Inner:
-    """The faces: inner URIs only."""
+    """The faces: URIs only; an incarnation that is not known yet is made."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
+
+    def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """As `Faces`."""
+        return self._registry.find(caller.caller_id, caller.peer.host, api.text)
+
+    def nobody(self) -> str:
+        """As `Faces`."""
+        return node_uri("127.0.0.1", _INNER_PORT, "/nobody/")
+
+    async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
+        """As `Faces`."""
+        known = self.known(caller, api)
+        if known is None:
+            known = Incarnation(new_key(), caller.caller_id, HOST, api.uri, api.text, "10.0.0.1", 1, 2)
+            self._registry.add(known)
+        return known
 
     def inner_uri(self, incarnation: Incarnation) -> str:
         """As `Faces`."""
@@ -178,6 +221,21 @@ class Modes:
         """As `Mediation`."""
         return True
 
+    def carries_service(self, _service: str) -> bool:
+        """As `Mediation`."""
+        return True
+
+
+class Addresses:
+    """One address that every node is told."""
+
+    async def learn(self, _peer: Peer) -> None:
+        """As `Addresses`."""
+
+    def told_to(self, _peer: Peer) -> str:
+        """As `Addresses`."""
+        return "10.0.0.1"
+
 
 class ControlParts:
     """The parts, with an open policy; `reload(text)` brings another into force, `settle()` waits for what follows."""
@@ -189,12 +247,17 @@ class ControlParts:
         self.records, self.deliveries, self.relay = Records(), Deliveries(), Grants()
         self.hidden, self.faces, self.clients = HiddenMaster(), Inner(self.registry), Clients()
         self.closed: list[str] = []
+        self.mediation, self.addresses, self.parameters = (
+            Modes(),
+            Addresses(),
+            ParameterMirror({}, lambda: None),
+        )
         self.graph = Graph(
             self.registry,
             cast(Any, self.relay),
             cast(Any, self.deliveries),
             cast(Any, self.records),
-            cast(Any, Modes()),
+            cast(Any, self.mediation),
             closed=lambda one: self.closed.append(one.key),
         )
         self.rosmaster = RosMaster(1, lost=lambda: None, limits=Limits(), hold=1.0)
@@ -204,7 +267,7 @@ class ControlParts:
             self.registry,
             cast(Any, self.faces),
             self.graph,
-            ParameterMirror({}, lambda: None),
+            self.parameters,
             cast(Any, self.records),
             own_parameters=dict,
         )
@@ -213,7 +276,9 @@ class ControlParts:
         self.gate = Gate(lambda: self.current, self.registry, HostLimits())
         self.recorder = self.records
         self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
+        self.redecide_for = self.revocation.redecide_for
         self.liveness = self._make_liveness()
+        self._serve = Pipeline(self.master, limits=Limits(), offload=1 << 20).handler(MASTER_CALLS)
 
     def _make_liveness(self) -> Liveness:
         async def withdraw_all(incarnation: Incarnation, registrations: list[Registration]) -> None:
@@ -238,6 +303,11 @@ class ControlParts:
         node = Incarnation(new_key(), name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
         self.registry.add(node)
         return node
+
+    async def ask(self, method: str, *params: Value) -> Value:
+        """A call that a node on the robot makes of RVMaster, as it is answered."""
+        peer = Peer(HOST, str(HOST), "10.0.0.1")
+        return parse_response(await self._serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
         """ROSMaster takes a registration, and control writes it down."""
