@@ -161,6 +161,9 @@ class Replaced(Model):
     moved: list[str] = Field(
         default=[], description="monitors that began anew because another relay process has them now"
     )
+    began: list[str] = Field(
+        default=[], description="all monitors that are in their initial state by this change, new ones among them"
+    )
 
 
 class Switch(Model):

@@ -93,4 +93,5 @@ def _replaced(replaced: Replaced, tag: str) -> dict[str, Any]:
         "removed": replaced.removed,
         "warnings": replaced.warnings,
         "moved": replaced.moved,
+        "began": replaced.began,
     }

@@ -13,7 +13,7 @@ a change that is meant for another tag than the present one is refused.
 import asyncio
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -62,7 +62,8 @@ class MonitorsChangedError(Exception):
 class Replaced:
     """What a load did: the revision in force, the one before, files added, changed and removed, the lint.
 
-    `moved` are monitors that began in their initial state because another relay process has them now.
+    `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
+    did: new ones, edited ones, and those whose messages have another definition.
     """
 
     revision: int
@@ -72,6 +73,7 @@ class Replaced:
     removed: list[str]
     warnings: list[str]
     moved: list[str]
+    began: list[str]
 
 
 class Monitors:
@@ -332,12 +334,14 @@ class Monitors:
                 who=who,
             )
             raise
-        self._keep(sources, checked, who=keeper, note=note, by=who, before=previous)
+        began = self._stating.began(checked.monitors)
+        self._keep(sources, checked, who=keeper, note=note, by=who, before=previous, began=began)
         await self._store.settled()
         await self._stating.all_taken()
         self.published()
         added, changed, removed = sources.difference(previous)
-        return Replaced(self.revision, before, added, changed, removed, list(checked.warnings), moved)
+        began = self._stating.began(checked.monitors)  # by those that have it only now, too
+        return Replaced(self.revision, before, added, changed, removed, list(checked.warnings), moved, began)
 
     def _keep(
         self,
@@ -348,6 +352,7 @@ class Monitors:
         note: str,
         by: str | None = None,
         before: Sources | None = None,
+        began: Sequence[str] = (),
     ) -> None:
         text = json.dumps({"files": sources.files, "definitions": sources.definitions})
         row = MonitorRevisionRow(self.revision + 1, text, time.time(), who, note)
@@ -370,6 +375,7 @@ class Monitors:
             added=added,
             changed=changed,
             removed=removed,
+            began=list(began),
             warnings=list(checked.warnings)[:100],
         )
 

@@ -11,7 +11,7 @@ its topics.
 import asyncio
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -64,6 +64,7 @@ class Stating:
             time.monotonic_ns()
         )  # relays may outlive control: no number comes again
         self._refusals: dict[int, list[str]] = {}
+        self._began: set[str] = set()  # by what is being changed
         self._held: dict[int, set[str]] = {}
         self._rows: dict[int, list[messages.MonitorRow]] = {}
         self.rows: dict[str, messages.MonitorRow] = {}
@@ -111,12 +112,17 @@ class Stating:
 
     # --- a change ---
 
+    def began(self, names: Iterable[str]) -> list[str]:
+        """Those of these monitors that are in their initial state since the last change, moved ones among them."""
+        return [name for name in names if name in self._began]
+
     async def take(self, coming: Revision) -> list[str]:
         """Have every relay take these; the monitors that began anew because they moved.
 
         Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.carried_now())
+        self._began = set()
         for _ in range(_TRIES):
             await self._try(coming, plan)
             tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
@@ -263,6 +269,8 @@ class Stating:
     def _taken(self, relay: int, statement: int, began: list[str], held: list[str]) -> None:
         self._refusals.pop(relay, None)
         self._held[relay] = set(held)
+        if (relay, statement) in self._waiting:
+            self._began |= set(began)
         if relay in self._fresh and began:
             self._recorder.happened(
                 "monitors restarted",

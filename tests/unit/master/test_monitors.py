@@ -40,6 +40,7 @@ class Desk:
         self.store = StateStore(home, failed=pytest.fail)
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
+        self.began: list[str] = []
 
     def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
         """A control starts."""
@@ -60,7 +61,7 @@ class Taking(NoRelays):
         self.desk.sent.append(message)
         if isinstance(message, messages.SpecificationsStated):
             answer: messages.Message = messages.SpecificationsTaken(
-                message.revision, [], [], message.statement
+                message.revision, self.desk.began, [], message.statement
             )
             if self.desk.findings:
                 answer = messages.SpecificationsRefused(
@@ -95,13 +96,16 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     await desk.store.settled()
     again = desk.monitors()
     assert again.revision == 1
+    desk.began = ["b"]
     replaced = await again.load({"b.rv": B}, {}, who="eve", note="")
     assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
+    assert replaced.began == ["b"]
     restarted = desk.monitors()
     assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
     back = await restarted.reload(who="operator")
     assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
     loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
+    assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
     assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
 
 

@@ -251,6 +251,16 @@ async def test_an_answer_to_the_try_before_is_none_to_this_one(
     await again
 
 
+async def test_who_began_in_the_initial_state_is_said(world: World) -> None:
+    """What the relays that were asked say; what one says of an earlier statement is of no change."""
+    world.fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
+        statement.revision, ["c", "b"] if relay else [], [], statement.statement
+    )
+    world.stating.received(messages.SpecificationsTaken(1, ["a"], []), 0)
+    await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+    assert world.stating.began(["a", "b", "c"]) == ["b", "c"]
+
+
 async def test_held_monitors_and_rows_of_both(world: World) -> None:
     """A row of a monitor that has moved counts only where it is now."""
     stating = world.stating
