@@ -3,10 +3,15 @@
 The appliance has a table of its own, `inet rosrv`, for IPv4 and IPv6. In it a base chain for each hook
 jumps to the chain with the rules, so that the chains have the same names and shape as with iptables. A
 verdict of another table can only add refusals to ours, never undo them.
+
+A limit for each host is a set of buckets, which the kernel does not make larger than its size: the rule that adds to a
+full set just does not match. So each such rule has a second one behind it: hosts that got no bucket share one, instead
+of going without a limit. (iptables drops what finds its table full.)
 """
 
 import json
 import subprocess
+from dataclasses import replace
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
@@ -17,6 +22,7 @@ from appliance.network.firewall.rules import (
     Family,
     Interface,
     PortRange,
+    RateLimit,
     Rule,
     Verdict,
 )
@@ -28,6 +34,7 @@ _SECONDS = 20.0
 _FILTER_PRIORITY, _DNAT_PRIORITY, _SNAT_PRIORITY = 0, -100, 100
 _METER_SIZE = 65535  # hosts
 _METER_SECONDS = 60
+_SHARED = " (no bucket left)"  # after the purpose, in the comment of the second rule
 
 Json = dict[str, Any]
 
@@ -55,7 +62,7 @@ class NftBackend:
             return ()
         rules = self._list("rule", "list", "table", _FAMILY, TABLE)
         hooked = {jump for rule in rules for jump in _jumps(rule)}
-        return tuple(_counter(rule) for rule in rules if rule["chain"] in hooked)
+        return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
         """Return the chains of other tables that hook forwarded packets with the policy drop."""
@@ -120,7 +127,14 @@ def render_rule(rule: Rule) -> list[Json]:
     both = len(rule.families()) == 2 and rule.above is None
     if both:
         return [_body(rule, [], None)]
-    return [_body(rule, [_match(_meta("nfproto"), f"ipv{family}")], family) for family in rule.families()]
+    bodies = [_body(rule, [_match(_meta("nfproto"), f"ipv{family}")], family) for family in rule.families()]
+    if rule.above is None:
+        return bodies
+    return [
+        one
+        for body, family in zip(bodies, rule.families(), strict=True)
+        for one in (body, _shared(rule, body, family))
+    ]
 
 
 def _transport(rule: Rule) -> list[Json]:
@@ -172,10 +186,26 @@ def _verdict(rule: Rule, protocol: str) -> Json:
 
 def _over_limit(rule: Rule, protocol: str) -> Json:
     assert rule.above is not None  # noqa: S101 - the caller asked
-    limit = {"rate": rule.above.per_second, "burst": rule.above.burst, "per": "second", "inv": True}
     name = _meter(rule, 6 if protocol == "ip6" else 4)
     element = _payload(protocol, "saddr")
-    return {"set": {"op": "add", "elem": element, "set": f"@{name}", "stmt": [{"limit": limit}]}}
+    return {"set": {"op": "add", "elem": element, "set": f"@{name}", "stmt": [_limit(rule.above)]}}
+
+
+def _shared(rule: Rule, own: Json, family: Family) -> Json:
+    """The rule behind `own`, for the hosts that it could not give a bucket."""
+    assert rule.above is not None  # noqa: S101 - the caller asked
+    address = _payload("ip6" if family == 6 else "ip", "saddr")
+    expressions: list[Json] = []
+    for one in own["expr"]:
+        if "set" in one:
+            expressions += [_match(address, f"@{_meter(rule, family)}", "!="), _limit(rule.above)]
+        else:
+            expressions.append(one)
+    return own | {"expr": expressions, "comment": own["comment"] + _SHARED}
+
+
+def _limit(above: RateLimit) -> Json:
+    return {"limit": {"rate": above.per_second, "burst": above.burst, "per": "second", "inv": True}}
 
 
 def _meter(rule: Rule, family: int) -> str:
@@ -253,6 +283,27 @@ def _is_ours(table: Json) -> bool:
 
 def _jumps(rule: Json) -> list[str]:
     return [part["jump"]["target"] for part in rule["expr"] if "jump" in part]
+
+
+def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
+    """The rules as they are counted: the two of a limit for each host as one, which neither is without the other."""
+    shared = {_key(one): one for one in map(_counter, rules) if one.purpose.endswith(_SHARED)}
+    found = []
+    for rule in rules:
+        counter = _counter(rule)
+        if any("set" in part for part in rule["expr"]):
+            behind = shared.get(_key(replace(counter, purpose=counter.purpose + _SHARED)))
+            if behind is None:
+                continue
+            packets, octets = counter.packets + behind.packets, counter.octets + behind.octets
+            counter = replace(counter, packets=packets, octets=octets)
+        if _key(counter) not in shared:
+            found.append(counter)
+    return tuple(found)
+
+
+def _key(counter: RuleCounter) -> tuple[str, Family | None, str]:
+    return counter.chain, counter.family, counter.purpose
 
 
 def _counter(rule: Json) -> RuleCounter:

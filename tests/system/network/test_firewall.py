@@ -277,6 +277,26 @@ def test_a_flood_of_one_host_is_slowed_and_others_are_not(
         assert sum(rule.packets for rule in dropped) >= 30
 
 
+def test_hosts_beyond_those_that_are_counted_share_one_limit(
+    lab: Lab, protected: Host, attacker: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """nft: when every bucket is taken, further hosts have one together; who has one keeps it, and nobody is unlimited."""
+    monkeypatch.setattr("appliance.network.firewall.nft._METER_SIZE", 1)
+    others = [lab.host(f"other{number}", f"10.77.0.{number}/24", f"fd77::{number}/64") for number in (11, 12)]
+    firewall = Firewall(protected.namespace, "nft")
+    limit = RateLimit(per_second=1, burst=5)
+    with listening(protected) as master:
+        firewall.install(settings(11312, master_port=master, new_connections=limit))
+        for address in (protected.address, protected.address6):
+            assert connect(attacker, 0, (address, master)) == ["reached"]  # takes the one bucket
+            opened = sum(flood(other, [(address, master)] * 15) for other in others)
+            assert 5 <= opened <= 12, f"{opened} of 30 came through"
+            assert connect(attacker, 0, (address, master)) == ["reached"]
+        (status,) = [one for one in firewall.report().rules if "per host" in one.purpose]
+        assert status.in_force
+        assert status.packets >= 30
+
+
 def flood(host: Host, targets: list[tuple[str, int]]) -> int:
     """Open all connections at once; return how many were there at the first try (a SYN again takes 1 s)."""
     with contextlib.ExitStack() as stack, host.entered():

@@ -1,6 +1,7 @@
 """Tests of what the nft back end makes of rules, without a kernel."""
 
 import errno
+import json
 import subprocess
 import sys
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError
+from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.nft import NftBackend, render, render_rule
 from appliance.network.firewall.rules import (
     Chain,
@@ -97,6 +99,40 @@ def test_a_rate_limit_has_one_set_for_each_family() -> None:
         ("new-ipv4-10-20", "ipv4_addr", 65535),
         ("new-ipv6-10-20", "ipv6_addr", 65535),
     ]
+
+
+def listed(rules: tuple[Rule, ...], *, without: int | None = None) -> str:
+    """What `nft list table` answers while these rules are in force, but for one of them."""
+    bodies = [one["add"]["rule"] for one in render(rules) if "rule" in one["add"]]
+    jumps = [body for body in bodies if "comment" not in body]
+    kept = [
+        body for number, body in enumerate(body for body in bodies if "comment" in body) if number != without
+    ]
+    for number, body in enumerate(kept):
+        body["expr"] = [
+            {"counter": {"packets": number + 1, "bytes": 100}} if "counter" in part else part
+            for part in body["expr"]
+        ]
+    return json.dumps(
+        {
+            "nftables": [
+                {"table": {"family": "inet", "name": "rosrv"}},
+                *({"rule": body} for body in jumps + kept),
+            ]
+        }
+    )
+
+
+def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
+    """Each family has a rule for hosts with a bucket and one for those without: they are one in the report."""
+    rule = Rule(
+        chain=Chain.IN, purpose="p", verdict=Verdict.DROP, tcp_ports=PortRange.one(1), above=RateLimit(10, 20)
+    )
+    (status,) = statuses((rule,), NftBackend(Machine(listed((rule,)))).counters())
+    assert (status.in_force, status.packets) == (True, 1 + 2 + 3 + 4)
+    for gone in range(4):
+        (status,) = statuses((rule,), NftBackend(Machine(listed((rule,), without=gone))).counters())
+        assert not status.in_force
 
 
 def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
