@@ -22,6 +22,7 @@ from appliance.master.http import Handler, HttpRequest
 from appliance.master.parameters import IN_ORDER, in_order
 from appliance.master.places import NoPortError
 from appliance.master.recorder import NOT_RECORDED
+from appliance.master.registration import given_up
 from appliance.master.registry import Incarnation
 from appliance.master.write_turns import WriteTurns
 from appliance.policy.model import Category, Decision
@@ -221,6 +222,8 @@ class Pipeline:
     ) -> Value:
         policy = self._master.policy()
         record = self._record(caller, call, arguments, decision)
+        if not decision.allowed:
+            given_up(self._master, caller, call.name, arguments)
         obstacle = await self._obstacle()
         if obstacle is not None:
             return [0, obstacle, call.denial]

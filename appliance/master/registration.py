@@ -83,6 +83,29 @@ async def unregister_service(master: "Master", caller: Caller, arguments: tuple[
     return answer
 
 
+def given_up(master: "Master", caller: Caller, method: str, arguments: tuple[object, ...]) -> None:
+    """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
+    match method:
+        case "unregisterPublisher":
+            kind, (resource, api) = Kind.PUBLICATION, arguments
+        case "unregisterSubscriber":
+            kind, (resource, api) = Kind.SUBSCRIPTION, arguments
+        case "unsubscribeParam":
+            kind, (api, resource) = Kind.PARAMETER, arguments
+        case "unregisterService":
+            kind, (resource, api) = Kind.SERVICE, arguments
+        case _:
+            return
+    asked = cast(ApiUri, api)
+    for one in master.registry.all():
+        shelved = one.shelf.get((kind, str(resource)))
+        if shelved is None or (one.name, one.host) != (caller.caller_id, caller.peer.host):
+            continue
+        by_port = kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
+        if by_port or one.api_text == asked.text:
+            master.registry.unshelve(one, kind, str(resource))
+
+
 async def _unregister(
     master: "Master", caller: Caller, method: str, kind: Kind, arguments: tuple[object, ...]
 ) -> Answer:
