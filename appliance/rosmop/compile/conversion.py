@@ -3,7 +3,7 @@
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.positions import Position
-from appliance.rosmop.runtime import numbers, texts
+from appliance.rosmop.runtime import numbers, texts, vectors
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -13,6 +13,11 @@ FUNCTIONS = {
     "c_truncate": numbers.truncate,
     "c_terminated": texts.terminated,
     "c_float": float,
+    "c_recast": vectors.recast,
+    "c_recast_each": vectors.recast_each,
+    "c_signed": vectors.signed,
+    "c_unsigned": vectors.unsigned,
+    "c_truths": vectors.truths,
 }
 
 
@@ -25,10 +30,29 @@ def convert(scope: Scope, value: Value, target: Type, site: int | None = None) -
         return f"c_terminated({value.code})"
     if isinstance(target, kinds.Characters) and isinstance(value.type, kinds.String):
         return f"({value.code} + b'\\0')"
+    where = scope.lines.site if site is None else site
+    if isinstance(value.type, kinds.Vector) and isinstance(target, kinds.Vector):
+        recast = _recast(scope.context, value.code, value.type.element, target.element, where)
+        if recast is not None:
+            return recast
     if value.owned:
         return value.code
-    where = scope.lines.site if site is None else site
     return scope.codecs.copy(value.type, scope.context, value.code, where)
+
+
+def _recast(context: str, code: str, source: Type, target: Type, site: int) -> str | None:
+    """Code for a vector with other elements than it has (bytes of another kind); None if they are the same."""
+    if source == target:
+        return None
+    if isinstance(source, kinds.Vector) and isinstance(target, kinds.Vector):
+        inner = _recast(context, "e", source.element, target.element, site)
+        return None if inner is None else f"c_recast_each({context}, {code}, lambda e: {inner}, {site})"
+    if isinstance(target, kinds.Bool):
+        name = "c_truths"
+    else:
+        assert isinstance(target, kinds.Integer)  # so says kinds.same_elements
+        name = "c_signed" if target.signed else "c_unsigned"
+    return f"c_recast({context}, {code}, {name}, {site})"
 
 
 def check_convertible(value: Value, target: Type) -> None:

@@ -229,7 +229,10 @@ def _conditional(scope: Scope, node: tree.Expression) -> Value:
         codes = [number(each.code, each.type, kind) for each in (yes, no)]
     elif kinds.convertible(no.type, yes.type):
         kind = kinds.STRING if isinstance(yes.type, kinds.Characters) else yes.type
-        codes = [convert(scope, each, kind) if kinds.is_scalar(kind) else each.code for each in (yes, no)]
+        codes = [
+            convert(scope, each, kind) if kinds.is_scalar(kind) or each.type != kind else each.code
+            for each in (yes, no)
+        ]
     else:
         raise SpecificationError.at(
             no.position, f"`?:` between {yes.type} and {no.type}; make them the same type"

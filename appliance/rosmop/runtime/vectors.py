@@ -63,6 +63,33 @@ def copied_deep(context: Context, values: Values, width: int, copy: Callable[...
     return [copy(context, value, site) for value in values]
 
 
+def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+    """A vector of bytes as one of bytes of another kind."""
+    context.allocate(len(values), site)
+    return convert(values)
+
+
+def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+    """The same for the vectors in a vector."""
+    context.allocate(len(values), site)
+    return [convert(value) for value in values]
+
+
+def signed(values: Values) -> Values:
+    """`uint8_t` or `bool` as `int8_t`."""
+    return memoryview(bytes(values)).cast("b").tolist()
+
+
+def unsigned(values: Values) -> Values:
+    """`int8_t` or `bool` as `uint8_t`."""
+    return [value & 0xFF for value in values]
+
+
+def truths(values: Values) -> Values:
+    """Bytes as `bool`."""
+    return list(map(bool, values))
+
+
 def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
     """`count` new elements."""
     context.allocate(count * width, site)

@@ -105,6 +105,46 @@ def test_a_constant_in_a_pattern(
     assert process(text, message(kind, **other)).events == ()
 
 
+UINT8S, INT8S = "std_msgs/UInt8MultiArray", "std_msgs/Int8MultiArray"
+RECAST = [
+    (UINT8S, "char[] d", [200, 7], '"%d %d", d[0], d[1]', "-56 7"),
+    (UINT8S, "std::vector<int8_t> d", [255], '"%d", d[0]', "-1"),
+    (UINT8S, "std::vector<bool> d", [2, 0], '"%d %d", d[0] == true, d[1] == true', "1 0"),
+    (INT8S, "uint8_t[] d", [-1, 5], '"%d %d", d[0], d[1]', "255 5"),
+    (UINT8S, "uint8_t[] d", [200], '"%d", d[0]', "200"),
+]
+
+
+@pytest.mark.parametrize(("kind", "parameter", "data", "arguments", "text"), RECAST)
+def test_bytes_are_converted_one_by_one(
+    kind: str, parameter: str, data: list[int], arguments: str, text: str
+) -> None:
+    """An array of bytes bound to one of another kind of byte has the values that C++ gives each of them."""
+    assert (
+        log_of(event(kind, parameter, "data:d", f"ROS_INFO({arguments});"), message(kind, data=data)) == text
+    )
+
+
+WRITTEN_BYTES = [
+    (UINT8S, "char[] d", [1, 2], "d[0] = -1;", [255, 2]),
+    (INT8S, "uint8_t[] d", [-1, 2], "d[1] = 200;", [-1, -56]),
+    (UINT8S, "std::vector<bool> d", [0, 7], "d[0] = true;", [1, 1]),
+    (UINT8S, "uint8_t[] d", [1], "std::vector<int8_t> v; v.push_back(-3); d = v;", [253]),
+    (UINT8S, "uint8_t[] d", [1], "std::vector<char> v{-3}; d = true ? d : v; d[0]++;", [2]),
+    (INT8S, "int8_t[] d", [1], "std::vector<std::vector<uint8_t> > v; std::vector<std::vector<char> > c{{-3}}; v = c; d[0] = v[0][0] == 253;", [1]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "parameter", "data", "body", "written"), WRITTEN_BYTES)
+def test_bytes_are_converted_where_they_are_written(
+    kind: str, parameter: str, data: list[int], body: str, written: list[int]
+) -> None:
+    """What is assigned to an array of bytes is sent as C++ converts it, and is no fault."""
+    outcome = process(event(kind, parameter, "data:d", body), message(kind, data=data))
+    assert not outcome.faults, outcome.faults
+    assert list(fields(kind, bytes(outcome.buffer)).data) == written
+
+
 BAD_CONSTANTS = [
     ("std_msgs/Int32", "data:2.5", "a field of type int cannot hold 2.5"),
     ("std_msgs/UInt8", "data:256", "a field of type uint8_t cannot hold 256"),
