@@ -280,7 +280,7 @@ def test_a_flood_of_one_host_is_slowed_and_others_are_not(
 def test_hosts_beyond_those_that_are_counted_share_one_limit(
     lab: Lab, protected: Host, attacker: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """nft: when every bucket is taken, further hosts have one together; who has one keeps it, and nobody is unlimited."""
+    """nft: when every bucket is taken, further hosts have one together; who has one keeps it."""
     monkeypatch.setattr("appliance.network.firewall.nft._METER_SIZE", 1)
     others = [lab.host(f"other{number}", f"10.77.0.{number}/24", f"fd77::{number}/64") for number in (11, 12)]
     firewall = Firewall(protected.namespace, "nft")
