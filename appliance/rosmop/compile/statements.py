@@ -219,7 +219,8 @@ def _return_value(scope: Scope, node: tree.Return) -> None:
 def _drop(scope: Scope, node: tree.Statement) -> None:
     if scope.drop_refused is not None:
         raise SpecificationError.at(node.position, f"`DROP;` cannot stand here: {scope.drop_refused}")
-    scope.lines.add("m.dropped = True")
+    guard = "if m is not None: " if scope.role == "handler" else ""  # a timeout has no message
+    scope.lines.add(f"{guard}m.dropped = True")
 
 
 def _reset(scope: Scope, node: tree.Statement) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.rosmop.acting import act, refused_action
+from tests.unit.rosmop.acting import act, load, message, refused_action
 
 
 def printed(body: str, *, before: str = "", data: int = 0) -> str:
@@ -57,6 +57,22 @@ def test_a_switch_falls_through_until_a_break(data: int, lines: str) -> None:
 def test_a_switch_without_a_fitting_case_does_nothing() -> None:
     """Without `default` nothing runs."""
     assert printed('switch (x) { case 1: ROS_INFO("one"); }', data=3) == ""
+
+
+def test_a_drop_in_a_state_that_a_timeout_enters_has_nothing_to_drop_then() -> None:
+    """With a message it drops the message; at the timeout there is none, and the handler goes on."""
+    text = (
+        "s() { event e() /t std_msgs/Int32 '{}' { } "
+        'tfsm: s0 [ e -> s1 ] s1 [ e -> late, timeout 1s -> late ] late [ e -> s1 ] @late { DROP; ROS_INFO("late"); } }'
+    )
+    monitors = load(text)
+    results = [monitors.process("/t", message("std_msgs/Int32"), at).result for at in (1, 2)]
+    assert results == ["passed", "dropped"]
+    monitors = load(text)
+    monitors.process("/t", message("std_msgs/Int32"), 1)
+    (outcome,) = monitors.advance(2 * 10**9)
+    assert not outcome.faults, outcome.faults
+    assert [line.text for line in outcome.log] == ["late"]
 
 
 def test_continue_in_a_switch_is_that_of_the_loop() -> None:
