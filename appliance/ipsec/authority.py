@@ -148,7 +148,7 @@ def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519Public
     try:
         parsed = x509.load_pem_x509_csr(request)
         key, signed = parsed.public_key(), parsed.is_signature_valid
-    except (ValueError, TypeError, UnsupportedAlgorithm, InvalidSignature) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm, InvalidSignature, x509.InvalidVersion) as error:
         raise RequestRefusedError(f"not a signing request (PKCS #10) in PEM: {error}") from error
     if not signed:
         raise RequestRefusedError("the signing request is not signed by the key that is in it")

@@ -7,6 +7,7 @@ Invariants:
    signs only audit checkpoints, certificates of the appliance's own authority and its list of revoked ones.
 3. It remembers what it signed (`checkpoints.py`) and signs no second past; `rosrv audit verify` holds the log
    against that memory, so cutting the log's end or taking its signatures away is found.
+4. Every signing request is answered, whatever it does to the parser: what else was read with it is served.
 """
 
 import asyncio
@@ -135,6 +136,10 @@ class Signer:
             )
         except RequestRefusedError as error:
             return CertificateRefused(wanted.number, str(error))
+        except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever they do to the parser, it is answered
+            return CertificateRefused(
+                wanted.number, f"the signing request cannot be used: {type(error).__name__}: {error}"
+            )
         return CertificateMade(wanted.number, issued.certificate, issued.serial, issued.expires)
 
 

@@ -2,7 +2,8 @@
 
 Invariants:
 
-1. A token is used up before the authority is asked, and is good again only when the fault was not its bearer's.
+1. A token is used up before the authority is asked, and is good again when no certificate was made: its bearer may
+   come with a better request. When its name was revoked meanwhile it is good for nothing any more.
 2. Who renews is at the virtual address of the name he says, which the firewall takes through IPsec only, and has the
    name's present key.
 3. Until the host says that the next certificate is in place, the present one is good: a host that is cut off in the

@@ -1,5 +1,6 @@
 """Tests of the certificate authority: what it makes, what it refuses, how it keeps its key."""
 
+import base64
 import datetime
 import stat
 from pathlib import Path
@@ -82,6 +83,22 @@ def test_what_is_no_request_is_refused(tmp_path: Path, request_text: bytes) -> N
     """Rubbish is refused with a reason."""
     with pytest.raises(RequestRefusedError, match="not a signing request"):
         Authority(tmp_path).issue(request_text, "ocu-1", 90)
+
+
+def with_another_version(request: bytes) -> bytes:
+    """The same request saying that it is of version 3 (PKCS #10 knows the first only, written as 0)."""
+    der = x509.load_pem_x509_csr(request).public_bytes(Encoding.DER)
+    start = der.index(b"\x02\x01\x00")
+    text = base64.encodebytes(der[:start] + b"\x02\x01\x02" + der[start + 3 :])
+    return b"-----BEGIN CERTIFICATE REQUEST-----\n" + text + b"-----END CERTIFICATE REQUEST-----\n"
+
+
+def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
+    """A version that there is not is what is wrong with the request, in words."""
+    authority = Authority(tmp_path)
+    request = with_another_version(request_of(ec.generate_private_key(ec.SECP384R1())))
+    with pytest.raises(RequestRefusedError, match="not a signing request"):
+        authority.issue(request, "ocu-1", 90)
 
 
 def test_limits_of_a_request(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Tests of the signer as a process of its own, spoken to over its lifeline and its link."""
 
+import asyncio
 import contextlib
 import os
 import select
@@ -47,7 +48,8 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
-from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE
+from appliance.ipsec.authority import Authority
+from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle
 
 _LIMIT_SECONDS = 30
@@ -223,6 +225,50 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     assert result.signed_checkpoints >= 5
     assert read_remembered(tmp_path / "signer", result.log) is not None
     assert not search(path, Filter(event="signature refused")).entries
+
+
+def test_whatever_a_request_does_to_the_parser_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error that nobody thought of is a refusal in words, and what was read with the request is answered too."""
+
+    class OddError(Exception):
+        """Of no kind that is expected."""
+
+    def fail(*_arguments: object, **_named: object) -> None:
+        raise OddError("something is odd")
+
+    async def work() -> None:
+        (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
+        own = Channel(child, Lifeline)
+        authority = Authority(tmp_path)
+        monkeypatch.setattr(authority, "issue", fail)
+        signer = Signer(own, tmp_path, load_or_create_key(tmp_path), authority)
+        running = asyncio.create_task(signer.run())
+        supervisor, link = Channel(lifeline, Lifeline), Channel(ours, SignerLink)
+        supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
+        theirs.close()
+        link.send(CertificateWanted(1, b"x", "a", 1))
+        link.send(AuthorityWanted(2))
+        heard: list[Any] = []
+        both = asyncio.Event()
+
+        def hear_one(message: Any, _descriptors: tuple[int, ...]) -> None:
+            heard.append(message)
+            if len(heard) == 2:
+                both.set()
+
+        link.attach(asyncio.get_running_loop(), hear_one, both.set)
+        await asyncio.wait_for(both.wait(), _LIMIT_SECONDS)
+        assert isinstance(heard[0], CertificateRefused)
+        assert "something is odd" in heard[0].reason
+        assert isinstance(heard[1], AuthorityStated)
+        supervisor.send(Stop())
+        await asyncio.wait_for(running, _LIMIT_SECONDS)
+        for one in (own, supervisor, link):
+            one.close()
+
+    asyncio.run(work())
 
 
 def test_certificates_over_the_link(tmp_path: Path) -> None:
