@@ -4,7 +4,8 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
-A `Publisher` keeps at it while somebody wants the topic; a success resets the wait.
+A `Publisher` keeps at it while somebody wants the topic. A flow of more than `retry_longest` resets the wait: one that
+answers its header and then closes, or breaks the protocol, is waited for ever longer.
 """
 
 import socket
@@ -45,6 +46,7 @@ class Publisher:
         self._wanted = False
         self._asked = False
         self._failures = 0
+        self._flowing = 0.0  # since when
         self._timer: Timer | None = None
         self._linger: Timer | None = None
         self._pause: Timer | None = None
@@ -197,7 +199,7 @@ class Publisher:
         self._stream = None
         self._socket = sock
         self._objected = ""
-        self._failures = 0
+        self._flowing = self._clock()
         self._set_timer(0, None)
         self._loop.watch(sock.fileno(), READ, self._ready)
         self._recv_into = sock.recv_into
@@ -265,6 +267,8 @@ class Publisher:
             self._pause.cancel()
             self._pause = None
         if self._socket is not None:
+            if self._clock() - self._flowing > self._limits.retry_longest:
+                self._failures = 0
             self._loop.discard(self._socket)
             self._socket = None
             self._receiver.abandon()

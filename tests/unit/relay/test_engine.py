@@ -41,6 +41,7 @@ from appliance.relay.engine import Engine
 from appliance.relay.limits import MIB, Limits
 from appliance.relay.links import Link
 from appliance.relay.loop import Loop
+from appliance.relay.upstream import Publisher
 from appliance.ros.tcpros import (
     HeaderParser,
     encode_frame,
@@ -451,6 +452,34 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
     assert ("header cannot be read" in unreadable.reason, unreadable.violation) == (True, "malformed")
     world.upstream()
     assert world.gets_header(subscriber) == HEADER
+
+
+def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays(world: World) -> None:
+    """An answered header is no success: each try would cost a call of the node and a record, ten times a second."""
+    world.connect(encode_header(ASK))
+    waits = []
+    for _ in range(6):
+        world.upstream().sock.close()
+        world.hears(UpstreamLost)
+        began = time.monotonic()
+        world.until(lambda: any(isinstance(one, UpstreamWanted) for one in world.told))
+        waits.append(time.monotonic() - began)
+    assert waits[-1] > 10 * LIMITS.retry_first
+    patient = World(replace(LIMITS, retry_longest=0.05))
+    patient.connect(encode_header(ASK))
+    for _ in range(3):
+        patient.upstream().sock.close()
+        patient.hears(UpstreamLost)
+    staying = patient.upstream()
+    ends = time.monotonic() + 0.1
+    patient.until(lambda: time.monotonic() > ends)
+    ((_topic, publisher),) = patient.engine._topics.values()
+    assert isinstance(publisher, Publisher)
+    assert publisher._failures == 3
+    staying.sock.close()
+    patient.hears(UpstreamLost)
+    assert publisher._failures == 1
+    patient.close()
 
 
 @pytest.mark.parametrize("host", ["robot.local", "", "10.0.0", "127.0.0.1\0"])
