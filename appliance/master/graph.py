@@ -137,7 +137,13 @@ class Graph:
         )
 
     def returned(self, incarnation: Incarnation) -> list[Registration]:
-        """A lost node answers again; what it had, in order, to be put back at ROSMaster."""
+        """A lost node answers again; what it had, in order, to be put back at ROSMaster.
+
+        A service that another offers by now stays his: a service has one provider, the last.
+        """
+        for service in incarnation.resources(Kind.SERVICE):
+            if self._others_offer(incarnation, service):
+                self.unregistered(incarnation, Kind.SERVICE, service)
         registrations = self._registry.revive(incarnation, time.time())
         self._relay.node_returned(incarnation)
         for registration in registrations:

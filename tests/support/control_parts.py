@@ -152,6 +152,8 @@ class HiddenMaster:
     def _change(self, how: str, kind: Kind, name: str, resource: str, *rest: str) -> Answer:
         table = self.tables[kind].setdefault(resource, {})
         if how == "register":
+            if kind is Kind.SERVICE:
+                table.clear()  # it keeps the last provider
             table[name] = rest[0] if kind is Kind.SERVICE else rest[-1]
             self.nodes[name] = rest[-1]
             return [1, "", []]
