@@ -41,6 +41,7 @@ class Plan(msgspec.Struct, frozen=True):
     secret: str | None = None
     argv: tuple[str, ...] = ()
     environment: dict[str, str] = {}
+    ended_early: int = 0
 
 
 def title_of(role: str, index: int | None) -> str:
@@ -74,6 +75,7 @@ def _prepare(plan: Plan) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
+    privileges.be_ended_early(plan.ended_early)
     if not plan.network:
         offline.leave_network_if_allowed()
     privileges.drop(plan.account, parent=plan.parent, capabilities=plan.capabilities)

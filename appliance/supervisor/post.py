@@ -64,6 +64,7 @@ class Post:
             index=self.index if role.indexed else None,
             path=str(role.path(facts)) if role.path else None,
             capabilities=role.capabilities,
+            ended_early=role.ended_early,
             takes_secret=role.secret is not None,
             secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
         )

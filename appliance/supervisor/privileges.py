@@ -11,6 +11,7 @@ Invariants, in the order in which they are made true by `drop`:
 As a caller who is not root only 1 and 3 and `no_new_privs` apply; there is nothing else to give up.
 """
 
+import contextlib
 import ctypes
 import os
 import resource
@@ -54,6 +55,16 @@ def raise_file_limit(wanted: int) -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         return hard
     return wanted
+
+
+def be_ended_early(score: int) -> None:
+    """Where memory is short be ended before others by so much (`oom_score_adj`); never later than it is now.
+
+    To be called before the change of user, which closes the file. Where /proc is read-only the kernel goes by size.
+    """
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "r+") as file:  # noqa: PTH123  as below
+        if score > int(file.read()):
+            file.write(str(score))
 
 
 def leave_network() -> None:

@@ -53,6 +53,7 @@ class Role:
     `group` is the user whose group it is in instead of one of its own, to read what is `readable_by` that.
     `capabilities` are those of `privileges.SUPERVISORS` that it keeps. `secret` is a file that its user may not read:
     it is opened before the privileges are given up, and `entry` gets the descriptor (or None) as its last argument.
+    `ended_early`: how much sooner than others the kernel ends it where memory is short (`oom_score_adj`, 0 to 1000).
     """
 
     name: str
@@ -75,6 +76,7 @@ class Role:
     capabilities: tuple[str, ...] = ()
     group: str | None = None
     secret: Callable[[Facts], Path | None] | None = None
+    ended_early: int = 0
 
 
 def roles_of(
@@ -119,6 +121,7 @@ def roles_of(
             user="rosrv-relay",
             part="relay",
             entry="appliance.supervisor.relay_entry:main",
+            ended_early=300,
             indexed=True,
             path=lambda facts: facts.config,
             links=("control",),
@@ -129,6 +132,7 @@ def roles_of(
             user="rosrv",
             part="control",
             entry="appliance.master.process:main",
+            ended_early=100,
             path=lambda facts: facts.config,
             links=("relay", "signer", "api", "charon", "syslog"),
             files=65_536,
@@ -153,6 +157,7 @@ def roles_of(
             user="rosrv-api",
             part="api",
             entry="appliance.api.process:main",
+            ended_early=800,
             path=lambda facts: facts.config,
             links=("control",),
             after="control",
@@ -176,6 +181,7 @@ def roles_of(
             user="rosrv-syslog",
             part="syslog",
             entry="appliance.forwarding.process:main",
+            ended_early=600,
             path=lambda facts: facts.config,
             links=("control",),
             after="control",

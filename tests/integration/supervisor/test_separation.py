@@ -66,6 +66,17 @@ def test_there_is_something_to_find(appliance: Appliance) -> None:
         assert (appliance.state / name).is_file(), name
 
 
+def test_who_is_ended_first_when_memory_ends(appliance: Appliance) -> None:
+    """What strangers can flood and the others can do without goes first; the supervisor and the signer last."""
+    scores = {
+        row["role"]: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
+        for row in appliance.status()["processes"]
+    }
+    own = scores["supervisor"]
+    assert scores["api"] > scores["relay"] > scores["control"] > own
+    assert scores["rosmaster"] == scores["signer"] == own
+
+
 def test_nothing_in_a_part_is_run_at_the_next_start() -> None:
     """Code that a fallen process, or a backup, put where Python looks in a user's home is not loaded by any process."""
     need_root()

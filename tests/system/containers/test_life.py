@@ -188,7 +188,7 @@ def test_a_hanging_process_is_ended_by_the_right_to_kill(alone: Compose) -> None
 
 
 def test_no_other_right_is_given(alone: Compose) -> None:
-    """Rights, memory, processes: the list in compose.yaml is what these tests prove to be needed, and no more is given."""
+    """The list in compose.yaml is exactly what these tests prove to be needed, the engine gives no more; nor memory."""
     proven = {
         "NET_ADMIN",
         "SETUID",
