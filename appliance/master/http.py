@@ -3,8 +3,9 @@
 httptools (llhttp) parses; this module bounds. Invariants:
 
 1. Nothing is buffered beyond the limits: head 64 KiB within 10 s, body by `Limits.body`, one request in
-   flight per connection (reading pauses meanwhile), one response in the write buffer (the next request is not
-   served before it is sent). What all connections of a host hold together is bounded, too.
+   flight per connection (reading pauses meanwhile; those that came with it in one piece wait), one response in the
+   write buffer (the next request is not served before it is sent). What all connections of a host hold together is
+   bounded, too: bodies, requests that wait, answers.
 2. A connection that makes no progress is closed by the sweep, whatever state it is in.
 3. An address that no rule names is answered before its body is read.
 4. Hosts are served in turn (`turns`): one host has at most `slots_per_host` requests being served.
@@ -31,6 +32,9 @@ _log = structlog.get_logger()
 FIELD_FRAMING = len(
     ": \r\n"
 )  # of a header field: a head of many short ones is as long as the bytes it came in
+_REQUEST_BYTES = (
+    400  # about what a request takes beside its body and its path: small ones may come by the thousand
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +229,7 @@ class _Connection(asyncio.Protocol):
         if self._counted:
             self.server.visitors.leave(self.peer.host)
             self._counted = False
-            self._release(len(self._body) + self._unsent + sum(len(one.body) for one, _ in self._pending))
+            self._release(len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending))
             self._body, self._unsent = bytearray(), 0
         self.server.visitors.connections.discard(self)
         self._pending.clear()
@@ -335,6 +339,10 @@ class _Connection(asyncio.Protocol):
     def on_message_complete(self) -> None:
         if self._closing:
             return
+        too_much = self.server.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
+        if too_much is not None:
+            self._reject(b"503 Service Unavailable", f"sent a request while {too_much}")
+            return
         self._in_request = False
         body, self._body = bytes(self._body), bytearray()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), body, time.monotonic_ns())
@@ -364,7 +372,7 @@ class _Connection(asyncio.Protocol):
             status, body = await self._answer(request)
         finally:
             self._busy = None
-            self._release(len(request.body))
+            self._release(_held_by(request))
         if self._closing:
             return
         self._write(status, body, keep=keep)
@@ -439,6 +447,10 @@ class _Connection(asyncio.Protocol):
         """Cut the connection now."""
         self._closing = True
         self._transport.abort()
+
+
+def _held_by(request: HttpRequest) -> int:
+    return _REQUEST_BYTES + len(request.path) + len(request.body)
 
 
 def plain_address(text: str) -> Address:
