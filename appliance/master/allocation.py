@@ -78,6 +78,11 @@ class Allocation:
         """The relay that has a file of specifications."""
         return self._plan.files.get(file, 0)
 
+    @property
+    def resources(self) -> set[Resource]:
+        """The topics and services that have a place of their own, not by their name."""
+        return set(self._plan.resources)
+
     def restore(self, text: str) -> bool:
         """Take the allocation that was kept; False if it is of another number of relays, or unreadable."""
         try:

@@ -84,8 +84,9 @@ class Stating:
         self._now = now
         if restarted:
             self._known = set(range(self.allocation.relays))
-        if not (restarted and self.allocation.restore(kept)):
-            self.allocation.adopt(self.allocation.plan(now.checked))
+        carried = self.allocation.resources if restarted and self.allocation.restore(kept) else ()
+        # what was kept may be of a change that control did not survive: then it is made to fit, as little as can be
+        self.allocation.adopt(self.allocation.plan(now.checked, carried))
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
         """What a relay is told before anything else; one that follows another must hold what is to be held."""

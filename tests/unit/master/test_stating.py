@@ -302,3 +302,21 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
     log.close()
+
+
+async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_without_its_monitors(
+    world: World,
+) -> None:
+    """The allocation of a removal was kept, its revision was not: the monitor is in force, and where its topic goes."""
+    kept: list[str] = []
+    allocation = Allocation(2, kept.append)
+    names = [f"/t{number}" for number in range(20)]
+    files = {f"x{number}": spec(f"x{number}", name) for number, name in enumerate(names)}
+    before = revision(1, **files)
+    allocation.adopt(allocation.plan(before.checked))
+    allocation.adopt(allocation.plan(revision(2).checked))
+    recorder = world.stating._recorder
+    after = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+    after.start(before, restarted=True, kept=kept[-1])
+    for number, name in enumerate(names):
+        assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)
