@@ -209,10 +209,12 @@ class Middle:
         return self.telling.rows(self.monitors.monitors, self.now()) if self.monitors is not None else []
 
     def _service(self, key: str, service: str, part: str, body: bytes) -> Judged:
-        if self.blocked or self.spent > LONGEST:
-            return Judged(b"", self.blocked or TOO_LONG)
+        if self.blocked:
+            return Judged(b"", self.blocked)
         if self.monitors is None or not self._serves(service):
             return Judged(body)
+        if self.spent > LONGEST:
+            return Judged(b"", TOO_LONG)
         self.look_again()
         place, now, began = (key, service), self.now(), time.thread_time()
         view = memoryview(body)

@@ -20,6 +20,7 @@ from appliance.channel.messages import (
     SpecificationsStated,
     SpecificationsTaken,
 )
+from appliance.relay.lane import TOO_LONG
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.unit.relay.test_engine import ASK, HEADER, LOOPBACK, Peer, World
 
@@ -432,6 +433,16 @@ def test_a_request_that_is_refused_never_reaches_the_service(world: Monitored) -
     once, _service = _called(world, persistent=False)
     once.send(encode_frame(b"\x00"))
     assert b"it is open" in world.ends(once)
+
+
+def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Monitored) -> None:
+    """Those of other topics have taken too long: only what they would have to judge is refused."""
+    world.load(LATCH)
+    middle = world.engine._middle
+    middle.spent = 99.0
+    assert middle.request("k", "/plain", b"x").body == b"x"
+    assert middle.request("k", "/mode", b"\1").refused == TOO_LONG
+    assert middle.response("k", "/plain", b"y").body == b"y"
 
 
 def test_a_service_with_another_definition_is_refused(world: Monitored) -> None:
