@@ -41,11 +41,13 @@ else
 fi
 
 end() { date -u -d "$(openssl x509 -in "$1" -noout -enddate | cut -d= -f2)" +%s; }
+# OpenSSL 3.2 and later print no spaces around the equals sign.
+name_in() { openssl x509 -in "$1" -noout -subject | sed -n 's/.*CN *= *\([^ ,]*\)$/\1/p'; }
 # A certificate that was renewed since this kit was made is not replaced by the kit's, which is revoked by now.
 renewed() {
     [ -s /etc/swanctl/x509/rosrv.pem ] && [ -s /etc/swanctl/private/rosrv.key ] \
         && cmp -s swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem \
-        && openssl x509 -in /etc/swanctl/x509/rosrv.pem -noout -subject | grep -q "CN = @name@\$" \
+        && [ "$(name_in /etc/swanctl/x509/rosrv.pem)" = "@name@" ] \
         && [ "$(end /etc/swanctl/x509/rosrv.pem)" -gt "$(end swanctl/x509/rosrv.pem)" ]
 }
 

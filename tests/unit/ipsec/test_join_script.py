@@ -1,0 +1,80 @@
+"""Tests of the kit's `join.sh`: which certificate is in place when it has run again.
+
+The part of the script that decides runs as it is, on a folder of its own in the place of `/etc/swanctl`; `openssl` is
+the real one, with the spelling of the version that is tested.
+"""
+
+import os
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from appliance.ipsec.authority import Authority
+from appliance.ipsec.kit import filled
+from appliance.ipsec.requests import make_key, signing_request
+
+SPELLINGS = {"before 3.2": "s/CN *= */CN = /; s/O *= */O = /", "3.2": "s/CN *= */CN=/; s/O *= */O=/"}
+
+
+class Machine:
+    """A host with a kit, and the certificate of a renewal in place."""
+
+    def __init__(self, folder: Path, spelling: str) -> None:
+        self._folder, self._authority = folder, Authority(folder)
+        self._kit, self._etc, programs = folder / "kit/swanctl", folder / "etc", folder / "bin"
+        for root in (self._kit, self._etc):
+            for part in ("x509", "x509ca", "private"):
+                (root / part).mkdir(parents=True)
+            (root / "private/rosrv.key").write_bytes(make_key())
+            (root / "x509ca/rosrv-ca.pem").write_bytes(self._authority.certificate)
+        programs.mkdir()
+        real = shutil.which("openssl")
+        assert real is not None
+        (programs / "openssl").write_text(f"#!/bin/sh\n{real} \"$@\" | sed '/^subject/{{{spelling}}}'\n")
+        (programs / "openssl").chmod(0o755)
+        self._path = f"{programs}:{os.environ['PATH']}"
+
+    def put(self, where: str, name: str, days: float) -> None:
+        """A certificate in the kit, or in place."""
+        made = self._authority.issue(signing_request(make_key(), name), name, days).certificate
+        root = self._kit if where == "kit" else self._etc
+        (root / "x509/rosrv.pem").write_bytes(made)
+
+    def keeps_what_is_in_place(self) -> bool:
+        """What join.sh decides."""
+        text = filled("join.sh", defaultdict(str, name="laptop"))
+        begin, end = text.index("end() {"), text.index("\n}\n", text.index("renewed() {")) + 3
+        script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"
+        done = subprocess.run(
+            ["sh", "-eu", "-c", script],
+            cwd=self._kit.parent,
+            env={"PATH": self._path},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.stderr == ""
+        return done.returncode == 0
+
+
+@pytest.mark.parametrize("openssl", SPELLINGS)
+def test_a_renewed_certificate_stays(tmp_path: Path, openssl: str) -> None:
+    """join.sh run again leaves the later certificate of this name in place, however openssl writes a name."""
+    machine = Machine(tmp_path, SPELLINGS[openssl])
+    machine.put("kit", "laptop", 10)
+    machine.put("etc", "laptop", 20)
+    assert machine.keeps_what_is_in_place()
+
+
+@pytest.mark.parametrize("openssl", SPELLINGS)
+@pytest.mark.parametrize(("name", "days"), [("laptop-2", 20), ("my-laptop", 20), ("laptop", 5)])
+def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: str, days: float) -> None:
+    """One in another name, or that ends before the kit's, gives way to the kit's."""
+    machine = Machine(tmp_path, SPELLINGS[openssl])
+    machine.put("kit", "laptop", 10)
+    machine.put("etc", name, days)
+    assert not machine.keeps_what_is_in_place()
