@@ -1,6 +1,7 @@
 #!/bin/sh
 # Renews the certificate of @name@ through the tunnel when a third of its life is left, and gets the list of revoked
-# certificates anew. Run daily by rosrv-renew.timer (or keep.sh, where there is no systemd). --now: whatever is left.
+# certificates anew. Run every hour, by rosrv-renew.timer or (where there is no systemd) a loop in the background that
+# join.sh starts. --now: whatever is left.
 set -eu
 
 rest="@rest@"
