@@ -184,10 +184,16 @@ class RelayControl:
             _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
 
     def withdraw_moving(self, moves: Iterable[Move]) -> None:
-        """Stop carrying what is about to be carried by another relay; the allocation is still the old one."""
+        """Stop carrying what is about to be carried by another relay; the allocation is still the old one.
+
+        Its grants go, too: one that is revoked later is revoked where it is carried then, and may come back.
+        """
         for move in moves:
+            post = self._posts[move.source]
             for incarnation in self._registry.registered(_KINDS[move.kind], move.name):
-                _withdraw(self._posts[move.source], incarnation, _KINDS[move.kind], move.name)
+                _withdraw(post, incarnation, _KINDS[move.kind], move.name)
+                for row in self._rows_of(incarnation, move):
+                    _revoke(post, row)
 
     def place_moved(self, moves: Iterable[Move]) -> None:
         """Carry what has moved, with its grants; the allocation is the new one."""
@@ -196,9 +202,12 @@ class RelayControl:
             for incarnation in self._registry.registered(kind, move.name):
                 detail = incarnation.registrations[kind, move.name].detail
                 self._place_one(post, incarnation, kind, move.name, detail)
-                for row in self._permissions.get(incarnation.key, ()):
-                    if (row.kind, row.resource) == (move.kind, move.name):
-                        self._state(row)
+                for row in self._rows_of(incarnation, move):
+                    self._state(row)
+
+    def _rows_of(self, incarnation: Incarnation, move: Move) -> list[PermissionRow]:
+        rows = self._permissions.get(incarnation.key, ())
+        return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
 
     def node_withdrawn(self, incarnation: Incarnation) -> None:
         """The incarnation is gone (for now): nothing of it is carried."""
@@ -281,11 +290,7 @@ class RelayControl:
         rows = self._permissions.get(row.key, set())
         rows.discard(row)
         self._drop(row)
-        post = self._post(row.kind, row.resource)
-        if row.kind == TOPIC:
-            post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
-        else:
-            post.send(messages.ClientRevoked(row.key, row.resource, row.host))
+        _revoke(self._post(row.kind, row.resource), row)
 
     def revoke_subscriber(self, host: Address, caller_id: str, topic: str) -> None:
         """The subscriber gave the topic up: its grants for it, on every publisher, are gone."""
@@ -347,6 +352,13 @@ def _withdraw(post: RelayPost, incarnation: Incarnation, kind: Kind, resource: s
         post.send(messages.PublicationWithdrawn(incarnation.key, resource))
     else:
         post.send(messages.ServiceWithdrawn(incarnation.key, resource))
+
+
+def _revoke(post: RelayPost, row: PermissionRow) -> None:
+    if row.kind == TOPIC:
+        post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
+    else:
+        post.send(messages.ClientRevoked(row.key, row.resource, row.host))
 
 
 def tcpros_port(answer: Value) -> int:

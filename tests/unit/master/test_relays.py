@@ -161,12 +161,35 @@ async def test_a_topic_moves_with_its_grants() -> None:
     relay.withdraw_moving(moves)
     world.put(left=0, right=0)
     relay.place_moved(moves)
-    assert second.heard() == [messages.PublicationWithdrawn("key", "/right")]
+    assert second.heard() == [
+        messages.PublicationWithdrawn("key", "/right"),
+        messages.GrantRevoked("key", "/right", "10.0.0.5", "/ear"),
+    ]
     assert first.heard() == [
         messages.PublicationPlaced("key", "/right", "std_msgs/String"),
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
     ]
     assert relay.port(world.node, Kind.PUBLICATION, "/right") == 2
+    world.close()
+
+
+async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -> None:
+    """Not on the relay it came from either, should the topic come back to it; so it is with a service."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_service(world.node, "/serve", HOST)
+    first.heard()
+    away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
+    relay.withdraw_moving(away)
+    assert messages.ClientRevoked("key", "/serve", "10.0.0.5") in first.heard()
+    world.allocation.adopt(Plan({}, {(SERVICE, "/serve"): 1}))
+    relay.place_moved(away)
+    relay.revoke(relay.permissions()[0])
+    assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5")
+    relay.withdraw_moving(back)
+    world.put()
+    relay.place_moved(back)
+    assert first.heard() == [messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001)]
     world.close()
 
 
