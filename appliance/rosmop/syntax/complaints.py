@@ -123,6 +123,7 @@ _SITUATIONS: tuple[tuple[Set[str], str, str], ...] = (
     ({"FORMULA"}, "", "a formula"),
     ({"$END"}, "", "a specification `name() { … }` or the end of the file"),
     ({"NUMBER", "STRING", "NAME"}, "RPAR", "an expression"),
+    ({"SEMICOLON", "COMMA", "EQUAL", "LBRACE"}, "", "`;` (or a value, `= …`)"),
 )
 
 

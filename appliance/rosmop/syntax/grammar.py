@@ -148,7 +148,7 @@ character: CHARACTER
 
 // Tokens
 NAME: /[A-Za-z_][A-Za-z_0-9]*/
-MODIFIER.5: /[A-Za-z_]\w*(?=\s+([A-Za-z_]\w*\s+){0,3}event\s+[A-Za-z_])/
+MODIFIER.5: /(creation|static|unsynchronized|decentralized|perthread|suffix)(?=\s+((creation|static|unsynchronized|decentralized|perthread|suffix)\s+)*event\s+[A-Za-z_])/
 BUILTIN.3: /(void|bool|char|short|int|long|float|double|signed|unsigned)(?!\w)/
 VECTOR.3: /(std\s*::\s*)?vector(?=\s*<)/
 LIMITS.3: /(std\s*::\s*)?numeric_limits(?=\s*<)/

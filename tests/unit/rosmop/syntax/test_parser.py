@@ -194,6 +194,10 @@ REFUSALS = [
         "found `String`, expected a message type such as `std_msgs/String`",
     ),
     ("a() { event x() '{}' { } }", 1, 17, "found `'`, expected"),
+    ("a() { int n\nevent x() /t p/T '{}' { } }", 2, 1, "found `event`, expected `;`"),
+    ("a() { static int n\nevent x() /t p/T '{}' { } }", 2, 1, "found `event`, expected `;`"),
+    ("a() { int n, m\ncreation event x() /t p/T '{}' { } }", 2, 1, "found `creation`, expected `;`"),
+    ("a() { event x() /t p/T " + "/" * 5000 + "\n", 1, 20, "expected a message type"),
     (
         "a() { event x() every 3 parsec { } }",
         1,
