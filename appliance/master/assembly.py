@@ -19,7 +19,7 @@ from appliance.config import Settings
 from appliance.master import rosout
 from appliance.master.addresses import Addresses
 from appliance.master.core import Master
-from appliance.master.delivery import Delivery
+from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.doors import Doors, value_limits
 from appliance.master.faces import Faces
 from appliance.master.gate import Gate, HostLimits
@@ -119,9 +119,9 @@ class _Wires:
         self.master: Later[Master] = Later("the master")
         self.revocation: Later[Revocation] = Later("the revocation")
 
-    def node_troubled(self, incarnation: Incarnation, why: str) -> None:
-        _log.info("a node could not be told", node=incarnation.name, why=why)
-        self.liveness().look_at(incarnation)
+    def node_troubled(self, incarnation: Incarnation, call: NodeCall, why: str) -> None:
+        _log.info("a node could not be told", node=incarnation.name, call=call.method, why=why)
+        self.liveness().missed(incarnation, call)
 
     def look_at(self, incarnation: Incarnation) -> None:
         self.liveness().look_at(incarnation)

@@ -2,35 +2,64 @@
 
 A node that is slow or gone delays nobody else; ROSMaster's threads are answered before a node is called. Several
 lists of publishers for one topic are all delivered, because roscpp must see a removal before the addition that
-follows it. A call that fails is tried again a few times; then the node is looked at (`troubled`).
+follows it. A call that fails is tried again a few times; then it is dropped, and `troubled` hears of it: the node is
+looked at, and told what it has missed when it answers (`Liveness.missed`).
 """
 
 import asyncio
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import structlog
+from dataclasses import dataclass, field
 
 from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.master.registry import Incarnation
 from appliance.ros.xmlrpc import Limits, Value
 
-_log = structlog.get_logger()
 MASTER_NAME = "/master"
+_CALL_BYTES = 200  # a call with nothing in it, and a text with nothing in it, as Python keeps them
+_TEXT_BYTES = 60
 
 
 @dataclass(frozen=True, slots=True)
 class NodeCall:
-    """One call to a node: method and parameters after the caller's name, and about how many bytes it takes."""
+    """One call to a node: method and parameters after the caller's name.
+
+    `size` is about how many bytes it takes, where that is known; a list of publishers is measured here.
+    """
 
     method: str
     parameters: tuple[Value, ...]
     size: int = 0
 
+    @property
+    def weight(self) -> int:
+        """About how many bytes it takes while it waits."""
+        if self.size:
+            return self.size
+        texts = [one for given in self.parameters for one in (given if isinstance(given, list) else [given])]
+        return _CALL_BYTES + sum(_TEXT_BYTES + len(one) for one in texts if isinstance(one, str))
+
+
+@dataclass(slots=True)
+class _Queue:
+    """What waits for one node, each call with its weight, and their sum."""
+
+    incarnation: Incarnation
+    calls: deque[tuple[NodeCall, int]] = field(default_factory=deque)
+    weight: int = 0
+
+    def put(self, call: NodeCall, weight: int) -> None:
+        self.calls.append((call, weight))
+        self.weight += weight
+
+    def take(self) -> tuple[NodeCall, int]:
+        call, weight = self.calls.popleft()
+        self.weight -= weight
+        return call, weight
+
 
 class Delivery:
-    """The queues. `timeout` is seconds for one call.
+    """The queues. `timeout` is seconds for one call; `troubled(incarnation, call, why)` hears of a call that is lost.
 
     A queue holds at most `bound` calls, all together `bound_bytes`: beyond, the oldest go, of the queue that has most.
     """
@@ -40,7 +69,7 @@ class Delivery:
         *,
         timeout: float,
         limits: Limits,
-        troubled: Callable[[Incarnation, str], None],
+        troubled: Callable[[Incarnation, NodeCall, str], None],
         bound: int = 10_000,
         bound_bytes: int = 64 << 20,
         tries: int = 4,
@@ -50,30 +79,33 @@ class Delivery:
         self._troubled = troubled
         self._bound = bound
         self._bound_bytes = bound_bytes
-        self._bytes: Counter[str] = Counter()
-        self._bytes_in_all = 0
+        self._weight = 0  # of all queues
         self._tries = tries
-        self._queues: dict[str, deque[NodeCall]] = {}
+        self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
 
     @property
     def waiting(self) -> int:
         """How many calls wait, for all nodes together."""
-        return sum(map(len, self._queues.values()))
+        return sum(len(queue.calls) for queue in self._queues.values())
+
+    @property
+    def weight(self) -> int:
+        """About how many bytes they take."""
+        return self._weight
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         """Queue a call for a node."""
-        queue = self._queues.setdefault(incarnation.key, deque())
-        queue.append(call)
-        self._count(incarnation.key, call.size)
-        if len(queue) > self._bound:
-            self._take(incarnation.key)
-            self._troubled(incarnation, f"more than {self._bound} calls wait for it; the oldest was dropped")
-        while self._bytes_in_all > self._bound_bytes:
-            longest = max(self._bytes, key=lambda key: self._bytes[key])
-            self._take(longest)
-            _log.warning(
-                "calls that wait for a node take too much memory: the oldest is dropped", key=longest
+        queue = self._queues.setdefault(incarnation.key, _Queue(incarnation))
+        weight = call.weight
+        queue.put(call, weight)
+        self._weight += weight
+        if len(queue.calls) > self._bound:
+            self._lose(queue, f"more than {self._bound} calls wait for it")
+        while self._weight > self._bound_bytes:
+            heaviest = max(self._queues.values(), key=lambda one: one.weight)
+            self._lose(
+                heaviest, f"calls that wait take more than {self._bound_bytes} bytes, most for this node"
             )
         if incarnation.key not in self._workers:
             worker = asyncio.get_running_loop().create_task(self._work(incarnation))
@@ -81,20 +113,17 @@ class Delivery:
 
     def drop(self, incarnation: Incarnation) -> None:
         """Forget what waits for a node."""
-        while self._queues.get(incarnation.key):
-            self._take(incarnation.key)
-        self._queues.pop(incarnation.key, None)
+        queue = self._queues.pop(incarnation.key, None)
+        if queue is not None:
+            self._weight -= queue.weight
 
-    def _take(self, key: str) -> NodeCall:
-        call = self._queues[key].popleft()
-        self._count(key, -call.size)
+    def _lose(self, queue: _Queue, why: str) -> None:
+        self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
+
+    def _take(self, queue: _Queue) -> NodeCall:
+        call, weight = queue.take()
+        self._weight -= weight
         return call
-
-    def _count(self, key: str, size: int) -> None:
-        self._bytes_in_all += size
-        self._bytes[key] += size
-        if not self._bytes[key]:
-            del self._bytes[key]
 
     def close(self) -> None:
         """Stop delivering."""
@@ -107,8 +136,8 @@ class Delivery:
 
     async def _work(self, incarnation: Incarnation) -> None:
         try:
-            while self._queues.get(incarnation.key):
-                await self._deliver(incarnation, self._take(incarnation.key))
+            while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
+                await self._deliver(incarnation, self._take(queue))
             self._queues.pop(incarnation.key, None)
         finally:
             self._workers.pop(incarnation.key, None)
@@ -127,4 +156,4 @@ class Delivery:
             if attempt + 1 < self._tries:
                 await asyncio.sleep(pause)
                 pause *= 3
-        self._troubled(incarnation, failure)
+        self._troubled(incarnation, call, failure)

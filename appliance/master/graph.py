@@ -199,8 +199,11 @@ class Graph:
             self.renew(subscriber, topic, publishers)
 
     def remind(self, subscriber: Incarnation, topic: str) -> None:
-        """Give a subscriber its list of a topic once more."""
-        self._tell_one(subscriber, topic, always=True)
+        """Give a subscriber its list of a topic once more; an empty one when the policy took the topic from it."""
+        if (Kind.SUBSCRIPTION, topic) in subscriber.registrations:
+            self._tell_one(subscriber, topic, always=True)
+        elif (Kind.SUBSCRIPTION, topic) in subscriber.shelf:
+            self._empty(subscriber, topic)
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""

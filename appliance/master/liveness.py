@@ -8,13 +8,14 @@ answers again gets them back, because a ROS 1 node never registers twice.
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import structlog
 
 from appliance.master.client import CallFailedError, RefusedError, XmlRpcClient
+from appliance.master.delivery import NodeCall
 from appliance.master.graph import Graph
-from appliance.master.registry import Incarnation, Life, Registration, Registry
+from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RELAY_NAME
 from appliance.ros.xmlrpc import Limits
 
@@ -33,6 +34,15 @@ class LivenessSettings:
     silent: float = 20.0
     shadow: float = 600.0
     call: float = 3.0
+
+
+@dataclass(slots=True)
+class _Missed:
+    """What a node could not be told: topics, and whether it were parameters; when it was told again, monotonic."""
+
+    topics: set[str] = field(default_factory=set)
+    parameters: bool = False
+    made_up: float | None = None
 
 
 class Liveness:
@@ -60,6 +70,7 @@ class Liveness:
         self._put_back = put_back
         self._returned = returned
         self._answered: dict[str, float] = {}
+        self._missed: dict[str, _Missed] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._slots = asyncio.Semaphore(_AT_ONCE)
 
@@ -73,6 +84,7 @@ class Liveness:
             await asyncio.sleep(self._settings.interval)
             known = self._registry.all()
             self._answered = {one.key: self._answered[one.key] for one in known if one.key in self._answered}
+            self._missed = {one.key: self._missed[one.key] for one in known if one.key in self._missed}
             for incarnation in known:
                 self.look_at(incarnation)
 
@@ -86,6 +98,14 @@ class Liveness:
             task = asyncio.get_running_loop().create_task(self._look(incarnation))
             self._looks[incarnation.key] = task
             task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
+
+    def missed(self, incarnation: Incarnation, call: NodeCall) -> None:
+        """The node could not be told this: it is looked at, and told how things are once it answers."""
+        missed = self._missed.setdefault(incarnation.key, _Missed())
+        if call.method == "publisherUpdate":
+            missed.topics.add(str(call.parameters[0]))
+        missed.parameters |= call.method == "paramUpdate"
+        self.look_at(incarnation)
 
     async def is_gone(self, incarnation: Incarnation) -> bool:
         """Whether the node refuses connections or cannot be reached, asked now."""
@@ -122,6 +142,21 @@ class Liveness:
                 await self._lose(incarnation, why)
         else:
             await self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
+        if there and incarnation.life is Life.LIVE:
+            await self._make_up(incarnation)
+
+    async def _make_up(self, incarnation: Incarnation) -> None:
+        """Tell a node what it has missed: once in a while, for one that answers may still take no update."""
+        missed, now = self._missed.get(incarnation.key), time.monotonic()
+        if missed is None or (missed.made_up is not None and now - missed.made_up < self._settings.interval):
+            return
+        topics, parameters = missed.topics, missed.parameters
+        self._missed[incarnation.key] = _Missed(made_up=now)
+        for topic in sorted(topics):
+            self._graph.remind(incarnation, topic)
+        subscribed = [one for one in incarnation.registrations.values() if one.kind is Kind.PARAMETER]
+        if parameters and subscribed:
+            await self._tell(self._put_back, incarnation, subscribed)
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Whether it answers: True, False, or None when it refuses connections; and why."""

@@ -242,10 +242,11 @@ class Addresses:
 class ControlParts:
     """The parts, with an open policy; `reload(text)` brings another into force, `settle()` waits for what follows."""
 
-    def __init__(self, journal: Any = None) -> None:
+    def __init__(self, *, silent: float = 0.0) -> None:
+        """`silent` is seconds without an answer until a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
-        self.registry = Registry(journal if journal is not None else Nothing())
+        self.registry = Registry(Nothing())
         self.records, self.deliveries, self.relay = Records(), Deliveries(), Grants()
         self.hidden, self.faces, self.clients = HiddenMaster(), Inner(self.registry), Clients()
         self.closed: list[str] = []
@@ -279,10 +280,10 @@ class ControlParts:
         self.recorder = self.records
         self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
         self.redecide_for = self.revocation.redecide_for
-        self.liveness = self._make_liveness()
+        self.liveness = self._make_liveness(silent)
         self._serve = Pipeline(self.master, limits=Limits(), offload=1 << 20).handler(MASTER_CALLS)
 
-    def _make_liveness(self) -> Liveness:
+    def _make_liveness(self, silent: float) -> Liveness:
         async def withdraw_all(incarnation: Incarnation, registrations: list[Registration]) -> None:
             for one in registrations:
                 await withdraw(self.master, incarnation, one.kind, one.resource)
@@ -290,7 +291,7 @@ class ControlParts:
         liveness = Liveness(
             self.registry,
             self.graph,
-            LivenessSettings(silent=0.0),
+            LivenessSettings(silent=silent),
             Limits(),
             withdraw=withdraw_all,
             put_back=self.reconciler.put_back,

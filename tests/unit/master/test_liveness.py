@@ -2,8 +2,9 @@
 
 import pytest
 
+from appliance.master.delivery import NodeCall
 from appliance.master.registry import Kind, Life
-from tests.support.control_parts import ControlParts
+from tests.support.control_parts import POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
 
@@ -56,3 +57,46 @@ async def test_a_service_that_nobody_took_comes_back() -> None:
     world.clients.silent = set()
     await world.look(node)
     assert world.hidden.has(Kind.SERVICE, "/s") == ["/a"]
+
+
+async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None:
+    """A list that a short outage swallowed comes again, once, though nobody took the node for lost."""
+    world = ControlParts(silent=3600.0)
+    await world.round()
+    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/t")
+    await world.register(ear, Kind.SUBSCRIPTION, "/other")
+    await world.register(mouth, Kind.PUBLICATION, "/t")
+    world.deliveries.told.clear()
+    world.clients.silent = {"/ear"}
+    world.liveness.missed(ear, NodeCall("publisherUpdate", ("/t", [])))
+    await world.settle()
+    assert (lives(world), world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
+    world.clients.silent = set()
+    await world.look(ear)
+    await world.look(ear)
+    assert world.deliveries.told == [("/ear", "publisherUpdate", ("/t", [mouth.outer_uri("10.0.0.1")]))]
+
+
+async def test_a_node_that_answers_and_takes_no_list_is_not_told_without_end() -> None:
+    """It is told again once per look at it, not each time it fails."""
+    world = await parts()
+    ear = world.node("/ear", 1)
+    await world.register(ear, Kind.SUBSCRIPTION, "/t")
+    for _ in range(5):
+        world.liveness.missed(ear, NodeCall("publisherUpdate", ("/t", [])))
+        await world.settle()
+    assert world.deliveries.told == [("/ear", "publisherUpdate", ("/t", []))]
+
+
+async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
+    """The list of a topic that the policy took has nobody in it, also when it is told again."""
+    world = await parts()
+    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/secret")
+    await world.register(mouth, Kind.PUBLICATION, "/secret")
+    world.reload(POLICY.format("", "/secret=\n"))
+    world.deliveries.told.clear()
+    world.liveness.missed(ear, NodeCall("publisherUpdate", ("/secret", [])))
+    await world.settle()
+    assert world.deliveries.told == [("/ear", "publisherUpdate", ("/secret", []))]
