@@ -1,4 +1,4 @@
-"""charon as a child: started, provisioned over vici, watched. Blocking calls, for one thread at a time.
+"""charon as a child: started, provisioned over vici, watched. Blocking calls: the caller makes one at a time.
 
 Provisioning is a difference: what is wanted and was not loaded is loaded, what is no longer wanted is unloaded and its
 tunnel closed. A host whose certificate was replaced has its tunnel closed too: it comes back with the new one.
@@ -6,18 +6,28 @@ tunnel closed. A host whose certificate was replaced has its tunnel closed too: 
 
 import contextlib
 import socket
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vici import Session
-from vici.exception import CommandException
+from vici.exception import (
+    CommandException,
+    DeserializationException,
+    EventUnknownException,
+    SessionException,
+)
 
 from appliance.ipsec.strongswan import Tunnel, connection, connection_name, host_of, pool, proposals_of
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
+# Of vici's own, and what it raises for a value that is too long for it.
+_FAULTS = (
+    CommandException, SessionException, EventUnknownException, DeserializationException, struct.error, OSError,
+)  # fmt: skip
 
 
 class CharonError(Exception):
@@ -54,6 +64,10 @@ class Vici:
         self._loaded: dict[str, Tunnel] = {}
         self._material: Material | None = None
         self.proposals = proposals_of(self._key_exchanges())
+
+    def close(self) -> None:
+        """End the conversation."""
+        self._session.transport.close()
 
     def load_key(self, key: bytes) -> None:
         """Give charon the appliance's private key (PEM)."""
@@ -162,7 +176,7 @@ class Vici:
     def _said(self, what: str) -> Iterator[None]:
         try:
             yield
-        except (CommandException, OSError) as error:
+        except _FAULTS as error:
             raise CharonError(f"charon did not take {what}: {error}") from error
 
 

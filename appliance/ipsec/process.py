@@ -11,6 +11,7 @@ Invariants:
    ports 500 and 4500. It dies with this process.
 3. Nothing that a stranger sends is parsed here but charon's log, as lines of text, and at most
    `REFUSALS_PER_SECOND` of them are passed on.
+4. Of the calls that charon answers, one is made at a time: two on one session would read each other's answers.
 """
 
 import asyncio
@@ -19,9 +20,10 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import structlog
 
@@ -56,6 +58,8 @@ REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
 
+T = TypeVar("T")
+
 _log = structlog.get_logger()
 
 
@@ -72,6 +76,7 @@ class TunnelProcess:
         self._taken = 0
         self._charon: asyncio.subprocess.Process | None = None
         self._vici: Vici | None = None
+        self._one_at_a_time = asyncio.Lock()
         self._version = ""
         self._refusals = Refusals()
         self._packets: Counter[Refusal] = Counter()  # that ESP dropped since the last report
@@ -124,7 +129,7 @@ class TunnelProcess:
             vici = self._vici
             tunnels = [Tunnel(one.name, one.address, one.serial) for one in wanted.hosts]
             material = Material(wanted.address, wanted.authority, wanted.certificate, wanted.revocations)
-            await asyncio.to_thread(vici.provision, tunnels, material)
+            await self._in_turn(partial(vici.provision, tunnels, material))
             self._taken = wanted.number
             await self._say_how_it_stands(vici)
 
@@ -145,11 +150,15 @@ class TunnelProcess:
         )
         self._spawn(self._read_log(self._charon))
         vici = await self._connect(sock)
-        await asyncio.to_thread(vici.load_key, self._key)
-        self._version = await asyncio.to_thread(vici.version)
+        await self._in_turn(partial(vici.load_key, self._key))
+        self._version = await self._in_turn(vici.version)
         self._say_what_it_is(vici)
         self._loop.run_in_executor(None, self._listen, vici)
         return vici
+
+    async def _in_turn(self, call: Callable[[], T]) -> T:
+        async with self._one_at_a_time:
+            return await asyncio.to_thread(call)
 
     def _say_what_it_is(self, vici: Vici) -> None:
         self._tell(CharonStarted(self._version, vici.proposals.key_exchange))
@@ -203,7 +212,7 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: Vici) -> None:
-        rows = await asyncio.to_thread(vici.seen)
+        rows = await self._in_turn(vici.seen)
         self._tell(
             TunnelsReported(
                 self._taken,

@@ -1,0 +1,64 @@
+"""Tests of the conversation with charon: what it says that nobody expects is an error in words, of one kind."""
+
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from vici.protocol import Message, Packet
+
+from appliance.ipsec.charon import CharonError, Material, Vici
+
+
+class StandIn:
+    """A charon that answers every command with success; `events` is what it says to who registers for events."""
+
+    def __init__(self, path: Path) -> None:
+        self.events = bytes([Packet.EVENT_CONFIRM])
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(path))
+        self._listener.listen()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._listener.accept()
+        with connection, connection.makefile("rb") as stream:
+            while header := stream.read(4):
+                packet = stream.read(struct.unpack("!I", header)[0])
+                success = bytes([Packet.CMD_RESPONSE]) + Message.serialize({"success": "yes"})
+                answer = success if packet[0] == Packet.CMD_REQUEST else self.events
+                connection.sendall(struct.pack("!I", len(answer)) + answer)
+
+    def close(self) -> None:
+        """End it, after whoever speaks to it."""
+        self._thread.join()
+        self._listener.close()
+
+
+@pytest.fixture
+def charon(tmp_path: Path) -> Iterator[tuple[StandIn, Vici]]:
+    """A charon and the conversation with it."""
+    stand_in = StandIn(tmp_path / "vici.sock")
+    vici = Vici(tmp_path / "vici.sock")
+    yield stand_in, vici
+    vici.close()
+    stand_in.close()
+
+
+def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, Vici]) -> None:
+    """What the library calls an error of the session is one of ours, with what was asked for."""
+    stand_in, vici = charon
+    stand_in.events = bytes([Packet.CMD_RESPONSE])
+    with pytest.raises(CharonError, match="the list of tunnels"):
+        vici.seen()
+
+
+def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
+    """A value has 65,535 bytes at most: more is an error that names the list, and what was loaded before stays."""
+    _stand_in, vici = charon
+    vici.provision([], Material("10.113.11.1", b"authority", b"certificate", b"x" * 65_535))
+    with pytest.raises(CharonError, match="the list of revoked certificates"):
+        vici.provision([], Material("10.113.11.1", b"authority", b"certificate", b"x" * 65_536))
