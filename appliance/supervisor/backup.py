@@ -12,11 +12,11 @@ Invariants:
 
 import errno
 import os
-import shutil
 import sqlite3
 import stat
 import tarfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
@@ -26,6 +26,7 @@ from typing import BinaryIO
 from appliance.supervisor.backup_contents import (
     AUDIT_LOG,
     LARGEST,
+    MOST_FILES,
     BackupError,
     is_database,
     is_passing,
@@ -36,6 +37,7 @@ from appliance.supervisor.backup_database import copy_database
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 
+_PIECE = 1 << 20
 _HEADER, _HASH = 8, 32  # bytes, of the signer's memory
 _FORMAT = tarfile.GNU_FORMAT  # a large database has its size in the one header
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -110,6 +112,12 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
         if (state / part).exists()  # else a role that never ran here
         for name in _names(state, part)
     ]
+    if len(names) > MOST_FILES:
+        parts = Counter(name.partition("/")[0] for name in names)
+        raise BackupError(
+            f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: see who put them"
+            " there, and take them away"
+        )
     for name in sorted(names, key=lambda one: one != AUDIT_LOG):
         descriptor = _opened(state, name)
         if descriptor is not None:
@@ -158,7 +166,12 @@ def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> N
         copy.write_bytes(_as_far_as(file.read(LARGEST), last.get(PurePosixPath(name).stem)))
         return
     with copy.open("wb") as written:
-        shutil.copyfileobj(file, written)
+        while piece := file.read(_PIECE):
+            written.write(piece)
+            if written.tell() > LARGEST:  # it grows while it is read
+                raise BackupError(
+                    f"{name} has more than {LARGEST} bytes: see who put it there, and take it away"
+                )
 
 
 def _raise(error: OSError) -> None:

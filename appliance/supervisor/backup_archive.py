@@ -4,7 +4,7 @@ Invariants:
 
 1. The whole file is read before anything is believed, so the checksum at its end is compared: what was damaged on a
    worn-out stick is refused, not put back.
-2. It unpacks to no more than there is room for, and holds memory for no more than `_MOST` headers: plain ones of
+2. It unpacks to no more than there is room for, and holds memory for no more than `MOST_FILES` headers: plain ones of
    regular files. No header says something about the next one (sparse, pax, long names), so what is checked here is
    what is extracted.
 3. Every name is one that a backup has, once.
@@ -18,10 +18,16 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Self
 
-from appliance.supervisor.backup_contents import AUDIT_LOG, BackupError, belongs, kept_parts, trouble_with
+from appliance.supervisor.backup_contents import (
+    AUDIT_LOG,
+    MOST_FILES,
+    BackupError,
+    belongs,
+    kept_parts,
+    trouble_with,
+)
 
 _PIECE = 1 << 20
-_MOST = 10_000  # files; a backup has some twenty
 
 
 class _StrangeEntryError(Exception):
@@ -79,8 +85,10 @@ def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
     while (entry := archive.next()) is not None:
         if entry.name in entries or not belongs(entry.name, parts) or trouble_with(entry.name, entry.size):
             raise _strange(file, entry.name)
-        if len(entries) == _MOST:
-            raise BackupError(f"{file} has more than {_MOST} files, which no backup has: nothing is put back")
+        if len(entries) == MOST_FILES:
+            raise BackupError(
+                f"{file} has more than {MOST_FILES} files, which no backup has: nothing is put back"
+            )
         entries[entry.name] = entry
     folders = {str(folder) for name in entries for folder in PurePosixPath(name).parents}
     for name in folders & entries.keys():

@@ -11,6 +11,7 @@ from appliance.supervisor.roles import roles_of
 
 AUDIT_LOG = "control/audit.db"
 LARGEST = 1 << 30  # bytes of a file that is no database
+MOST_FILES = 10_000  # some twenty are usual
 _LONGEST_NAME = 100  # bytes: what an archive holds without a further header
 _DATABASES = "control/"  # the only part that has any
 # Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.

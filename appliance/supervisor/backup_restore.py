@@ -23,7 +23,6 @@ from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import account_of
 
 _SPARE = 64 << 20  # bytes of a disk that are left for others
-_MOST = 64 << 30
 
 
 def restore(file: Path, state: Path) -> list[str]:
@@ -31,9 +30,7 @@ def restore(file: Path, state: Path) -> list[str]:
 
     As root each part is given to its user. Raises `BackupError`.
     """
-    if state.exists() and any(state.iterdir()):
-        raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
-    with checked_archive(file, _room(state)) as (archive, entries), _marked(state):
+    with checked_archive(file, _room_in(state)) as (archive, entries), _marked(state):
         for entry in entries:
             _extract(archive, entry, state)
         if os.geteuid() == 0:
@@ -42,13 +39,21 @@ def restore(file: Path, state: Path) -> list[str]:
     return [entry.name for entry in entries]
 
 
-def _room(state: Path) -> int:
-    """Bytes that a backup may have on the disk that `state` is, or will be, on."""
-    here = state.absolute()
-    while not here.exists():
-        here = here.parent
-    disk = os.statvfs(here)
-    return min(_MOST, disk.f_bavail * disk.f_frsize - _SPARE)
+def _room_in(state: Path) -> int:
+    """Bytes for which there is room on the disk of an empty folder, or of one that is not there yet.
+
+    Raises `BackupError`.
+    """
+    try:
+        if os.path.lexists(state) and any(state.iterdir()):
+            raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
+        here = state.absolute()
+        while not os.path.lexists(here):
+            here = here.parent
+        disk = os.statvfs(f"{here}/.")  # which only a folder has
+    except OSError as error:
+        raise BackupError(f"{state}: {error.strerror}; name another --state") from error
+    return disk.f_bavail * disk.f_frsize - _SPARE
 
 
 @contextmanager

@@ -193,6 +193,36 @@ def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: st
     assert not (tmp_path / "backup.tar.gz").exists()
 
 
+def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who writes on while it is read cannot fill the disk with a backup, either."""
+    content = state / "api" / "growing"
+    content.write_bytes(bytes(1000))
+    opened = backup._opened
+
+    def grown(state: Path, name: str) -> int | None:
+        descriptor = opened(state, name)
+        if name == "api/growing":
+            monkeypatch.setattr(backup, "LARGEST", 999)
+        return descriptor
+
+    monkeypatch.setattr(backup, "_opened", grown)
+    with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: see who put it there"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_more_files_than_could_be_put_back(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that makes files without number is found when the backup is made, not when it is needed."""
+    monkeypatch.setattr(backup, "MOST_FILES", 5)
+    with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
+        for number in range(9):
+            (state / "api" / str(number)).touch()
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
 def test_an_interrupted_backup_leaves_no_file(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -125,7 +125,7 @@ def test_more_than_there_is_room_for(tmp_path: Path, monkeypatch: pytest.MonkeyP
     """What unpacks to more than the disk has room for is not begun."""
     file = archive(tmp_path / "bomb", header("api/x", 1 << 24), bytes(1 << 24))
     assert file.stat().st_size < 1 << 16
-    monkeypatch.setattr(backup_restore, "_room", lambda _state: 1 << 23)
+    monkeypatch.setattr(backup_restore, "_room_in", lambda _state: 1 << 23)
     refused(file, tmp_path / "state", "more than the 8 MiB that there is room for")
 
 
@@ -136,6 +136,14 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
     refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be put back")
     (tmp_path / "other").write_bytes(gzip.compress(header("api/x") + bytes(1024)))
     refused(tmp_path / "other", tmp_path / "state", "no backup of an appliance")
+
+
+def test_a_place_that_is_no_folder(tmp_path: Path) -> None:
+    """A file in the place of the new state directory, or on the way to it: an error that names it."""
+    (tmp_path / "file").touch()
+    for state in (tmp_path / "file", tmp_path / "file" / "state"):
+        with pytest.raises(BackupError, match=r"file.*: Not a directory"):
+            restore(archive(tmp_path / "backup"), state)
 
 
 def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
