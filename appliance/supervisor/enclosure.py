@@ -8,11 +8,13 @@ Invariants:
 
 1. No process starts before the firewall is in force.
 2. A port that another local user can reach, or a probe that cannot be made, counts as open: `probe` says why.
-3. Rules that somebody took away are put back, and that is said.
+3. Rules that somebody took away are put back, and that is said; so are those that could not be put in force before.
+4. What `remove` took away stays away: it waits for a call that is under way, and none puts anything back after it.
 """
 
 import contextlib
 import ipaddress
+import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -34,6 +36,7 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
 TUNNEL_INTERFACE = "ipsec0"  # charon's, when ESP runs in user space
+_PATIENCE_SECONDS = 5.0  # of an end with a call that hangs
 
 log = structlog.get_logger()
 
@@ -117,9 +120,37 @@ class Contained(Enclosure):
         self._firewall: Firewall | None = None
         self._tunnels: tuple[str, Esp] | None = None  # the pool of their addresses
         self._own: str | None = None  # the appliance's address in the tunnels
+        self._owed = False  # rules that are not in force yet, for the kernel refused them
+        self._changing = threading.RLock()
+        self._ending = False
+
+    @contextlib.contextmanager
+    def _standing(self) -> Iterator[None]:
+        """Have the rules to oneself. Raises `NetworkError` once they are taken away."""
+        with self._changing:
+            self._require_standing()
+            yield
+
+    def _require_standing(self) -> None:
+        if self._ending:
+            raise NetworkError("the firewall is taken away: the appliance ends")
+
+    @contextlib.contextmanager
+    def _taking_away(self) -> Iterator[None]:
+        """Have the rules to oneself for the last time; a call that hangs is not waited for without end."""
+        self._ending = True
+        held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
+        if not held:
+            log.error("a look at the firewall hangs; it is taken away all the same")
+        try:
+            yield
+        finally:
+            if held:
+                self._changing.release()
 
     def build(self) -> None:
         """Install the firewall. Raises `StartError`."""
+        self._ending = False
         if self._namespace == Namespace.own():
             _require_own_network()
         try:
@@ -134,12 +165,13 @@ class Contained(Enclosure):
         """Take every rule away again, and the address that the tunnels end at."""
         if self._firewall is None:
             return
-        try:
-            if self._own is not None:
-                self._end_tunnels(self._own)
-            self._firewall.remove()
-        except NetworkError as error:
-            log.error("rules of the firewall may be left", error=str(error))
+        with self._taking_away():
+            try:
+                if self._own is not None:
+                    self._end_tunnels(self._own)
+                self._firewall.remove()
+            except NetworkError as error:
+                log.error("rules of the firewall may be left", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
         """Take away their address, and what a charon that was killed has left in the kernel."""
@@ -151,27 +183,31 @@ class Contained(Enclosure):
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
         """Close both to everybody but rosmaster's user."""
-        if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
-            self._ports = replace(self._ports, inner=inner_port, own=own_port)
-            self._firewall.update(self._settings())
+        with self._standing():
+            if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
+                self._ports = replace(self._ports, inner=inner_port, own=own_port)
+                self._owed = True
+                self._firewall.update(self._settings())
+                self._owed = False
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
         """Close the pool to clear text first; only then it has a way in."""
-        if self._firewall is None:
-            raise NetworkError("the firewall is not in force")
-        esp = choose_esp(self._namespace)
-        before, self._tunnels = self._tunnels, (str(ipaddress.ip_network(pool)), esp)
-        if self._tunnels != before:
-            try:
-                self._firewall.update(self._settings())
-            except NetworkError:
-                self._tunnels = before
-                raise
-        own = f"{ipaddress.IPv4Address(address)}/32"
-        if own not in links.addresses(self._namespace):
-            links.add_address(self._namespace, "lo", own)
-        self._own = own
-        return esp
+        with self._standing():
+            if self._firewall is None:
+                raise NetworkError("the firewall is not in force")
+            esp = choose_esp(self._namespace)
+            before, self._tunnels = self._tunnels, (str(ipaddress.ip_network(pool)), esp)
+            if self._tunnels != before:
+                try:
+                    self._firewall.update(self._settings())
+                except NetworkError:
+                    self._tunnels = before
+                    raise
+            own = f"{ipaddress.IPv4Address(address)}/32"
+            if own not in links.addresses(self._namespace):
+                links.add_address(self._namespace, "lo", own)
+            self._own = own
+            return esp
 
     def endpoint(self) -> Endpoint:
         """The only address here, if there is but one: of several, the right one is known outside only."""
@@ -183,14 +219,17 @@ class Contained(Enclosure):
 
     def report(self) -> dict[str, Any]:
         """Back end, rules with counters; rules that are gone are put back first."""
-        if self._firewall is None:
-            return {}
-        report = self._firewall.report()
-        if not report.intact:
-            gone = [rule.purpose for rule in report.rules if not rule.in_force]
-            log.critical("rules of the firewall were taken away and are put back", rules=gone)
-            self._firewall.install(self._settings())
+        with self._standing():
+            if self._firewall is None:
+                return {}
             report = self._firewall.report()
+            if self._owed or not report.intact:
+                gone = [rule.purpose for rule in report.rules if not rule.in_force]
+                self._require_standing()
+                log.critical("rules of the firewall are not in force and are put back", rules=gone)
+                self._firewall.install(self._settings())
+                self._owed = False
+                report = self._firewall.report()
         rules = [asdict(rule) for rule in report.rules]
         return {"backend": report.backend, "not_used": list(report.not_used), "rules": rules}
 
@@ -269,9 +308,10 @@ class InNamespace(Contained):
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
         """As in a container; then IKE and ESP are forwarded to the namespace."""
-        esp = super().open_tunnels(pool, address)
-        self._isolation.forward_tunnels()
-        return esp
+        with self._standing():
+            esp = super().open_tunnels(pool, address)
+            self._isolation.forward_tunnels()
+            return esp
 
     def build(self) -> None:
         """Make the namespace, its way to the host's networks, and the firewall. Raises `StartError`."""
@@ -283,11 +323,12 @@ class InNamespace(Contained):
 
     def remove(self) -> None:
         """Take firewall and namespace away and put the host's settings back."""
-        super().remove()
-        try:
-            self._isolation.down()
-        except NetworkError as error:
-            log.error("the namespace may be left; the next start clears it", error=str(error))
+        with self._taking_away():
+            super().remove()
+            try:
+                self._isolation.down()
+            except NetworkError as error:
+                log.error("the namespace may be left; the next start clears it", error=str(error))
 
     def _api_networks(self) -> tuple[str, ...]:
         # The host's own loopback arrives under the address of its end of the link.
@@ -308,13 +349,15 @@ class InNamespace(Contained):
 
     def report(self) -> dict[str, Any]:
         """As in a container, and the rules on the host; those that are gone are put back, too."""
-        rules = self._isolation.rules()
-        gone = [rule.purpose for rule in rules if not rule.in_force]
-        if gone:
-            log.critical("rules on the host were taken away and are put back", rules=gone)
-            self._isolation.put_rules_back()
+        with self._standing():
             rules = self._isolation.rules()
-        return super().report() | {"forwarding": [asdict(rule) for rule in rules]}
+            gone = [rule.purpose for rule in rules if not rule.in_force]
+            if gone:
+                self._require_standing()
+                log.critical("rules on the host were taken away and are put back", rules=gone)
+                self._isolation.put_rules_back()
+                rules = self._isolation.rules()
+            return super().report() | {"forwarding": [asdict(rule) for rule in rules]}
 
 
 def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:

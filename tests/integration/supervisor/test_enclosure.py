@@ -2,14 +2,19 @@
 
 import os
 import socket
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from appliance.network.firewall.firewall import FirewallReport
 from appliance.network.firewall.rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.lab import Host, Lab
+from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Contained, InNamespace, Ports
 from tests.support.requirements import need_program, need_root
 
@@ -75,6 +80,27 @@ def test_the_inner_face_is_closed_once_it_is_known(host: Host, enclosure: Contai
         assert enclosure.probe() is None
 
 
+def test_rules_that_were_refused_are_owed(
+    host: Host, enclosure: Contained, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new inner face that could not be closed is closed by the next look; its failure was an error."""
+    enclosure.build()
+    firewall = enclosure._firewall
+    assert firewall is not None
+
+    def refused(_settings: object) -> None:
+        raise NetworkError("the kernel says no")
+
+    with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as inner:
+        port = inner.getsockname()[1]
+        with monkeypatch.context() as patch, pytest.raises(NetworkError, match="says no"):
+            patch.setattr(firewall, "update", refused)
+            enclosure.control_ready(port, port + 1)
+        assert reachable(host, port)
+        assert all(rule["in_force"] for rule in enclosure.report()["rules"])
+        assert not reachable(host, port)
+
+
 def test_rules_that_are_taken_away_come_back(host: Host, enclosure: Contained, hidden: int) -> None:
     """Somebody flushes the rules: the next look puts them back, and they are reported in force."""
     enclosure.build()
@@ -85,6 +111,68 @@ def test_rules_that_are_taken_away_come_back(host: Host, enclosure: Contained, h
     report = enclosure.report()
     assert all(rule["in_force"] for rule in report["rules"])
     assert not reachable(host, hidden)
+
+
+def test_what_is_taken_away_stays_away(
+    host: Host, enclosure: Contained, hidden: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look that is still under way at the end, or comes after it, puts nothing back: the end waits for it."""
+    enclosure.build()
+    firewall = enclosure._firewall
+    assert firewall is not None
+    looking, go_on = threading.Event(), threading.Event()
+    report = firewall.report
+
+    def slowly() -> FirewallReport:
+        looking.set()
+        assert go_on.wait(30)
+        return replace(
+            report(), rules=(), backend=None
+        )  # as somebody sees it whose rules were just taken away
+
+    monkeypatch.setattr(firewall, "report", slowly)
+    with ThreadPoolExecutor() as pool:
+        look = pool.submit(enclosure.report)
+        assert looking.wait(30)
+        end = pool.submit(enclosure.remove)
+        with pytest.raises(TimeoutError):
+            end.result(0.2)
+        go_on.set()
+        end.result(30)
+        with pytest.raises(NetworkError, match="the appliance ends"):
+            look.result(30)
+    assert reachable(host, hidden)
+    for late in (enclosure.report, lambda: enclosure.control_ready(1, 2)):
+        with pytest.raises(NetworkError, match="the appliance ends"):
+            late()
+    assert reachable(host, hidden)
+
+
+def test_an_end_does_not_wait_for_a_look_that_hangs(
+    host: Host, enclosure: Contained, hidden: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rules are taken away all the same, and the look puts nothing back when it wakes up."""
+    monkeypatch.setattr("appliance.supervisor.enclosure._PATIENCE_SECONDS", 0.1)
+    enclosure.build()
+    firewall = enclosure._firewall
+    assert firewall is not None
+    looking, go_on = threading.Event(), threading.Event()
+    report = firewall.report
+
+    def hanging() -> FirewallReport:
+        looking.set()
+        assert go_on.wait(30)
+        return report()
+
+    monkeypatch.setattr(firewall, "report", hanging)
+    with ThreadPoolExecutor() as pool:
+        look = pool.submit(enclosure.report)
+        assert looking.wait(30)
+        enclosure.remove()
+        go_on.set()
+        with pytest.raises(NetworkError, match="the appliance ends"):
+            look.result(30)
+    assert reachable(host, hidden)
 
 
 def test_rules_on_the_host_come_back(host: Host, tmp_path: Path) -> None:
