@@ -5,7 +5,13 @@ divisions elsewhere, and `event` or `service` are still names of variables insid
 know what a name is to tell a declaration from an expression, two names in a row are a declaration.
 """
 
-GRAMMAR = r"""
+_GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
+"""What may stand between two tokens: blanks and comments. It matches in one way only, so nothing is tried twice."""
+
+_WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
+"""What MOP writes before `event`."""
+
+_GRAMMAR = r"""
 file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
 
@@ -148,7 +154,7 @@ character: CHARACTER
 
 // Tokens
 NAME: /[A-Za-z_][A-Za-z_0-9]*/
-MODIFIER.5: /(creation|static|unsynchronized|decentralized|perthread|suffix)(?=\s+((creation|static|unsynchronized|decentralized|perthread|suffix)\s+)*event\s+[A-Za-z_])/
+MODIFIER.5: /<WORD>(?=<GAP>+(<WORD><GAP>+)*event<GAP>+[A-Za-z_])/
 BUILTIN.3: /(void|bool|char|short|int|long|float|double|signed|unsigned)(?!\w)/
 VECTOR.3: /(std\s*::\s*)?vector(?=\s*<)/
 LIMITS.3: /(std\s*::\s*)?numeric_limits(?=\s*<)/
@@ -172,8 +178,8 @@ SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/
 SERVICE_PART.5: /(request|response)(?!\w)/
 TOPIC.2: /[~\/]?[A-Za-z_][\w]*(\/\w+)*\/?/
-MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=\s*['\u2018\u2019\u00b4`{>\],&]|\s+[A-Za-z_])/
-    | /[A-Za-z]\w*::[A-Za-z]\w*(?=\s*['\u2018\u2019\u00b4`,]|\s+(request|response)(?!\w))/
+MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<GAP>+[A-Za-z_])/
+    | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
 QUOTE: /['\u2018\u2019\u00b4`]/
 FORMULA.9: /(?:[^@{}\/]|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
@@ -199,3 +205,5 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 %ignore COMMENT
 %ignore PREAMBLE
 """
+
+GRAMMAR = _GRAMMAR.replace("<GAP>", _GAP).replace("<WORD>", _WORD)
