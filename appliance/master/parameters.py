@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.batch import Wanted
+from appliance.master.bulk import weigh
 from appliance.master.call import Answer, Caller, LimitReachedError, denial_text
 from appliance.master.client import CallFailedError
 from appliance.master.http import Peer
 from appliance.master.registration import incarnation_of
 from appliance.master.registry import Incarnation, Kind
 from appliance.policy.model import Category, Request
-from appliance.ros.errors import EncodingError, ProtocolError
+from appliance.ros.errors import EncodingError, PeerError, ProtocolError
+from appliance.ros.names import resolve_parameter
 from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ class ParameterMirror:
 
     `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
     tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
+    `bytes_limit` is what all parameters together may weigh.
     `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`.
     """
 
@@ -56,7 +59,7 @@ class ParameterMirror:
             else:
                 self.set(key, value)
         self._note = note
-        self._bytes_limit = bytes_limit
+        self.bytes_limit = bytes_limit
         self._depth_limit = depth_limit
 
     def check(self, key: str, value: Value) -> None:
@@ -64,14 +67,14 @@ class ParameterMirror:
         weight, depth = measure(value)
         if len(_parts(key)) + depth > self._depth_limit:
             raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
-        if self.weight + weight > self._bytes_limit:
+        if self.weight + weight > self.bytes_limit:
             raise LimitReachedError(
-                f"all parameters together would have {self.weight + weight} bytes; the limit is {self._bytes_limit}"
+                f"all parameters together would have {self.weight + weight} bytes; the limit is {self.bytes_limit}"
             )
 
     def has_room(self, weight: int) -> bool:
         """Whether so much can come in addition to what is there."""
-        return self.weight + weight <= self._bytes_limit
+        return self.weight + weight <= self.bytes_limit
 
     def replace(self, tree: Tree) -> None:
         """Take the tree that ROSMaster has."""
@@ -190,6 +193,20 @@ def _hidden(master: "Master", caller: Caller, method: str, key: str, answer: Ans
     if decision.allowed:
         return None
     return denial_text(decision, master.recorder.decided(caller, method, Category.READ.value, key, decision))
+
+
+def asks_for(mirror: ParameterMirror, params: Sequence[Value], enough: int) -> bool:
+    """Whether `getParam` with these parameters, as they came, is for a namespace of about `enough` bytes or more."""
+    if mirror.weight < enough:
+        return False
+    match params:
+        case (str(caller_id), str(name)):
+            try:
+                there, _ = standing_at(mirror.tree, resolve_parameter(name, caller_id))
+            except PeerError:
+                return False
+            return weigh(there, enough) >= enough
+    return False
 
 
 def may_be_told(master: "Master", incarnation: Incarnation, key: str, value: Value) -> bool:

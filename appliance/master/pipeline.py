@@ -14,12 +14,13 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.master.arguments import KEY, NODE, SEARCH_KEY, SUBGRAPH, canonicalise, check_arity
+from appliance.master.bulk import Bulk, bulk_turns, weigh
 from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError, Touch, denial_text
 from appliance.master.claims import Claims
 from appliance.master.client import CallFailedError
 from appliance.master.gate import Contest, contested
 from appliance.master.http import Handler, HttpRequest
-from appliance.master.parameters import IN_ORDER, in_order
+from appliance.master.parameters import IN_ORDER, asks_for, in_order
 from appliance.master.places import NoPortError
 from appliance.master.recorder import NOT_RECORDED
 from appliance.master.registration import given_up
@@ -45,7 +46,7 @@ _PARSE_FAULT, _LIMIT_FAULT, _INTERNAL_FAULT = -32700, -32600, -32603
 
 
 class Pipeline:
-    """Serves requests by a table of calls. Bodies over `offload` bytes are parsed in a thread."""
+    """Serves requests by a table of calls. Bodies and answers over `offload` bytes are read and written in a thread."""
 
     def __init__(self, master: "Master", *, limits: Limits, offload: int) -> None:
         self._master = master
@@ -53,6 +54,7 @@ class Pipeline:
         self._offload = offload
         self._claims = Claims()
         self._writes = WriteTurns()
+        self._bulk = bulk_turns()
 
     def handler(
         self, calls: Mapping[str, Call], *, own: bool = False, target: Incarnation | None = None
@@ -69,26 +71,37 @@ class Pipeline:
     # --- parse, and write the answer ---
 
     async def _serve(self, calls: Mapping[str, Call], caller: Caller, body: bytes) -> bytes:
+        async with Bulk(self._bulk, caller.peer.host) as bulk:
+            try:
+                method_call = await self._parse(body, bulk)
+            except PeerError as error:
+                return self._not_understood(caller, error)
+            try:
+                answer = await self._answer_all(calls, caller, method_call, bulk)
+                known = method_call.method in calls or method_call.method == _MULTICALL
+                seconds = (time.monotonic_ns() - caller.arrived) / 1e9
+                self._master.recorder.meter.called(method_call.method if known else "unknown", seconds)
+                return await self._build(answer, bulk)
+            except EncodingError as error:
+                _log.error("answer cannot be written", call=method_call.method, error=str(error))
+                return build_fault(
+                    _INTERNAL_FAULT, f"the answer to {method_call.method} cannot be written: {error}"
+                )
+
+    async def _parse(self, body: bytes, bulk: Bulk) -> MethodCall:
+        if len(body) <= self._offload:
+            return parse_call(body, self._limits)
+        await bulk.take()
         try:
-            if len(body) > self._offload:
-                method_call = await asyncio.to_thread(parse_call, body, self._limits)
-            else:
-                method_call = parse_call(body, self._limits)
-        except PeerError as error:
-            return self._not_understood(caller, error)
-        try:
-            answer = await self._answer_all(calls, caller, method_call)
-            known = method_call.method in calls or method_call.method == _MULTICALL
-            seconds = (time.monotonic_ns() - caller.arrived) / 1e9
-            self._master.recorder.meter.called(method_call.method if known else "unknown", seconds)
-            if len(body) > self._offload:
-                return await asyncio.to_thread(build_response, answer)
+            return await asyncio.to_thread(parse_call, body, self._limits)
+        finally:
+            bulk.give_back()  # to carry it out may take long
+
+    async def _build(self, answer: Value, bulk: Bulk) -> bytes:
+        if weigh(answer, self._offload) < self._offload:
             return build_response(answer)
-        except EncodingError as error:
-            _log.error("answer cannot be written", call=method_call.method, error=str(error))
-            return build_fault(
-                _INTERNAL_FAULT, f"the answer to {method_call.method} cannot be written: {error}"
-            )
+        await bulk.take()
+        return await asyncio.to_thread(build_response, answer)
 
     def _not_understood(self, caller: Caller, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)
@@ -103,26 +116,63 @@ class Pipeline:
 
     # --- one call, or the parts of a multicall ---
 
-    async def _answer_all(self, calls: Mapping[str, Call], caller: Caller, call: MethodCall) -> Value:
+    async def _answer_all(
+        self, calls: Mapping[str, Call], caller: Caller, call: MethodCall, bulk: Bulk
+    ) -> Value:
         if call.method != _MULTICALL or caller.target is not None:
+            await self._prepare(call.method, call.params, bulk)
             return await self._answer(calls, caller, call.method, call.params)
         if len(call.params) != 1 or not isinstance(call.params[0], list):
             why = "system.multicall takes one list of calls"
             self._part_refused(caller, why)
             return [-1, why, 0]
         results: list[Value] = []
+        room = self._master.parameters.bytes_limit  # as much as one call can be answered
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
         for run in _runs(call.params[0]):
+            if room <= 0:
+                return results + self._too_much(caller, len(call.params[0]) - len(results))
             # Roslaunch clears and sets parameters in one multicall, and the order is what counts: a run of parameter
             # calls goes to ROSMaster as one, in its order. Everything else waits for the part before it.
             if len(run) > 1:
                 results += await self._answer_run(calls, caller, run)
             else:
-                results.append(await self._answer_part(calls, caller, run[0]))
+                results.append(await self._answer_part(calls, caller, run[0], bulk))
+                room -= await self._weigh(results[-1], bulk)
             if time.monotonic() - since > _LONGEST_STRETCH:
                 await asyncio.sleep(0)
                 since = time.monotonic()
         return results
+
+    async def _prepare(self, method: str, params: tuple[Value, ...], bulk: Bulk) -> None:
+        """Wait for one's turn with a call that will be answered with a large tree of parameters."""
+        if method == "getParam" and asks_for(self._master.parameters, params, self._offload):
+            await bulk.take()
+
+    async def _weigh(self, answer: Value, bulk: Bulk) -> int:
+        """About how many bytes an answer has, which is kept until the other parts have theirs."""
+        weight = weigh(answer, self._offload)
+        if weight < self._offload:
+            return weight
+        await bulk.take()
+        return await asyncio.to_thread(weigh, answer, self._master.parameters.bytes_limit)
+
+    def _too_much(self, caller: Caller, count: int) -> list[Value]:
+        """What the parts are answered for which there is no room after the answers to those before them."""
+        limit = self._master.parameters.bytes_limit
+        why = (
+            f"the answers to a multicall have more than {limit} bytes; {count} more parts are not carried out"
+        )
+        record = self._master.recorder.happened(
+            "limit exceeded",
+            why,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=caller.peer.text,
+            category=Category.COMMAND.value,
+            resource=_MULTICALL,
+        )
+        return [{"faultCode": _LIMIT_FAULT, "faultString": f"{why} [{record}]"}] * count
 
     async def _answer_run(self, calls: Mapping[str, Call], caller: Caller, run: list[Value]) -> list[Value]:
         """Each part is decided and recorded by itself; those that may be carried out are carried out in order."""
@@ -154,12 +204,13 @@ class Pipeline:
             ]
         return answers
 
-    async def _answer_part(self, calls: Mapping[str, Call], caller: Caller, part: Value) -> Value:
+    async def _answer_part(self, calls: Mapping[str, Call], caller: Caller, part: Value, bulk: Bulk) -> Value:
         if isinstance(part, dict) and part.get("methodName") == _MULTICALL:
             return self._part_refused(caller, "a multicall inside a multicall is not served")
         call = _part_of(part)
         if call is None:
             return self._part_refused(caller, _FORM)
+        await self._prepare(*call, bulk)
         return [await self._answer(calls, caller, *call)]
 
     def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:

@@ -3,11 +3,13 @@
 import asyncio
 import copy
 import ipaddress
+import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
 
+from appliance.master import pipeline
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.gate import Gate, HostLimits
 from appliance.master.http import HttpRequest, Peer
@@ -19,6 +21,8 @@ from appliance.policy.model import Decision
 from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
+THIRD = "10.0.0.7"
+OFFLOAD = 256 << 10
 POLICY = """
 [Groups]
 ocu = 10.0.0.5
@@ -70,21 +74,21 @@ class Records:
 class Site:
     """A pipeline that serves, the ROSMaster behind it (whose calls wait for `go`), and what is recorded."""
 
-    def __init__(self, rules: str = LIMITED, tree: Any = None) -> None:
+    def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
         policy = compile_policy(self.policy_text, file="test.ini")
         self.policy = lambda: policy
         self.gate = Gate(self.policy, Registry(Anything()), HostLimits())
         self.recorder = Records()
-        self.parameters = ParameterMirror(copy.deepcopy(tree or {}), lambda: None)
+        self.parameters = ParameterMirror(copy.deepcopy(tree or {}), lambda: None, bytes_limit=bytes_limit)
         self.there = ParameterMirror(copy.deepcopy(tree or {}), lambda: None)
         self.rosmaster = self
         self.addresses = self
         self.arrived: list[str] = []
         self.go = asyncio.Event()
         self.go.set()
-        pipeline = Pipeline(self, limits=Limits(), offload=1 << 20)  # type: ignore[arg-type]  # stands for the master
-        self.serve = pipeline.handler(MASTER_CALLS)
+        served = Pipeline(self, limits=Limits(), offload=OFFLOAD)  # type: ignore[arg-type]  # stands for the master
+        self.serve = served.handler(MASTER_CALLS)
 
     async def learn(self, _peer: Peer) -> None:
         """As `Addresses`."""
@@ -215,5 +219,78 @@ def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
         assert answer[1].endswith("[id]")
         assert site.recorder.decisions[-1][1:2] == ("/arm",)
         assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
+
+    play(scene)
+
+
+def test_answers_to_a_multicall_are_bounded_together() -> None:
+    """A small request cannot have the appliance hold many large answers: the rest is refused, and recorded once."""
+
+    async def scene() -> None:
+        site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
+        wanted: list[Value] = [part("getParam", "/arm/model")] * 100
+        answers = await site.ask(OPERATOR, "system.multicall", wanted)
+        assert len(answers) == 100
+        assert [one[0][0] for one in answers[:10]] == [1] * 10
+        assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
+        assert len(site.arrived) == 10
+        assert site.recorder.events == ["limit exceeded"]
+        usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
+        assert [one[0][0] for one in usual] == [1] * 100
+
+    play(scene)
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
+def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
+    """However often a host asks for all parameters, it is one large answer at a time; others are not held up by it."""
+
+    async def scene() -> None:
+        site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
+
+        async def dump(host: str) -> None:
+            if together:
+                [answer] = await site.ask(host, "system.multicall", [part("getParam", "/arm")])
+            else:
+                answer = [await site.ask(host, "getParam", "/me", "arm/")]
+            assert answer[0][0] == 1
+
+        site.go.clear()
+        dumps = [asyncio.create_task(dump(host)) for host in [OPERATOR] * 5 + [ADMIN, THIRD]]
+        small = asyncio.create_task(site.ask(OPERATOR, "getParam", "/me", "/leg"))
+        await others()
+        assert site.arrived == ["getParam /arm", "getParam /arm", "getParam /leg"]
+        site.go.set()
+        assert (await small)[2] == 1
+        await asyncio.gather(*dumps)
+        assert site.arrived.count("getParam /arm") == 7
+
+    play(scene)
+
+
+def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The event loop goes on meanwhile; what is small is not worth a thread."""
+    threads: list[tuple[str, bool]] = []
+
+    def observed(name: str) -> None:
+        real = getattr(pipeline, name)
+
+        def observe(*arguments: Any) -> Any:
+            threads.append((name, threading.current_thread() is threading.main_thread()))
+            return real(*arguments)
+
+        monkeypatch.setattr(pipeline, name, observe)
+
+    async def scene() -> None:
+        observed("parse_call")
+        observed("build_response")
+        site = Site(tree={"arm": {"gains": list(range(20_000))}})
+        await site.ask(OPERATOR, "getParam", "/me", "/arm")
+        assert threads == [("parse_call", True), ("build_response", False)]
+        threads.clear()
+        await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
+        assert threads == [("parse_call", False), ("build_response", True)]
 
     play(scene)

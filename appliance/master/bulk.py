@@ -1,0 +1,69 @@
+"""Large bodies and answers: few at a time, host by host, so that memory and the event loop are there for others.
+
+A tree of parameters takes ten times its size while it is read from ROSMaster and written for a node. What one request
+needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, one of each host, and hosts take turns.
+"""
+
+from typing import Self
+
+from appliance.master.turns import Turns
+from appliance.policy.model import Address
+from appliance.ros.xmlrpc import Value
+
+AT_ONCE = 2
+_VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # about what XML-RPC writes around a value
+
+
+def bulk_turns() -> Turns:
+    """The turns that all requests share."""
+    return Turns(AT_ONCE, 1)
+
+
+class Bulk:
+    """The bulk of one request of a host: room for it is taken when it is needed, and given back at the end."""
+
+    def __init__(self, turns: Turns, host: Address) -> None:
+        self._turns = turns
+        self._host = host
+        self.taken = False
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        self.give_back()
+
+    async def take(self) -> None:
+        """Wait for room, unless it is taken already."""
+        if not self.taken:
+            await self._turns.enter(self._host)
+            self.taken = True
+
+    def give_back(self) -> None:
+        """Make room for others."""
+        if self.taken:
+            self.taken = False
+            self._turns.leave(self._host)
+
+
+def weigh(value: Value, enough: int) -> int:
+    """About how many bytes a value takes on the wire; counting ends when it is `enough`."""
+    total = 0
+    waiting: list[Value] = [value]
+    while waiting and total < enough:
+        one = waiting.pop()
+        if isinstance(one, str | bytes):
+            total += _TEXT + len(one)
+        elif isinstance(one, list):
+            total += _ARRAY
+            waiting += one
+        elif isinstance(one, dict):
+            total += _STRUCT
+            for name in one:
+                total += _MEMBER + len(name)
+                if total >= enough:
+                    return total
+            waiting += one.values()
+        else:
+            total += _VALUE
+    return total
