@@ -134,6 +134,26 @@ def test_the_state_is_copied_and_taken_back(alone: Compose, tmp_path: Path) -> N
     assert verified.returncode == 0, verified.stdout + verified.stderr
 
 
+def test_backup_and_restore_as_documented(alone: Compose, tmp_path: Path) -> None:
+    """By the commands of docs/upgrade-and-backup.md: taken while it runs, put back into a new volume, it goes on."""
+    container, entry = alone.container("appliance"), ("--entrypoint", "rosrv", APPLIANCE)
+    folder = ("--volume", f"{tmp_path}:/backup")
+    backup = ("--cap-add", "DAC_OVERRIDE", "--volumes-from", container, *folder, *entry, "backup")
+    state = ("/backup/rosrv.tar.gz", "--state", "/var/lib/rosrv")
+    alone.engine.docker("run", "--rm", *backup, *state)
+    before = alone.audit("--oldest-first")[0]["id"]
+    alone("down", "--volumes", "--timeout", "5")
+    alone("up", "--no-start", "--no-build")
+    alone.engine.docker(
+        "run", "--rm", "--volume", "alone_state:/var/lib/rosrv", *folder, *entry, "restore", *state
+    )
+    alone("start")
+    alone.wait_healthy()
+    assert alone.audit("--oldest-first")[0]["id"] == before
+    verified = alone.exec("appliance", "rosrv", "audit", "verify", check=False)
+    assert verified.returncode == 0, verified.stdout + verified.stderr
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 

@@ -1,6 +1,7 @@
 """Tests of a host behind a tunnel to the appliance in its container: enrolled, heard, revoked."""
 
-import base64
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -28,12 +29,29 @@ default = laptop
 ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--out", "/tmp/laptop.tar.gz")
 
 
+def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
+    """By the commands of docs/next-to-your-robot.md: the endpoint in `.env`, the kit through standard output."""
+    (alone.directory / ".env").write_text(f"ROSRV_ENDPOINT={MACHINE}\n")
+    alone("up", "--detach", "--no-build")
+    alone.wait_healthy()
+    command = ["docker-compose", "--project-name", alone.project, "exec", "-T", "appliance"]
+    with kit.open("wb") as file:
+        subprocess.run(
+            [*command, "rosrv", "host", "add", "laptop", "--out", "-"],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            cwd=alone.directory,
+            env=os.environ | {"DOCKER_HOST": alone.engine.address},
+            timeout=120,
+            check=True,
+        )
+    return kit
+
+
 def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp_path: Path) -> None:
     """By its kit a laptop on the machine's network has a tunnel through the published ports, until it is revoked."""
     need_strongswan()
-    alone.exec("appliance", *ENROL)
-    kit = tmp_path / "laptop.tar.gz"
-    kit.write_bytes(base64.b64decode(alone.exec("appliance", "base64", "/tmp/laptop.tar.gz").stdout))
+    kit = enrolled_as_documented(alone, tmp_path / "laptop.tar.gz")
     (alone.directory / "policies" / "containers.ini").write_text(POLICY)
     (alone.directory / "policies" / "containers.ini.tests.yaml").unlink()
     alone.exec("appliance", "rosrv", "policy", "reload")
@@ -45,6 +63,13 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
             listener.wait_for(event="received")
             hosts = {record["host"] for record in alone.audit("--event", "registered", "--caller", "/talker")}
             assert hosts == {laptop.address}
+            nowhere_to_write = alone.exec("appliance", "rosrv", "host", "kit", "laptop", check=False)
+            assert nowhere_to_write.returncode == 2
+            assert (
+                "Read-only file system; name another: --out FILE, or --out - > FILE"
+                in nowhere_to_write.stderr
+            )
+            assert not alone.audit("--event", "host renewed"), "it kept its certificate, and its tunnel"
             assert "up" in alone.exec("appliance", "rosrv", "host", "list").stdout
             alone.exec("appliance", "rosrv", "host", "revoke", "laptop")
             assert alone.audit("--event", "host revoked")
@@ -54,6 +79,15 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
                 listener.wait_for(event="received", since=cut + 20, timeout=5)
             for node in (listener, talker):
                 node.kill()  # it cannot say good-bye to anybody
+
+
+def test_a_token_is_not_given_for_nothing(alone: Compose) -> None:
+    """REST is published for this machine only, so no host could bring a token: it is said, and nobody is awaited."""
+    done = alone.exec("appliance", "rosrv", "host", "add", "laptop", "--token", "--out", "-", check=False)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert "publish port 8443 of the container" in done.stderr
+    assert "laptop" not in alone.exec("appliance", "rosrv", "host", "list").stdout
 
 
 def test_low_ports_are_for_who_has_the_right(alone: Compose) -> None:
