@@ -36,7 +36,10 @@ METRICS = (
     ),
     Metric("rosrv_decision_seconds", "histogram", (), "from a request's arrival to its decision"),
     Metric("rosrv_master_call_seconds", "histogram", ("call",), "from a request's arrival to its answer"),
-    Metric("rosrv_relay_connected", "gauge", (), "1 while there is a relay"),
+    Metric(
+        "rosrv_probe_failed", "gauge", (), "1 while the hidden ROS Master can be reached past the appliance"
+    ),
+    Metric("rosrv_relay_connected", "gauge", (), "1 while every relay process is there"),
     Metric(
         "rosrv_relay_connections", "gauge", ("kind",), "subscribers (topic) and clients (service) connected"
     ),
@@ -86,9 +89,16 @@ METRICS = (
         "1 if a check from outside found ROS ports open, 0 if closed, -1 not known",
     ),
     Metric("rosrv_hosts", "gauge", ("state",), "hosts by state, as `rosrv host list` shows it"),
+    Metric("rosrv_ipsec_troubles", "gauge", (), "what `rosrv status` says is wrong with IPsec, in number"),
     Metric("rosrv_audit_queue", "gauge", (), "audit records that wait to be on disk"),
     Metric("rosrv_audit_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
     Metric("rosrv_audit_failed", "gauge", (), "1 while the audit log cannot be written"),
+    Metric(
+        "rosrv_audit_degraded",
+        "gauge",
+        (),
+        "1 while checkpoints, the full-text index or retention are behind",
+    ),
     Metric("rosrv_syslog_up", "gauge", (), "1 while the audit log is forwarded; absent when it is not to be"),
     Metric(
         "rosrv_syslog_sent_total", "counter", (), "messages the receiver has, since the forwarder started"

@@ -5,6 +5,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from appliance.channel.serving import no_relay, probe_failed
+
 
 class Alarm(BaseModel):
     """A condition that holds now. `kind` is a stable name; it goes by itself when the condition does."""
@@ -24,11 +26,12 @@ def open_alarms(status: Mapping[str, Any]) -> list[Alarm]:
 
 
 def _system(status: Mapping[str, Any]) -> Iterator[Alarm]:
-    if status["probe"] not in ("", "passed"):
+    if probe_failed(status):
         text = f"the hidden ROS Master can be reached past the appliance; nodes are not served: {status['probe']}"
         yield Alarm(kind="probe", severity="alarm", text=text, about="system")
-    if status["relay"] != "connected":
-        text = "there is no relay: topics and services carry nothing until it is back"
+    relay = no_relay(status["relay"])
+    if relay is not None:
+        text = f"{relay}, until it is back"
         yield Alarm(kind="relay", severity="alarm", text=text, about="system")
     if status["rosmaster"] != "reachable":
         text = "the ROS Master behind the appliance is being rebuilt; calls of nodes wait"
@@ -42,6 +45,13 @@ def _audit(status: Mapping[str, Any]) -> Iterator[Alarm]:
         yield Alarm(kind="audit-failed", severity="alarm", text=text, about="audit")
     if audit["degraded"] is not None:
         yield Alarm(kind="audit-degraded", severity="warning", text=str(audit["degraded"]), about="audit")
+    forwarding = audit["forwarding"]
+    if forwarding is not None and forwarding["trouble"]:
+        text = (
+            f"the audit log is not forwarded to {forwarding['to']}, {forwarding['behind']} records wait:"
+            f" {forwarding['trouble']}"
+        )
+        yield Alarm(kind="audit-not-forwarded", severity="warning", text=text, about="audit")
 
 
 def _policy(status: Mapping[str, Any]) -> Iterator[Alarm]:

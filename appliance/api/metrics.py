@@ -18,6 +18,7 @@ from starlette.responses import Response
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
+from appliance.channel.serving import no_relay, probe_failed
 from appliance.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -101,7 +102,8 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_decisions_total": [((one[0], one[1]), one[2]) for one in body["decisions"]],
         "rosrv_decision_seconds": [((), body["decision_seconds"])],
         "rosrv_master_call_seconds": [((one[0],), (one[1], one[2])) for one in body["calls"]],
-        "rosrv_relay_connected": [((), status["relay"] == "connected")],
+        "rosrv_probe_failed": [((), probe_failed(status))],
+        "rosrv_relay_connected": [((), no_relay(status["relay"]) is None)],
         "rosrv_relay_connections": [((kind,), count) for kind, count in body["connections"].items()],
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
@@ -123,9 +125,11 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_rosmaster_reachable": [((), status["rosmaster"] == "reachable")],
         "rosrv_delivery_queue": [((), body["queued_deliveries"])],
         **_tunnels(body["hosts"]),
+        "rosrv_ipsec_troubles": [((), len(status["ipsec"]["troubles"]))],
         "rosrv_audit_queue": [((), audit["lag_records"])],
         "rosrv_audit_lag_seconds": [((), audit["lag_seconds"])],
         "rosrv_audit_failed": [((), audit["failed"] is not None)],
+        "rosrv_audit_degraded": [((), audit["degraded"] is not None)],
         **_forwarding(audit["forwarding"]),
         "rosrv_policy_revision": [((), policy["revision"])],
         "rosrv_policy_differs_from_file": [((), policy["differs_from_file"])],

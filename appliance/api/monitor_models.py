@@ -162,7 +162,8 @@ class Replaced(Model):
         default=[], description="monitors that began anew because another relay process has them now"
     )
     began: list[str] = Field(
-        default=[], description="all monitors that are in their initial state by this change, new ones among them"
+        default=[],
+        description="all monitors that are in their initial state by this change, new ones among them",
     )
 
 

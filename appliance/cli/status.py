@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
-from appliance.cli.healthy import no_relay
+from appliance.channel.serving import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.status_view import age, processes_table, shortened
@@ -53,7 +53,7 @@ def troubles_of(body: dict[str, Any]) -> list[str]:
             f"the audit log is not forwarded to {forwarding['to']}, {counted(forwarding['behind'], 'record')} wait:"
             f" {forwarding['trouble']}"
         )
-    if body["probe"] not in ("", "passed"):
+    if probe_failed(body):
         found.append(f"the ROS Master is not hidden: {body['probe']}")
     monitors = body["monitors"]
     if monitors["refused"]:
@@ -62,8 +62,9 @@ def troubles_of(body: dict[str, Any]) -> list[str]:
         found.append(f"topics are held: rosrv monitor resume {' '.join(monitors['held'])}")
     if monitors["failing"]:
         found.append(f"monitors fail: {', '.join(monitors['failing'])}; their messages are dropped")
-    if body["relay"] != "connected":
-        found.append(no_relay(body["relay"]))
+    relay = no_relay(body["relay"])
+    if relay is not None:
+        found.append(relay)
     if body["rosmaster"] != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
     found += body["ipsec"]["troubles"]

@@ -6,12 +6,13 @@ import pytest
 
 from appliance.api.alarms import open_alarms
 
+FORWARDING = {"to": "tls://10.0.0.9:6514", "behind": 7, "trouble": ""}
 GOOD: dict[str, Any] = {
     "probe": "passed",
     "relay": "connected",
     "rosmaster": "reachable",
     "policy": {"revision": 3, "file": "robot.ini", "confirm_by": None, "differs_from_file": False},
-    "audit": {"failed": None, "degraded": None},
+    "audit": {"failed": None, "degraded": None, "forwarding": None},
     "monitors": {"revision": 1, "held": [], "failing": [], "refused": [], "differs_from_folder": False},
     "ipsec": {"troubles": []},
 }
@@ -41,6 +42,8 @@ def test_a_healthy_appliance_has_none() -> None:
         ("relay", "away", "relay", "alarm", "system"),
         ("rosmaster", "being rebuilt", "rosmaster", "warning", "system"),
         ("audit.failed", "disk full", "audit-failed", "alarm", "audit"),
+        ("relay", "1 of 2 are away", "relay", "alarm", "system"),
+        ("audit.forwarding", FORWARDING | {"trouble": "refused"}, "audit-not-forwarded", "warning", "audit"),
         ("audit.degraded", "fsync is slow", "audit-degraded", "warning", "audit"),
         ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),
         ("policy.differs_from_file", True, "policy-differs", "notice", "policy"),
@@ -56,6 +59,13 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
     (alarm,) = open_alarms(changed(path, value))
     assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
     assert len(alarm.text) > 5
+
+
+def test_one_relay_away_is_not_told_as_all_away() -> None:
+    """With several relay processes the alarm says how many are away, and that the others go on."""
+    (alarm,) = open_alarms(changed("relay", "1 of 2 are away"))
+    assert "1 of 2 are away: their topics" in alarm.text
+    assert open_alarms(changed("audit.forwarding", FORWARDING)) == []
 
 
 def test_the_gravest_come_first() -> None:

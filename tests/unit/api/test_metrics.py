@@ -21,10 +21,11 @@ def body() -> dict[str, Any]:
     return {
         **meter.values(),
         "status": {
-            "version": "1", "since": 5.0, "relay": "connected", "rosmaster": "reachable",
+            "version": "1", "since": 5.0, "relay": "1 of 2 are away", "rosmaster": "reachable", "probe": "it answers",
+            "ipsec": {"troubles": ["a", "b"]},
             "policy": {"revision": 3, "differs_from_file": True},
             "monitors": {"loaded": 3, "enabled": 2, "held": ["b"], "failing": []},
-            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None, "forwarding": {
+            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None, "degraded": "fsync", "forwarding": {
                 "sent": 9, "behind": 4, "seconds": 1.5, "missed": 0, "trouble": "nobody there",
             }},
             "processes": [{"role": "control", "pid": 1, "restarts": 4}],
@@ -86,6 +87,10 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_relay_delay_seconds_bucket", (("le", "+Inf"), topic)] == 10
     assert samples["rosrv_relay_delay_seconds_sum", (topic,)] == 0.25
     assert samples["rosrv_audit_failed", ()] == 0
+    assert samples["rosrv_audit_degraded", ()] == 1
+    assert samples["rosrv_probe_failed", ()] == 1
+    assert samples["rosrv_ipsec_troubles", ()] == 2
+    assert samples["rosrv_relay_connected", ()] == 0
     assert samples["rosrv_monitor_dropped_total", (("resource", "/b"),)] == 5
     assert samples["rosrv_monitor_changed_total", (("resource", "(others)"),)] == 1
     assert samples["rosrv_syslog_up", ()] == 0

@@ -1,0 +1,31 @@
+"""Whether nodes are served, read from control's status: one answer for health checks, REST, metrics, `rosrv status`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def probe_failed(status: Mapping[str, Any]) -> bool:
+    """Whether the hidden ROS Master was reached past the appliance; before the probe has run it did not fail."""
+    return status["probe"] not in ("", "passed")
+
+
+def no_relay(presence: str) -> str | None:
+    """What it means that not every relay process is there; None when all are."""
+    if presence == "connected":
+        return None
+    if presence == "away":
+        return "no relay process: topics and services carry nothing"
+    return f"of the relay processes {presence}: their topics and services carry nothing"
+
+
+def unserved(status: Mapping[str, Any]) -> str | None:
+    """Why nodes are not served now; None when they are."""
+    audit = status["audit"]
+    if probe_failed(status):
+        return f"the ROS Master is not hidden: {status['probe']}"
+    if audit["failed"]:
+        return f"the audit log cannot be written: {audit['failed']}"
+    relay = no_relay(status["relay"])
+    if relay is not None:
+        return relay
+    return None if status["rosmaster"] == "reachable" else "the ROS Master is being rebuilt: calls wait"

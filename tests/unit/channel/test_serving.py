@@ -1,0 +1,41 @@
+"""Tests of `appliance.channel.serving`."""
+
+from typing import Any
+
+import pytest
+
+from appliance.channel.serving import no_relay, unserved
+
+SERVING: dict[str, Any] = {
+    "probe": "passed",
+    "audit": {"failed": None},
+    "relay": "connected",
+    "rosmaster": "reachable",
+}
+
+
+def test_an_appliance_that_serves() -> None:
+    """What status says of a running appliance is no reason, with and without a probe."""
+    assert unserved(SERVING) is None
+    assert unserved(SERVING | {"probe": ""}) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"probe": "ROSMaster can be reached"}, "not hidden: ROSMaster can be reached"),
+        ({"audit": {"failed": "disk full"}}, "the audit log cannot be written: disk full"),
+        ({"relay": "away"}, "no relay process"),
+        ({"relay": "1 of 2 are away"}, "of the relay processes 1 of 2 are away"),
+        ({"rosmaster": "being rebuilt"}, "the ROS Master is being rebuilt"),
+    ],
+)
+def test_what_keeps_nodes_from_being_served_is_named(wrong: dict[str, Any], reason: str) -> None:
+    """Each reason why nodes are not served, in words."""
+    assert reason in str(unserved(SERVING | wrong))
+
+
+def test_one_relay_away_is_not_all_away() -> None:
+    """With several relay processes it is said how many are away."""
+    assert no_relay("connected") is None
+    assert no_relay("1 of 3 are away") != no_relay("away")
