@@ -214,6 +214,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return str(children[0])
 
     def core(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        if isinstance(children[0], tree.TypeName):
+            return children[0]
         return tree.TypeName(self.at(meta), tuple(map(str, children)))
 
     def pointer(self, meta: Meta, children: list[Any]) -> tree.TypeName:
@@ -227,6 +229,10 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def vector(self, meta: Meta, children: list[Any]) -> tree.TypeName:
         return tree.TypeName(self.at(meta), ("std", "vector"), element=children[-1])
+
+    def vector_of_vectors(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+        inner = self.vector(meta, children)
+        return tree.TypeName(self.at(meta), ("std", "vector"), element=inner)
 
     def automatic(self, meta: Meta, children: list[Any]) -> tree.TypeName:
         del children
@@ -386,6 +392,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
         words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
+        if _is_word(children[1], "FIXED"):
+            words = tuple(part.strip() for part in children[1].split("::"))
         return tree.Cast(self.at(meta), tree.TypeName(self.at(meta), words), children[-1])
 
     def static_cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
@@ -396,13 +404,11 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return tree.Construct(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
 
     def construct_vector(self, meta: Meta, children: list[Any]) -> tree.Construct:
-        _, element, *arguments = (child for child in children if not _is_word(child, "LPAR"))
-        kind = tree.TypeName(self.at(meta), ("std", "vector"), element=element)
+        kind, *arguments = (child for child in children if not _is_word(child, "LPAR"))
         return tree.Construct(self.at(meta), kind, arguments[0] or ())
 
     def construct_elements(self, meta: Meta, children: list[Any]) -> tree.Construct:
-        _, element, *items = (child for child in children if not _is_word(child, "LBRACE"))
-        kind = tree.TypeName(self.at(meta), ("std", "vector"), element=element)
+        kind, *items = (child for child in children if not _is_word(child, "LBRACE"))
         return tree.Construct(self.at(meta), kind, (tree.Elements(self.at(meta), items[0] or ()),))
 
     def new(self, meta: Meta, children: list[Any]) -> tree.NewCharacters:

@@ -55,8 +55,10 @@ core: BUILTIN+
     | BUILTIN+ "*"                                -> pointer
     | scoped                                      -> named
     | MESSAGE_TYPE                                -> message
-    | VECTOR "<" type ">"                         -> vector
+    | vector
     | "auto"                                      -> automatic
+vector: VECTOR "<" type ">"
+    | VECTOR "<" VECTOR "<" type ">>"             -> vector_of_vectors
 !qualifier: "const" | "static" | "volatile"
 scoped: ["::"] NAME ("::" NAME)*
 
@@ -132,6 +134,7 @@ elements: initializer ("," initializer)* [","]
     | PLUS unary                                  -> prefix
     | INCREMENT unary                             -> step_before
     | LPAR BUILTIN+ ")" unary                     -> cast
+    | LPAR FIXED ")" unary                        -> cast
 ?postfix: primary
     | postfix "[" expression "]"                  -> index
     | postfix "." NAME                            -> member
@@ -142,8 +145,8 @@ elements: initializer ("," initializer)* [","]
     | scoped -> name
     | LPAR expression ")"                         -> parenthesis
     | BUILTIN+ "(" [arguments] ")"                -> convert
-    | VECTOR "<" type ">" "(" [arguments] ")"     -> construct_vector
-    | VECTOR "<" type ">" "{" [elements] "}"      -> construct_elements
+    | vector "(" [arguments] ")"                  -> construct_vector
+    | vector "{" [elements] "}"                   -> construct_elements
     | CAST "<" type ">" "(" expression ")"        -> static_cast
     | NEW BUILTIN+ "[" expression "]"             -> new
     | LIMITS "<" type ">" "::" NAME "(" ")"       -> limit
@@ -156,6 +159,7 @@ character: CHARACTER
 NAME: /[A-Za-z_][A-Za-z_0-9]*/
 MODIFIER.5: /<WORD>(?=<GAP>+(<WORD><GAP>+)*event<GAP>+[A-Za-z_])/
 BUILTIN.3: /(void|bool|char|short|int|long|float|double|signed|unsigned)(?!\w)/
+FIXED.4: /(std\s*::\s*)?(u?int(8|16|32|64)_t|size_t)(?=\s*\))/
 VECTOR.3: /(std\s*::\s*)?vector(?=\s*<)/
 LIMITS.3: /(std\s*::\s*)?numeric_limits(?=\s*<)/
 CAST: "static_cast"
