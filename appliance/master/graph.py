@@ -16,6 +16,7 @@ from appliance.master.recorder import Recorder
 from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.policy.model import Decision
+from appliance.ros.xmlrpc import Value
 
 
 class Graph:
@@ -204,6 +205,10 @@ class Graph:
             self._tell_one(subscriber, topic, always=True)
         elif (Kind.SUBSCRIPTION, topic) in subscriber.shelf:
             self._empty(subscriber, topic)
+
+    def tell_parameter(self, subscriber: Incarnation, key: str, value: Value, size: int) -> None:
+        """Tell a node the value of a parameter as ROSMaster does: keys end with `/`, and an unset one has `{}`."""
+        self._delivery.push(subscriber, NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), size))
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""

@@ -19,7 +19,7 @@ from appliance.master.call import Answer
 from appliance.master.client import CallFailedError
 from appliance.master.faces import Faces
 from appliance.master.graph import Graph
-from appliance.master.parameters import ParameterMirror, Tree
+from appliance.master.parameters import ParameterMirror, Tree, measure
 from appliance.master.recorder import Recorder
 from appliance.master.registration import NO_SERVICE, stand_in
 from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
@@ -138,7 +138,11 @@ class Reconciler:
                         incarnation.life is Life.LIVE
                         and (one.kind, one.resource) in incarnation.registrations
                     ):
-                        await self._register(incarnation, one)
+                        answer = await self._register(incarnation, one)
+                        if one.kind is Kind.PARAMETER and answer[0] == 1:
+                            # It heard of no change in the meantime, and ROSMaster tells each change once.
+                            value = answer[2]
+                            self._graph.tell_parameter(incarnation, one.resource, value, measure(value)[0])
         except CallFailedError:
             self.wake()
             raise

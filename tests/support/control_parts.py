@@ -143,7 +143,7 @@ class HiddenMaster:
             "lookupService": next(iter(self.tables[Kind.SERVICE].get(asked, {}).values()), ""),
             "hasParam": asked[1:] in self.parameters,
             "getParam": dict(self.parameters),
-            "subscribeParam": self.parameters.get(asked[1:], {}),
+            "subscribeParam": self.parameters.get(asked[1:], {}) if asked != "/" else dict(self.parameters),
             "unsubscribeParam": 1,
             "setParam": 0,
         }

@@ -40,3 +40,36 @@ async def test_what_was_granted_and_not_written_down_is_adopted() -> None:
     await world.reconciler._register(node, Registration(Kind.PUBLICATION, "/second", "t", 0))
     await world.round()
     assert node.resources(Kind.PUBLICATION) == ["/first", "/second"]
+
+
+async def test_a_parameter_that_changed_while_its_node_was_away_is_told() -> None:
+    """What a returned node subscribed to has the value it has now; an unset one is told as ROSMaster tells it."""
+    world = ControlParts()
+    await world.round()
+    node = world.node("/n")
+    for key in ("/speed", "/unset", "/"):
+        await world.register(node, Kind.PARAMETER, key)
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    world.hidden.parameters["speed"] = 2
+    world.clients.silent = set()
+    await world.look(node)
+    assert world.deliveries.told == [
+        ("/n", "paramUpdate", ("/speed/", 2)),
+        ("/n", "paramUpdate", ("/unset/", {})),
+        ("/n", "paramUpdate", ("/", {"run_id": "1", "speed": 2})),
+    ]
+
+
+async def test_a_parameter_that_is_granted_again_is_told() -> None:
+    """The same for a node that could not hear of it because the policy had taken it."""
+    world = ControlParts()
+    await world.round()
+    node = world.node("/n")
+    await world.register(node, Kind.PARAMETER, "/speed")
+    world.reload(NO_SECRET + "[Parameters]\n")
+    await world.settle()
+    world.hidden.parameters["speed"] = 2
+    world.reload(NO_SECRET)
+    await world.settle()
+    assert world.deliveries.told == [("/n", "paramUpdate", ("/speed/", 2))]
