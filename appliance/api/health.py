@@ -1,4 +1,8 @@
-"""`/healthz`, `/readyz`, `/v1/status`: is the process alive, is the appliance in service, how does it stand."""
+"""`/healthz`, `/readyz`, `/v1/status`: is the process alive, are nodes served, how does it stand.
+
+The probes ask control nothing: whether nodes are served was seen at most `history.IDLE_SECONDS` ago, and is looked at
+anew when they were not, at most so often however many ask.
+"""
 
 from typing import Any, Literal
 
@@ -9,6 +13,9 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import StatusWanted
+from appliance.channel.serving import unserved
+
+_PATIENCE_SECONDS = 1.0
 
 
 class _Model(BaseModel):
@@ -44,11 +51,12 @@ class PolicyState(_Model):
 
 
 class AuditState(_Model):
-    """How far the audit log is behind, and why it cannot be written."""
+    """How far the audit log is behind, why it cannot be written, and what becomes of requests then."""
 
     lag_records: int
     lag_seconds: float
     failed: str | None
+    on_failure: Literal["deny", "allow"]
     degraded: str | None
 
 
@@ -90,9 +98,14 @@ def routes(services: Services) -> APIRouter:
         return Health(status="live")
 
     async def ready() -> Health:
-        """Whether the appliance is in service: 503 while it is not; no token needed."""
+        """Whether nodes are served: 503 while they are not; no token needed, so it does not say why."""
         if not services.control.connected:
             raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
+        seen = services.history.seen
+        if seen.status is None or unserved(seen.status) is not None:
+            seen = await services.history.again(_PATIENCE_SECONDS)
+        if seen.status is None or unserved(seen.status) is not None:
+            raise ProblemError(503, "not-served", "nodes are not served: /v1/status says why", retry_after=1)
         return Health(status="ready")
 
     unready: dict[int | str, dict[str, Any]] = {503: {"description": "Not in service."}}

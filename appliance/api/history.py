@@ -18,6 +18,7 @@ from appliance.channel.admin import MetricsWanted
 
 BUSY_SECONDS = 2.0
 IDLE_SECONDS = 10.0
+LEAST_SECONDS = 0.2
 _KEPT_SECONDS = 3600.0
 _MOST = 1800
 _KINDS = ("verdict", "drop", "change", "fault")
@@ -80,16 +81,26 @@ class History:
             await self._news.wait_for(lambda: self.seen.number > number)
             return self.seen
 
+    async def again(self, seconds: float) -> Seen:
+        """What is seen by a look sooner than is due; what was seen last when that takes longer than `seconds`.
+
+        However many ask, there is one look in `LEAST_SECONDS`.
+        """
+        self._sooner.set()
+        with contextlib.suppress(TimeoutError):
+            return await asyncio.wait_for(self.after(self.seen.number), seconds)
+        return self.seen
+
     async def run(self) -> None:
         """Sample until cancelled."""
         while True:
-            await self._look()
             self._sooner.clear()
+            await self._look()
+            until = BUSY_SECONDS if self._followers else IDLE_SECONDS
+            least = min(LEAST_SECONDS, until)
+            await asyncio.sleep(least)
             with contextlib.suppress(TimeoutError):
-                if self._followers:
-                    await asyncio.sleep(BUSY_SECONDS)
-                else:
-                    await asyncio.wait_for(self._sooner.wait(), IDLE_SECONDS)
+                await asyncio.wait_for(self._sooner.wait(), until - least)
 
     async def _look(self) -> None:
         status, sample, away = None, None, None

@@ -23,7 +23,7 @@ def unserved(status: Mapping[str, Any]) -> str | None:
     audit = status["audit"]
     if probe_failed(status):
         return f"the ROS Master is not hidden: {status['probe']}"
-    if audit["failed"]:
+    if audit["failed"] and audit["on_failure"] == "deny":
         return f"the audit log cannot be written: {audit['failed']}"
     relay = no_relay(status["relay"])
     if relay is not None:

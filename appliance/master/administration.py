@@ -68,6 +68,7 @@ class Administration:
         *,
         hosts: Hosts,
         lag: Callable[[], tuple[int, float]],
+        on_audit_failure: str,
         audit_failed: Callable[[], str | None],
         audit_degraded: Callable[[], str | None],
         queued_deliveries: Callable[[], int],
@@ -80,6 +81,7 @@ class Administration:
         self._surroundings = surroundings
         self._hosts = hosts
         self._lag = lag
+        self._on_audit_failure = on_audit_failure
         self._audit_failed = audit_failed
         self._audit_degraded = audit_degraded
         self._queued_deliveries = queued_deliveries
@@ -258,6 +260,7 @@ class Administration:
                 "lag_records": lag_records,
                 "lag_seconds": lag_seconds,
                 "failed": self._audit_failed(),
+                "on_failure": self._on_audit_failure,
                 "degraded": self._audit_degraded(),
                 "forwarding": self._forwarded(),
             },

@@ -204,6 +204,7 @@ class _Control:
             self._lifeline.surroundings,
             hosts=base.hosts,
             lag=lambda: self._audit.lag,
+            on_audit_failure=self._settings.audit.on_audit_failure,
             audit_failed=lambda: self._audit.failed,
             audit_degraded=lambda: self._audit.degraded,
             queued_deliveries=lambda: parts.delivery.waiting,

@@ -8,7 +8,7 @@ from appliance.channel.serving import no_relay, unserved
 
 SERVING: dict[str, Any] = {
     "probe": "passed",
-    "audit": {"failed": None},
+    "audit": {"failed": None, "on_failure": "deny"},
     "relay": "connected",
     "rosmaster": "reachable",
 }
@@ -18,13 +18,17 @@ def test_an_appliance_that_serves() -> None:
     """What status says of a running appliance is no reason, with and without a probe."""
     assert unserved(SERVING) is None
     assert unserved(SERVING | {"probe": ""}) is None
+    assert unserved(SERVING | {"audit": {"failed": "disk full", "on_failure": "allow"}}) is None
 
 
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
         ({"probe": "ROSMaster can be reached"}, "not hidden: ROSMaster can be reached"),
-        ({"audit": {"failed": "disk full"}}, "the audit log cannot be written: disk full"),
+        (
+            {"audit": {"failed": "disk full", "on_failure": "deny"}},
+            "the audit log cannot be written: disk full",
+        ),
         ({"relay": "away"}, "no relay process"),
         ({"relay": "1 of 2 are away"}, "of the relay processes 1 of 2 are away"),
         ({"rosmaster": "being rebuilt"}, "the ROS Master is being rebuilt"),
