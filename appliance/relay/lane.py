@@ -184,6 +184,8 @@ class Lane:
                 telling.told(outcome, place)
             result = outcome.result
             if result == "dropped":
+                if outcome.overwritten:
+                    outcome.restore(body)  # it is told as it was received
                 telling.dropped(outcome, place, body)
                 passage.cut(position, following)
             elif result == "changed":

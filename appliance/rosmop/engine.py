@@ -312,6 +312,7 @@ class MonitorSet:
             self._collect(outcome)
         if message.dropped:
             outcome.result = "dropped"
+            outcome.overwritten = message.overwritten
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer

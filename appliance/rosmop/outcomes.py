@@ -44,6 +44,9 @@ class Outcome:
     `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
     `reason` (it is held, or could not begin).
 
+    `overwritten` is, of a dropped message, what stood in the buffer that came in where actions have written into it
+    (place and bytes, in order): `restore` puts it back.
+
     Most messages have nothing to tell; so there is nothing to make for them but the object itself.
     """
 
@@ -59,10 +62,17 @@ class Outcome:
     changed_by: Sequence[str] = ()
     dropped_by: str = ""
     fatal: Fault | None = None
+    overwritten: Sequence[tuple[int, bytes]] = ()
 
     def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
         self.buffer = buffer
         self.time = time
+
+    def restore(self, buffer: memoryview) -> None:
+        """Make of the buffer that came in what was received; one that cannot be written was left alone."""
+        if not buffer.readonly:
+            for start, old in reversed(self.overwritten):
+                buffer[start : start + len(old)] = old
 
     def __repr__(self) -> str:
         told = {name: value for name, value in vars(self).items() if name != "buffer"}

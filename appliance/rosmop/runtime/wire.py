@@ -5,7 +5,7 @@ from its start. Reading past the end raises `MalformedError` or `struct.error`.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from appliance.rosmop.runtime.context import Context, MalformedError
@@ -141,6 +141,11 @@ class Message:
                 return bytes(self.buffer) != self._original()
             ends = start + len(old)
         return True  # `patch` has compared them
+
+    @property
+    def overwritten(self) -> Sequence[tuple[int, bytes]]:
+        """Where the buffer that came in had other bytes, and which, in order."""
+        return self._written or ()
 
     def patch(self, start: int, new: bytes) -> None:
         """Put bytes in the place of as many."""

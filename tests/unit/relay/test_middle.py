@@ -122,6 +122,20 @@ def test_a_monitor_drops_and_changes_messages_and_control_is_told_before_and_aft
     assert world.event("change", count=1).resource == "/chatter"
 
 
+def test_a_dropped_message_is_told_as_it_was_received(world: Monitored) -> None:
+    """Not as a monitor before the one that dropped it has changed it, in place or to another length."""
+    first = "a() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s[0] = 'X'; s[1] = 'Y'; } }"
+    longer = "b() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s += \"more\"; } }"
+    last = "c() { event e(std::string s) /chatter std_msgs/String '{data:s}' { return; } }"
+    world.load(first, last)
+    publisher, _subscriber = world.typed()
+    other = last.replace("c()", "d()")  # the second drop of a monitor in one second is only counted
+    for revision, texts in enumerate(((first, last), (first, longer, other)), 1):
+        assert isinstance(world.load(*texts, revision=revision), SpecificationsTaken)
+        publisher.send(string("ok then"))
+        assert world.event("drop", count=0).before == string("ok then")[4:]
+
+
 def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:
     """Not with specifications for other topics, and not while its monitor is disabled; then messages are untouched."""
     world.load(GUARD.replace("/chatter", "/other"))
