@@ -11,10 +11,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import structlog
+
 from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.master.registry import Incarnation
-from appliance.ros.xmlrpc import Limits, Value
+from appliance.ros.xmlrpc import FaultReceived, Limits, Value
 
+_log = structlog.get_logger()
 MASTER_NAME = "/master"
 _CALL_BYTES = 200  # a call with nothing in it, and a text with nothing in it, as Python keeps them
 _TEXT_BYTES = 60
@@ -148,7 +151,7 @@ class Delivery:
             try:
                 await self.client(incarnation).call(call.method, MASTER_NAME, *call.parameters)
             except CallFailedError as error:
-                failure = str(error)
+                failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
                 if call.method == "shutdown":
                     return  # a node told to shut down often dies before it answers: that is success
             else:
@@ -156,4 +159,7 @@ class Delivery:
             if attempt + 1 < self._tries:
                 await asyncio.sleep(pause)
                 pause *= 3
-        self._troubled(incarnation, call, failure)
+        if heard:
+            _log.info("a node refused what it was told", node=incarnation.name, call=call.method, why=failure)
+        else:
+            self._troubled(incarnation, call, failure)

@@ -8,7 +8,7 @@ import pytest
 from appliance.master.client import CallFailedError
 from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.registry import Incarnation
-from appliance.ros.xmlrpc import Limits, Value
+from appliance.ros.xmlrpc import FaultReceived, Limits, Value
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -27,13 +27,14 @@ class Node:
     def __init__(self) -> None:
         self.answers = asyncio.Event()
         self.fails = False
+        self.fault: Exception | None = None
         self.heard: list[Value] = []
 
     async def call(self, _method: str, _caller: str, *parameters: Value) -> None:
         """As `XmlRpcClient`."""
         await self.answers.wait()
         if self.fails:
-            raise CallFailedError("it does not answer")
+            raise CallFailedError("it does not answer") from self.fault
         self.heard.append(parameters[0])
 
 
@@ -88,3 +89,13 @@ async def test_a_call_that_stays_undelivered_is_reported() -> None:
     post.push("/a", publishers=[])
     await post.world.settle()
     assert post.lost == [("/n", "/a")]
+
+
+async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
+    """It is not told the same for ever: saying it again later would get the same answer."""
+    post = Post(tries=2)
+    post.node.fails, post.node.fault = True, FaultReceived(1, "not for me")
+    post.node.answers.set()
+    post.push("/a", publishers=[])
+    await post.world.settle()
+    assert post.lost == []
