@@ -142,10 +142,13 @@ class Gate:
 
     def _bound(self, caller: Caller, call: Call, decision: Decision) -> Decision | Contest:
         holder = self._registry.holder(caller.caller_id)
-        if holder is None or holder.host == caller.peer.host:
+        if holder is None:
             return decision
-        if holder.own:
+        # The appliance's own nodes call RVMaster on a listener of their own, but others' outer faces as everybody does.
+        if holder.own and (caller.target is None or holder.host != caller.peer.host):
             return _no(f"the name {holder.name} belongs to the appliance")
+        if holder.host == caller.peer.host:
+            return decision
         if call.identity is Identity.NODE and call.name.startswith("register"):
             if self._policy().takeover == "granted":
                 return decision

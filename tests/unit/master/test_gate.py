@@ -1,18 +1,21 @@
-"""What the gate decides on parameters: the key, what is below it, and what a write would take the place of."""
+"""What the gate decides on parameters (the key, what is below it, what a write replaces) and on names that are held."""
 
 import ipaddress
 from typing import Any
 
 import pytest
 
+from appliance.master.arguments import ApiUri
 from appliance.master.call import Caller
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.gate import Contest, Gate, HostLimits
 from appliance.master.http import Peer
+from appliance.master.node_calls import NODE_CALLS
 from appliance.master.parameters import Tree
-from appliance.master.registry import Registry
+from appliance.master.registry import Incarnation, Kind, Registry
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
+from appliance.ros.uris import parse_node_uri
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
 BASE = """
@@ -117,3 +120,59 @@ def test_without_the_section_everything_is_as_it_was() -> None:
     decision = here.decide(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0), tree)
     assert isinstance(decision, Decision)
     assert decision.allowed
+
+
+API = "http://127.0.0.1:4000/"
+
+
+def held(name: str, host: str, *, own: bool) -> Registry:
+    """A registry in which a node of this host, or one of the appliance's, holds a name."""
+    registry = Registry(NobodyIsKept())
+    address, uri = ipaddress.ip_address(host), parse_node_uri(API)
+    node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)
+    registry.add(node)
+    registry.register(node, Kind.PUBLICATION, "/rosout_agg", "rosgraph_msgs/Log")
+    return registry
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("registerPublisher", ("/rosout_agg", "rosgraph_msgs/Log", API)),
+        ("unregisterPublisher", ("/rosout_agg", API)),
+        ("setParam", ("/key", 1)),
+    ],
+)
+def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
+    method: str, arguments: tuple[Any, ...]
+) -> None:
+    """Without isolation the robot's nodes and the appliance's come from one address: the listener tells them apart."""
+    policy = compile_policy(
+        "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Commands]\ndefault = *\n", file="test.ini"
+    )
+    loopback = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
+    call = MASTER_CALLS[method]
+    given = tuple(ApiUri(API, parse_node_uri(API)) if one == API else one for one in arguments)
+    for own in (True, False):
+        registry = held("/rosout", "127.0.0.1", own=own)
+        here = Gate(lambda: policy, registry, HostLimits())
+        decision = here.decide(Caller(loopback, "/rosout", 0), call, given, {})
+        assert isinstance(decision, Decision)
+        assert decision.allowed is not own
+        itself = here.decide(Caller(loopback, "/rosout", 0, own=True), call, given, {})
+        assert isinstance(itself, Decision)
+        assert itself.allowed
+
+
+def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
+    """The rosout aggregator subscribes at other nodes' outer faces; from another machine nobody does in its name."""
+    policy = compile_policy("[Nodes]\ndefault = *\n[Subscribers]\ndefault = *\n", file="test.ini")
+    here = Gate(lambda: policy, held("/rosout", "127.0.0.1", own=True), HostLimits())
+    uri = parse_node_uri(API)
+    other = Incarnation("other", "/voice", ipaddress.ip_address(OPERATOR), uri, API, OPERATOR, 19003, 19004)
+    for host, allowed in (("127.0.0.1", True), (OPERATOR, False)):
+        peer = Peer(ipaddress.ip_address(host), host, "127.0.0.1")
+        caller = Caller(peer, "/rosout", 0, target=other)
+        decision = here.decide(caller, NODE_CALLS["requestTopic"], ("/rosout", [["TCPROS"]]), {})
+        assert isinstance(decision, Decision)
+        assert decision.allowed is allowed
