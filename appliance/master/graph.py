@@ -41,9 +41,7 @@ class Graph:
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
         """ROSMaster took a registration."""
-        holder = self._registry.holder(incarnation.name)
-        if holder is not None and holder is not incarnation:
-            self.replaced(holder, incarnation)
+        self._take_name(incarnation)
         if kind is Kind.SERVICE:
             for provider in list(self._registry.registered(Kind.SERVICE, resource)):
                 if provider is not incarnation:  # ROSMaster keeps one provider of a service: the last
@@ -104,6 +102,16 @@ class Graph:
     def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
         return any(one is not incarnation for one in self._registry.registered(Kind.SERVICE, service))
 
+    def _take_name(self, incarnation: Incarnation) -> None:
+        """From whoever has it: also from one that has nothing left, and is not to get anything back any more."""
+        other = self._registry.occupant(incarnation.name)
+        if other is None or other is incarnation:
+            return
+        if other.registrations:
+            self.replaced(other, incarnation)
+        for kind, resource in list(other.shelf):
+            self._registry.unshelve(other, kind, resource)
+
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
         """Another incarnation took the name; ROSMaster tells the old one to shut down."""
         lost = self._registry.replace(incarnation, time.time())
@@ -142,6 +150,7 @@ class Graph:
 
         A service that another offers by now stays his: a service has one provider, the last.
         """
+        self._take_name(incarnation)
         for service in incarnation.resources(Kind.SERVICE):
             if self._others_offer(incarnation, service):
                 self.unregistered(incarnation, Kind.SERVICE, service)

@@ -174,7 +174,7 @@ class Liveness:
         return False, ""
 
     async def _lose(self, incarnation: Incarnation, why: str) -> None:
-        if not incarnation.registrations:
+        if not incarnation.registrations and not incarnation.shelf:
             if time.monotonic() - incarnation.touched > _IDLE_SECONDS:
                 self._forget(incarnation)
             return
@@ -189,7 +189,7 @@ class Liveness:
                 self._forget(incarnation)
         elif age > self._settings.shadow:
             self._forget(incarnation)
-        elif answered and self._registry.holder(incarnation.name) is None:
+        elif answered and self._registry.occupant(incarnation.name) is None:
             await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
 
     async def _tell(

@@ -165,6 +165,12 @@ class Registry:
         incarnation = self._live.get(name)
         return incarnation if incarnation is not None and incarnation.registrations else None
 
+    def occupant(self, name: str) -> Incarnation | None:
+        """The live incarnation that holds a name, or would if it were given back what the policy took from it."""
+        incarnation = self._live.get(name)
+        there = incarnation is not None and (incarnation.registrations or incarnation.shelf)
+        return incarnation if there else None
+
     def live(self) -> list[Incarnation]:
         """All live incarnations."""
         return list(self._live.values())

@@ -2,9 +2,10 @@
 
 import pytest
 
+from appliance.master import liveness
 from appliance.master.delivery import NodeCall
 from appliance.master.registry import Kind, Life
-from tests.support.control_parts import POLICY, ControlParts
+from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
 
@@ -100,3 +101,61 @@ async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
     world.liveness.missed(ear, NodeCall("publisherUpdate", ("/secret", [])))
     await world.settle()
     assert world.deliveries.told == [("/ear", "publisherUpdate", ("/secret", []))]
+
+
+async def test_a_node_whose_every_registration_was_taken_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is away while it has nothing: like any other node it is kept, and gets back what is granted again."""
+    monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)
+    world = await parts()
+    node, idle = world.node("/n", 1), world.node("/idle", 2)
+    await world.register(node, Kind.PUBLICATION, "/secret")
+    world.reload(POLICY.format("/secret=\n", ""))
+    await world.settle()
+    world.clients.silent = {"/n", "/idle"}
+    await world.look(node)
+    await world.look(idle)
+    assert world.registry.all() == [node]
+    world.reload(OPEN)
+    world.clients.silent = set()
+    await world.look(node)
+    assert lives(world) == [Life.LIVE]
+    assert world.hidden.has(Kind.PUBLICATION, "/secret") == ["/n"]
+
+
+@pytest.mark.parametrize("away", [False, True], ids=["there", "away"])
+async def test_who_had_a_name_before_gets_nothing_back(away: bool) -> None:
+    """Everything was taken from a node, and another life has its name now: a rollback is for that one."""
+    world = await parts()
+    first, second = world.node("/n", 1), world.node("/n", 2)
+    await world.register(first, Kind.PUBLICATION, "/secret")
+    world.reload(POLICY.format("/secret=\n", ""))
+    await world.settle()
+    if away:
+        world.clients.silent = {"/n"}
+        await world.look(first)
+        world.clients.silent = set()
+    await world.register(second, Kind.PUBLICATION, "/plain")
+    world.reload(OPEN)
+    await world.look(first)
+    assert world.registry.holder("/n") is second
+    assert [one for one in world.registry.live() if one.name == "/n"] == [second]
+    assert first.resources(Kind.PUBLICATION) == []
+    assert world.hidden.nodes["/n"] == world.faces.inner_uri(second)
+
+
+async def test_a_node_that_returns_leaves_the_name_to_one_that_everything_was_taken_from() -> None:
+    """Who holds a name by what the policy took from it is still who has the name, when all is granted again."""
+    world = await parts()
+    first, second = world.node("/n", 1), world.node("/n", 2)
+    await world.register(first, Kind.PUBLICATION, "/plain")
+    world.clients.silent = {"/n"}
+    await world.look(first)
+    world.clients.silent = set()
+    await world.register(second, Kind.PUBLICATION, "/secret")
+    world.reload(POLICY.format("/secret=\n", ""))
+    await world.settle()
+    await world.look(first)
+    assert first.life is Life.SHADOW
+    world.reload(OPEN)
+    await world.settle()
+    assert world.registry.holder("/n") is second
