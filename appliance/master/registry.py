@@ -229,7 +229,8 @@ class Registry:
         for registration in incarnation.registrations.values():
             self._order = max(self._order, registration.order)
         if incarnation.life is Life.LIVE:
-            self._live[incarnation.name] = incarnation
+            if self.occupant(incarnation.name) is None:
+                self._live[incarnation.name] = incarnation
             for registration in incarnation.registrations.values():
                 self._index(incarnation, registration)
 
@@ -308,7 +309,9 @@ class Registry:
         if self._by_key.pop(incarnation.key, None) is not None:
             self._nodes_of[incarnation.host] -= 1
             self._registrations_of[incarnation.host] -= len(incarnation.registrations)
-        self._known.pop((incarnation.name, incarnation.host, incarnation.api_text), None)
+        identity = incarnation.name, incarnation.host, incarnation.api_text
+        if self._known.get(identity) is incarnation:
+            del self._known[identity]
         self._journal.incarnation_forgotten(incarnation.key)
 
     def _retire(self, incarnation: Incarnation, life: Life, when: float) -> None:

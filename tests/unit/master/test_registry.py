@@ -3,6 +3,7 @@
 import ipaddress
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -98,3 +99,27 @@ def test_the_one_that_was_lost_first_makes_room() -> None:
     registry.overshadow(known[1], 7.0)
     assert registry.spare_of(HOSTS[0]) is known[2]
     assert registry.spare_of(HOSTS[1]) is None
+
+
+def test_forgetting_one_life_leaves_the_next_findable() -> None:
+    """Two incarnations of one identity (name, host and URI again): the later one is found when the first is dropped."""
+    registry = Registry(Journal())
+    first, second = incarnation(0), incarnation(0)
+    registry.add(first)
+    registry.replace(first, 1.0)
+    registry.add(second)
+    registry.forget(first)
+    assert registry.find(second.name, second.host, second.api_text) is second
+    registry.forget(second)
+    assert registry.find(second.name, second.host, second.api_text) is None
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_name_is_restored_to_the_one_that_has_something(order: tuple[int, int]) -> None:
+    """An idle life of a node, kept as live beside the one that has its name, does not take it at a restart."""
+    known = [incarnation(0), incarnation(3)]
+    known[1].registrations[Kind.PUBLICATION, "/x"] = Registration(Kind.PUBLICATION, "/x", "t", 1)
+    registry = Registry(Journal())
+    for number in order:
+        registry.restore(known[number])
+    assert registry.holder("/n0") is known[1]
