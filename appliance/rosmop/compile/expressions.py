@@ -153,7 +153,10 @@ def _message_constant(scope: Scope, node: tree.Name) -> Value:
     except UnknownNameError as error:
         raise SpecificationError.at(node.position, str(error)) from None
     value = found.value.encode("utf-8", "surrogateescape") if isinstance(found.value, str) else found.value
-    return constant_value(node.position, PRIMITIVES[found.type], value)
+    kind = PRIMITIVES[found.type]
+    if kind == kinds.FLOAT and not isinstance(value, bytes):
+        value = f32(value)
+    return constant_value(node.position, kind, value)
 
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:

@@ -6,8 +6,10 @@ import struct
 
 import pytest
 
+from appliance.ros.definitions import Definitions
+from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
-from tests.unit.rosmop.acting import STORE, fields, load, message, refused
+from tests.unit.rosmop.acting import STORE, definitions, fields, load, message, refused
 
 
 def event(kind: str, parameters: str, pattern: str, body: str, rest: str = "") -> str:
@@ -105,6 +107,20 @@ def test_a_constant_in_a_pattern(
     assert process(text, message(kind, **other)).events == ()
 
 
+def test_a_float_constant_of_a_message_is_a_float() -> None:
+    """It is rounded to 32 bits, as the field that holds it is: the two are equal."""
+    own = definitions().extended(Definitions.from_files({"own/C.msg": "float32 LIMIT=0.1\nfloat32 x\n"}))
+    text = event(
+        "own/C",
+        "float x",
+        "x:x",
+        'ROS_INFO("%d %d", x == own::C::LIMIT, (double) own::C::LIMIT == 0.1);',
+    )
+    monitors = MonitorSet.load({"x.rv": text}, own)
+    monitors.start(0)
+    assert [line.text for line in monitors.process("/t", struct.pack("<f", 0.1), 1).log] == ["1 0"]
+
+
 UINT8S, INT8S = "std_msgs/UInt8MultiArray", "std_msgs/Int8MultiArray"
 RECAST = [
     (UINT8S, "char[] d", [200, 7], '"%d %d", d[0], d[1]', "-56 7"),
@@ -143,6 +159,27 @@ def test_bytes_are_converted_where_they_are_written(
     outcome = process(event(kind, parameter, "data:d", body), message(kind, data=data))
     assert not outcome.faults, outcome.faults
     assert list(fields(kind, bytes(outcome.buffer)).data) == written
+
+
+BOUND_TWICE = [
+    ("double[] p, double a", "position:p, position[0]:a", "a = 9;"),
+    ("double[] p, double a", "position:p, position[0]:a", "p[0] = 9;"),
+    ("double a, double b", "position[1]:a, position[1]:b", "b = 9;"),
+    ("std_msgs/Header h, int a", "header:h, header.seq:a", "a = 9;"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "pattern", "body"), BOUND_TWICE)
+def test_a_field_that_is_assigned_is_bound_once(parameters: str, pattern: str, body: str) -> None:
+    """Also as part of a whole that is bound: one change would undo the other."""
+    found = refused(event("sensor_msgs/JointState", parameters, pattern, body))
+    assert "two bindings hold this field" in found[0].text
+
+
+def test_two_elements_of_an_array_are_two_fields() -> None:
+    """Both may be assigned."""
+    text = event("sensor_msgs/JointState", "double a, double b", "position[0]:a, position[1]:b", "a = b = 9;")
+    assert list(fields("sensor_msgs/JointState", bytes(process(text, JOINTS).buffer)).position) == [9, 9]
 
 
 BAD_CONSTANTS = [
