@@ -241,7 +241,7 @@ def _assemble(
     lines.add("b = m.buffer")
     read_fields(scope, bound)
     written = [each for each in bound if each.variable is not None and each.variable.assigned]
-    check_overlaps(scope, bound, written)
+    check_overlaps(bound, written)
     for each in written:
         assert each.variable is not None
         lines.add(f"{each.variable.flag} = False")

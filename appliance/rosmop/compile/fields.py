@@ -173,19 +173,20 @@ def write_back(scope: Scope, written: list[Bound]) -> None:
     lines.add(f"if {edits}: m.splice({edits})")
 
 
-def check_overlaps(scope: Scope, bound: list[Bound], written: list[Bound]) -> None:
+def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:
     """Refuse an assignment to a field that is bound twice: one change would undo the other."""
     for each in written:
-        path = _path(each)
         for other in bound:
-            shorter = min(len(path), len(_path(other)))
-            if other is not each and path[:shorter] == _path(other)[:shorter]:
+            if other is not each and _overlap(each.binding, other.binding):
                 raise SpecificationError.at(
                     max(each, other, key=lambda one: one.binding.position).binding.position,
                     "two bindings hold this field, and one of them is assigned; bind it once",
                 )
-    del scope
 
 
-def _path(each: Bound) -> list[tuple[str, int | None]]:
-    return [(step.name, step.index) for step in each.binding.path]
+def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
+    """Whether one is the other or a part of it; an array without an index is all its elements."""
+    return all(
+        step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
+        for step, beside in zip(one.path, other.path, strict=False)
+    )
