@@ -101,8 +101,7 @@ class Engine:
         elif isinstance(message, MonitorSwitched):
             self._middle.switch(message.name, message.enabled)
         elif isinstance(message, MonitorResumed):
-            self._middle.resume(message.name)
-            self._ask_for_latched()
+            self._ask_for_latched(self._middle.resume(message.name))
         elif isinstance(message, OwnHeaderStated):
             self._state_header(message)
         elif isinstance(message, OwnPublished):
@@ -209,19 +208,23 @@ class Engine:
         through = middle.lane(key, topic).through if middle.stands(topic) else None
         relayed.monitor(through, wanted=middle.wants(topic))
 
-    def _monitors_changed(self) -> None:
+    def _monitors_changed(self, topics: frozenset[str] | None) -> None:
         for relayed, publisher in list(self._topics.values()):
             publisher.judge_again()
             if isinstance(publisher, Publisher):
                 self._let_monitor(relayed)
         for client in list(self._clients):
             client.judge_again()
-        self._ask_for_latched()
+        self._ask_for_latched(topics)
 
-    def _ask_for_latched(self) -> None:
-        """What monitors kept back of a latching publisher may go through now: it gives it to a new connection."""
+    def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
+        """What monitors kept back of a latching publisher may go through now: it gives it to a new connection.
+
+        Only of these topics (None: all); what did not change would judge the same message twice.
+        """
         for relayed, publisher in list(self._topics.values()):
-            if relayed.lacks_latched and isinstance(publisher, Publisher):
+            concerned = topics is None or relayed.topic in topics
+            if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
                 publisher.connect_anew()
 
     def _state_header(self, message: OwnHeaderStated) -> None:

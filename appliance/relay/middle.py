@@ -15,7 +15,7 @@ Invariants:
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from appliance.channel.messages import (
@@ -31,6 +31,7 @@ from appliance.relay.observations import SHOWN, Observations
 from appliance.relay.report import Reporter
 from appliance.relay.telling import Telling, refusal
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
 
 _AFTER_DEFECT = 1.0
@@ -47,7 +48,8 @@ class Judged:
 class Middle:
     """The monitors of one relay.
 
-    `publish(published)` sends what a monitor publishes; `changed()` is called when other topics may be wanted.
+    `publish(published)` sends what a monitor publishes; `changed(topics)` is called when other topics may be wanted,
+    with those whose messages may fare otherwise now (None: all).
     """
 
     def __init__(self, loop: Loop, reporter: Reporter) -> None:
@@ -65,7 +67,7 @@ class Middle:
         self._compiler = Compiler(loop, self._compiled)
         self.observations = Observations(loop, reporter, self._rows)
         self.publish: Callable[[Published], None] = lambda published: None  # noqa: ARG005 - set by the engine
-        self.changed: Callable[[], None] = lambda: None
+        self.changed: Callable[[frozenset[str] | None], None] = lambda topics: None  # noqa: ARG005 - set by the engine
         self.telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
 
     # --- what control states ---
@@ -76,7 +78,7 @@ class Middle:
         if self._compiler.busy:
             self._compiler.later(message)
         elif self._stated is not None and not self.blocked and _same(message, self._stated):
-            self._taken(message, [])
+            self._taken(message, [], frozenset())
         elif self._stated is None or self.blocked:
             self._compiler.now(message)
         else:
@@ -87,7 +89,7 @@ class Middle:
         if isinstance(result, list):
             self._refuse(message, result)
             return
-        before, now = self.monitors, self.now()
+        before, now, blocked = self.monitors, self.now(), self.blocked
         outcome = (
             result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
         )
@@ -99,18 +101,19 @@ class Middle:
             )
         self.telling.keep([one.name for one in result.monitors], began, now)
         self.telling.told(outcome, ("", ""))
-        self._taken(message, began)
+        anew = None if before is None or blocked else _topics(_replaced(before, result))
+        self._taken(message, began, anew)
 
-    def _taken(self, message: SpecificationsStated, began: list[str]) -> None:
+    def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
         self.look_again()
         held: list[str] = []
         if self.monitors is not None:
-            now = self.now()
-            for monitor in self.monitors.monitors:
-                self.monitors.set_enabled(monitor.name, self._switches.get(monitor.name, True), now)
+            switches = {one.name: self._switches.get(one.name, True) for one in self.monitors.monitors}
+            switched = _topics(self.monitors.switch(switches, self.now()))
+            anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
         self.schedule()
-        self.changed()
+        self.changed(anew)
         self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
@@ -118,23 +121,28 @@ class Middle:
         if self.monitors is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
-        self.changed()
+            self.changed(None)
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
         """Let the events of a monitor happen, or not; an unknown name is fine (it is gone)."""
         self.look_again()
         self._switches[name] = enabled
-        if self.monitors is not None and any(one.name == name for one in self.monitors.monitors):
-            self.monitors.set_enabled(name, enabled, self.now())
-            self.schedule()
-            self.changed()
+        if self.monitors is not None:
+            switched = self.monitors.switch({name: enabled}, self.now())
+            if switched:
+                self.schedule()
+                self.changed(_topics(switched))
 
-    def resume(self, name: str) -> None:
-        """Let the topics of a monitor that holds them go on."""
+    def resume(self, name: str) -> frozenset[str]:
+        """Let the topics of a monitor that holds them go on; they."""
         self.look_again()
-        if self.monitors is not None and any(one.name == name for one in self.monitors.monitors):
-            self.monitors.resume(name)
+        held = (
+            [one for one in self.monitors.monitors if one.name == name and one.held] if self.monitors else []
+        )
+        for monitor in held:
+            monitor.held = False
+        return _topics(held)
 
     # --- what is asked when something changes ---
 
@@ -273,6 +281,16 @@ class Middle:
             return
         self.spent += time.thread_time() - began
         self.schedule()
+
+
+def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
+    return frozenset(step.event.topic for one in monitors for step in one.steps if step.event.topic)
+
+
+def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
+    """The monitors of both sets that do not go on as they were."""
+    kept = {monitor.name for monitor in after.monitors} - set(after.began)
+    return [one for each in (before, after) for one in each.monitors if one.name not in kept]
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:

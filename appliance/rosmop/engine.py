@@ -209,16 +209,28 @@ class MonitorSet:
 
         Time that passed meanwhile does not count: timers and properties with time bounds begin anew.
         """
-        monitor = self.monitor(name)
-        if enabled and not monitor.enabled:
-            for timer in monitor.timers:
-                timer.due = time_ns + timer.period
-            for running in monitor.properties:
-                if running.code.property.timed:
-                    running.run = running.code.property.start(time_ns)
-        monitor.enabled = enabled
-        self._index()
-        self._schedule()
+        self.monitor(name)
+        self.switch({name: enabled}, time_ns)
+
+    def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[Monitor, ...]:
+        """The same of many at once, unknown ones left out; those that were not so already."""
+        changed = []
+        for monitor in self._monitors:
+            wanted = enabled.get(monitor.name, monitor.enabled)
+            if wanted is monitor.enabled:
+                continue
+            changed.append(monitor)
+            monitor.enabled = wanted
+            if wanted:
+                for timer in monitor.timers:
+                    timer.due = time_ns + timer.period
+                for running in monitor.properties:
+                    if running.code.property.timed:
+                        running.run = running.code.property.start(time_ns)
+        if changed:
+            self._index()
+            self._schedule()
+        return tuple(changed)
 
     def resume(self, name: str) -> None:
         """Let a held specification carry its topics again; raises KeyError."""

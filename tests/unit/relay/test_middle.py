@@ -19,6 +19,7 @@ from appliance.channel.messages import (
     SpecificationsRefused,
     SpecificationsStated,
     SpecificationsTaken,
+    UpstreamWanted,
 )
 from appliance.relay.lane import TOO_LONG
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
@@ -382,6 +383,27 @@ def test_a_latched_message_that_a_monitor_dropped_comes_when_it_is_replaced(worl
     again = world.upstream(latching)
     again.send(string("bad"))
     world.gets(subscriber, string("bad"))
+
+
+def test_a_change_of_other_monitors_gives_no_latched_message_again(world: Monitored) -> None:
+    """Neither a load, a refused one, a switch nor a resumption; one of the monitors of the topic does."""
+    latching = TYPED | {"latching": "1"}
+    other = "other() { event e() /elsewhere std_msgs/String '{}' { } }"
+    held = "hold other() { event e() /elsewhere std_msgs/String '{}' { return; } }"
+    world.load(GUARD, other)
+    world.connect(encode_header(WANTED))
+    publisher = world.upstream(latching)
+    publisher.send(string("bad"))
+    world.event("drop")
+    world.load(GUARD, held, revision=2)
+    world.load(GUARD, held, revision=2, other=False)
+    world.load(GUARD, "nonsense", revision=3)
+    world.state(MonitorSwitched("other", True))
+    world.state(MonitorResumed("other"))
+    world.load(GUARD, revision=4)
+    assert not [one for one in world.told if isinstance(one, UpstreamWanted)]
+    world.state(MonitorSwitched("guard", False))
+    world.upstream(latching)
 
 
 LATCH = """
