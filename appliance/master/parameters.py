@@ -236,9 +236,18 @@ async def set_param(master: "Master", caller: Caller, arguments: tuple[object, .
     key, value = str(arguments[0]), cast(Value, arguments[1])
     master.parameters.check(key, value)
     answer = await master.rosmaster.call("setParam", caller.caller_id, key, value)
-    if answer[0] == 1:
+    if _is_set(answer, key, value):
         master.parameters.set(key, value)
     return answer
+
+
+def _is_set(answer: Answer, key: str, value: Value) -> bool:
+    """Whether ROSMaster has a value now, by its answer to `setParam`.
+
+    It has it before it looks whom to tell, and answers with an error when that fails (a name with a slash in a
+    dictionary, and somebody who subscribed to what it looks like). What it does not take is a root that is none.
+    """
+    return answer[0] == 1 or key != "/" or isinstance(value, dict)
 
 
 async def in_order(
@@ -287,11 +296,11 @@ async def _send(master: "Master", calls: list[Wanted]) -> list[Answer | Exceptio
     except CallFailedError as error:
         return [error] * len(calls)
     for (method, (_caller_id, key, *value)), outcome in zip(calls, outcomes, strict=True):
-        if isinstance(outcome, Exception) or outcome[0] != 1:
+        if isinstance(outcome, Exception):
             continue
-        if method == "setParam":
+        if method == "setParam" and _is_set(outcome, str(key), value[0]):
             master.parameters.set(str(key), value[0])
-        elif method == "deleteParam":
+        elif method == "deleteParam" and outcome[0] == 1:
             master.parameters.delete(str(key))
     return outcomes
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from appliance.master.call import Caller, LimitReachedError
 from appliance.master.client import CallFailedError
 from appliance.master.http import Peer
-from appliance.master.parameters import ParameterMirror, in_order, measure
+from appliance.master.parameters import ParameterMirror, in_order, measure, set_param
 from appliance.ros.errors import EncodingError, ProtocolError
 from tests.support.nodes import PYTHON
 
@@ -29,6 +29,15 @@ for line in sys.stdin:
         except (KeyError, TypeError):
             pass
     print(json.dumps(tree.parameters), flush=True)
+"""
+WHOLE = """
+import json, sys
+from rosmaster.master_api import ROSMasterHandler
+master = ROSMasterHandler()
+master.subscribeParam("/node", "http://127.0.0.1:9/", "/q/b/c")
+answers = [master.setParam("/me", key, value)[0] for key, value in json.loads(sys.argv[1])]
+print(json.dumps([answers, master.getParam("/me", "/")[2]]), flush=True)
+master._shutdown()
 """
 PART = st.sampled_from(["a", "b", "c"])
 KEY = st.lists(PART, min_size=1, max_size=4).map(lambda parts: "/" + "/".join(parts))
@@ -217,3 +226,32 @@ def test_changes_made_once_more_leave_the_same_tree(
     again = ParameterMirror(tree, lambda: None, since=noted[first:])
     assert again.tree == mirror.tree
     assert again.weight == mirror.weight
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
+def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
+    """ROSMaster keeps a value before it finds that it cannot tell those who subscribed: the mirror has it, too."""
+    steps: list[Any] = [["/q", {"b": 1, "b/c": 2}], ["/", 7], ["/r", 3]]
+    answered = subprocess.run(
+        [PYTHON, "-c", WHOLE, json.dumps(steps)], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    codes, tree = json.loads(answered.splitlines()[-1])
+    assert codes[:2] == [-1, -1]
+
+    class Failing(OrderedServer):
+        """ROSMaster with the answers that the real one gave."""
+
+        async def call_in_order(self, calls: Any) -> list[Any]:
+            keys = [key for key, _ in steps]
+            return [[codes[keys.index(params[1])], method, 0] for method, params in calls]
+
+    server = Failing(ParameterMirror({}, lambda: None))
+    calls = [("setParam", key, copy.deepcopy(value)) for key, value in steps]
+    if together:
+        ordered(server, *calls)
+    else:
+        peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
+        for _method, *arguments in calls:
+            asyncio.run(set_param(server, Caller(peer, "/me", 0), tuple(arguments)))  # type: ignore[arg-type]  # same
+    assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
+    assert server.parameters.weight == measure(server.parameters.tree)[0]
