@@ -25,6 +25,7 @@ from appliance.channel.messages import (
     TunnelsEnclosed,
 )
 from appliance.network.namespaces import NetworkError
+from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure
 
 PROBE_SECONDS = 60.0
@@ -141,6 +142,7 @@ async def in_thread(function: Callable[[], T]) -> T:
             answer()
 
     def work() -> None:
+        signals.block()
         try:
             result = function()
         except BaseException as error:  # noqa: BLE001  handed to the caller, who waits for it

@@ -9,6 +9,7 @@ import structlog
 
 from appliance.config import Settings
 from appliance.network.firewall.iptables import load_modules
+from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free
@@ -56,6 +57,17 @@ def run_appliance(
         )
     keep_supervisors()
     refuse_half_restored(settings.state)
+    with signals.held():
+        _run(settings, roles, ready, node_ports)
+
+
+def _run(
+    settings: Settings,
+    roles: tuple[Role, ...],
+    ready: Callable[[ControlReady, Settings], None],
+    node_ports: range,
+) -> None:
+    """From the state directory's lock to the last rule that is taken away, whatever signals come meanwhile."""
     state = StateDirectory(settings.state)
     try:
         settings = _with_ports(settings)

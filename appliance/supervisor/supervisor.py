@@ -48,7 +48,7 @@ from appliance.channel.messages import (
     TunnelsWanted,
 )
 from appliance.ipsec.charon import PROGRAM as CHARON
-from appliance.supervisor import health
+from appliance.supervisor import health, signals
 from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.ending import end_all
 from appliance.supervisor.errors import StartError
@@ -133,6 +133,12 @@ class Supervisor:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
         loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(PolicyReloadRequested()))
+        with signals.heard():
+            await self._serve()
+        if self._failure is not None:
+            raise StartError(self._failure)
+
+    async def _serve(self) -> None:
         self._spawn(self._watch())
         try:
             await self._start()
@@ -143,8 +149,6 @@ class Supervisor:
             self._kept.close()
             for listener in self._listeners.values():
                 listener.close()
-        if self._failure is not None:
-            raise StartError(self._failure)
 
     def stop(self, failure: str | None = None) -> None:
         """End the appliance; `failure` is why it cannot go on, nothing for an orderly end."""

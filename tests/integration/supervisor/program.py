@@ -6,6 +6,7 @@ Everything that any process says comes on standard output, one JSON object per l
 
 import json
 import os
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,28 @@ class Leaky(Enclosure):
         return "ROSMaster can be reached by another user"
 
 
+class Interrupted(Enclosure):
+    """Surroundings in whose making, or taking away, somebody ends the program, in more than one way."""
+
+    def __init__(self, when: str) -> None:
+        self.when = when
+
+    def build(self) -> None:
+        """Says when it was made."""
+        self._interrupt("build")
+        _say(event="built")
+
+    def remove(self) -> None:
+        """Says when it was taken away."""
+        self._interrupt("remove")
+        _say(event="removed")
+
+    def _interrupt(self, when: str) -> None:
+        if when == self.when:
+            for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGTERM):
+                os.kill(os.getpid(), number)
+
+
 def main() -> None:
     """Run until told to stop."""
     os.dup2(1, 2)
@@ -42,6 +65,10 @@ def main() -> None:
     for one in sys.argv[2:]:
         if one == "leaky":
             mock.patch.object(run, "enclosure_of", return_value=Leaky()).start()
+            continue
+        if one.startswith("interrupted="):
+            made = Interrupted(one.partition("=")[2])
+            mock.patch.object(run, "enclosure_of", return_value=made).start()
             continue
         role, _, entry = one.partition("=")
         actors[role] = entry

@@ -210,6 +210,27 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.process.seen(event="process did not end") == []
 
 
+def test_an_end_while_the_surroundings_are_made_takes_them_away(start: Any, state: Path) -> None:
+    """SIGTERM, Ctrl-C or a terminal that goes away before the first process: an orderly end, nothing is left."""
+    running = start("interrupted=build")
+    assert running.process.wait() == 0
+    assert [one["event"] for one in running.process.seen() if one.get("event") in {"built", "removed"}] == [
+        "built",
+        "removed",
+    ]
+    assert running.process.seen(event="ready") == []
+    assert (state / "lock").read_text() == ""
+    running.until_childless()
+
+
+def test_a_second_end_does_not_interrupt_the_first(start: Any, state: Path) -> None:
+    """Who is impatient (Ctrl-C twice) gets the same end: the surroundings are taken away, exit status 0."""
+    running = start("interrupted=remove").until_ready()
+    assert running.process.stop(with_signal=signal.SIGTERM) == 0
+    assert running.process.seen(event="removed")
+    assert (state / "lock").read_text() == ""
+
+
 def test_control_may_end_the_appliance(start: Any) -> None:
     """The `shutdown` call of the Master API, once granted, ends it as SIGTERM would."""
     running = start().until_ready()
@@ -289,6 +310,7 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None
         assert {status[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
         assert status["NoNewPrivs"] == "1"
         assert status["Umask"] == "0077"
+        assert status["SigBlk"] == "0" * 16  # it ends when it is asked to
 
 
 def test_the_supervisor_keeps_few_capabilities(start: Any) -> None:
