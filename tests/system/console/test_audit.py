@@ -62,6 +62,22 @@ def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: 
     assert numbers[0] - numbers[-1] == len(numbers) - 1
 
 
+def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -> None:
+    """A list that is followed for long drops its oldest records, and goes on from the last one that it has."""
+    page = opened().go("audit")
+    added = """async (state) => {
+      const { added } = await import("/console/static/js/audit/records.js");
+      return added(state, { sequence: 9 });
+    }"""
+    rows = [{"sequence": number} for number in (8, 7, 6)]
+    kept = page.evaluate(added, {"records": rows, "cursor": None, "most": 3})
+    assert [one["sequence"] for one in kept["records"]] == [9, 8, 7]
+    assert kept["cursor"] == "7"
+    whole = page.evaluate(added, {"records": rows, "cursor": None, "most": 4})
+    assert [one["sequence"] for one in whole["records"]] == [9, 8, 7, 6]
+    assert whole["cursor"] is None
+
+
 def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
     """Verify says that the chain is whole; Export gives what the filter finds as a file of JSON lines."""
     refuse(attempt, "/exported")

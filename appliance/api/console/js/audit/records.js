@@ -5,13 +5,13 @@ import { follow } from "../events.js";
 import { get, queryText } from "../rest.js";
 
 const PAGE = 100;
-const KEPT = 2000;
+const KEPT = 2000; // while it is followed; what the reader asked for by hand comes on top
 const PAUSE = 250; // after the last key of a search
 
 /** @param {Record<string, string>} filter @param {boolean} following */
 export function useRecords(filter, following) {
   const key = JSON.stringify(filter);
-  const [state, setState] = useState({ records: /** @type {any[] | null} */ (null), cursor: /** @type {string | null} */ (null), error: /** @type {unknown} */ (null), loading: true });
+  const [state, setState] = useState({ records: /** @type {any[] | null} */ (null), cursor: /** @type {string | null} */ (null), most: KEPT, error: /** @type {unknown} */ (null), loading: true });
   const [standing, setStanding] = useState(/** @type {import("../events.js").Standing | null} */ (null));
   const [round, setRound] = useState(0);
   const first = useRef(true);
@@ -22,7 +22,7 @@ export function useRecords(filter, following) {
     const timer = setTimeout(async () => {
       try {
         const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE }, controller.signal);
-        setState({ records, cursor, error: null, loading: false });
+        setState({ records, cursor, most: KEPT, error: null, loading: false });
       } catch (error) {
         if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
       }
@@ -40,7 +40,7 @@ export function useRecords(filter, following) {
     const { until, since, ...rest } = filter;
     const newest = state.records?.[0]?.sequence;
     const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
-      if (event === "record") setState((state) => ({ ...state, records: added(state.records ?? [], record) }));
+      if (event === "record") setState((state) => ({ ...state, ...added(state, record) }));
     }, setStanding, newest ? String(newest) : null);
     return () => {
       running.stop();
@@ -52,7 +52,7 @@ export function useRecords(filter, following) {
     if (!state.cursor) return;
     try {
       const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE, cursor: state.cursor });
-      setState((state) => ({ ...state, records: [...(state.records ?? []), ...records], cursor, error: null }));
+      setState((state) => ({ ...state, records: [...(state.records ?? []), ...records], cursor, most: state.most + records.length, error: null }));
     } catch (error) {
       setState((state) => ({ ...state, error }));
     }
@@ -60,7 +60,14 @@ export function useRecords(filter, following) {
   return { ...state, standing, older, again: () => setRound(round + 1) };
 }
 
-function added(/** @type {any[]} */ records, /** @type {any} */ record) {
-  if (records.length && record.sequence <= records[0].sequence) return records;
-  return [record, ...records].slice(0, KEPT);
+/**
+ * The list with one record more; what falls off its end is fetched again from `cursor` on.
+ * @param {{records: any[] | null, cursor: string | null, most: number}} state @param {any} record
+ */
+export function added({ records, cursor, most }, record) {
+  const before = records ?? [];
+  if (before.length && record.sequence <= before[0].sequence) return { records: before, cursor };
+  if (before.length < most) return { records: [record, ...before], cursor };
+  const kept = [record, ...before].slice(0, most);
+  return { records: kept, cursor: String(kept[kept.length - 1].sequence) };
 }
