@@ -142,7 +142,9 @@ class StateStore:
         )  # fmt: skip
         self._database.submit("DELETE FROM relay_port WHERE key = ?", (row.key,))
         for relay, port in enumerate(row.more_relay_ports, start=1):
-            self._database.submit("INSERT INTO relay_port VALUES (?, ?, ?)", (row.key, relay, port))
+            self._database.submit(
+                "INSERT OR REPLACE INTO relay_port VALUES (?, ?, ?)", (row.key, relay, port)
+            )
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""

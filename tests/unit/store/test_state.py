@@ -1,9 +1,11 @@
 """The tables of control's state file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from appliance.store.ahead import Statement, WriteAhead
 from appliance.store.state import (
     LARGEST_CHANGE,
     IncarnationRow,
@@ -38,6 +40,42 @@ def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
     again = reopened(tmp_path)
     assert again.load_registry() == ([incarnation("k1")], [first, second])
     again.close()
+
+
+def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever control was killed, the next one starts and finds the registry, though the database had it already."""
+    statements: list[Statement] = []
+    append = WriteAhead.append
+
+    def observed(ahead: WriteAhead, statement: Statement) -> None:
+        statements.append(statement)
+        append(ahead, statement)
+
+    monkeypatch.setattr(WriteAhead, "append", observed)
+    node = replace(incarnation("k1"), more_relay_ports=(19003, 19004))
+    registration = RegistrationRow("k1", "publication", "/a", "*", 1)
+    grant = PermissionRow("k1", "topic", "/a", "10.0.0.9", "/listener")
+    store = reopened(tmp_path)
+    store.save_incarnation(node)
+    store.save_registration(registration)
+    store.save_permission(grant)
+    store.note_parameter("/a", 1)
+    store.save_revision(RevisionRow(1, "text", "p.ini", 1.0, "disk", "note"))
+    store.save_setting("name", "value")
+    store.save_incarnation(node)
+    store.close()
+    monkeypatch.undo()
+    for begin in range(len(statements)):
+        ahead = WriteAhead(tmp_path / "state.ahead")
+        for statement in statements[begin:]:
+            ahead.append(statement)
+        ahead.close()
+        again = reopened(tmp_path)
+        assert again.load_registry() == ([node], [registration])
+        assert again.permissions() == [grant]
+        again.close()
 
 
 def test_a_forgotten_incarnation_takes_all_it_had_with_it(tmp_path: Path) -> None:
