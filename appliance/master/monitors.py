@@ -4,7 +4,8 @@ The folder is the baseline and only read; what is loaded, replaced or removed wh
 the store and survives a restart. New specifications are compiled before anything changes; bad ones change nothing
 and say everything that is wrong with them. The relay compiles them again and has the last word.
 
-Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says.
+Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
+with its monitor: another that is loaded later under the same name is as if nobody had switched it.
 
 What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
 a change that is meant for another tag than the present one is refused.
@@ -260,15 +261,22 @@ class Monitors:
             return changed
 
     async def resume(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
-        """Let the topics of held monitors go on; which were held. Raises `UnknownMonitorError`."""
+        """Let the topics of held monitors go on; which were held.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for those whose relay process is away: the one
+        that comes will hold them.
+        """
         async with self._changing:
             self._expect(expected)
             self._all_known(names)
             held = [name for name in dict.fromkeys(names) if name in self.held]
             if held:
                 await self._count()
+            away = []
             for name in held:
-                self._stating.tell(name, messages.MonitorResumed(name))
+                if not self._stating.tell(name, messages.MonitorResumed(name)):
+                    away.append(name)
+                    continue
                 self._stating.resumed(name)
                 self._recorder.happened(
                     "monitor resumed",
@@ -278,6 +286,11 @@ class Monitors:
                     resource=name,
                     who=who,
                 )
+            if away:
+                text = (
+                    f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
+                )
+                raise SpecificationsRefusedError([text])
             return held
 
     # --- what the relay says ---
@@ -382,6 +395,10 @@ class Monitors:
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.revision = sources, checked, row.revision
         self.who, self.note, self.loaded = row.who, row.note, row.loaded
+        left = {name: enabled for name, enabled in self._switches.items() if name in checked.monitors}
+        if left != self._switches:
+            self._switches = left
+            self._store.save_setting(_SWITCHES, json.dumps(left))
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:

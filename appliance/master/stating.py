@@ -102,9 +102,9 @@ class Stating:
         """The relay that has a monitor."""
         return self.allocation.of_file(self._now.checked.monitors[monitor])
 
-    def tell(self, monitor: str, message: messages.Message) -> None:
-        """Tell the relay that has a monitor."""
-        self.relays.send(message, self.relay_of(monitor))
+    def tell(self, monitor: str, message: messages.Message) -> bool:
+        """Tell the relay that has a monitor; False when it is not there."""
+        return self.relays.send(message, self.relay_of(monitor))
 
     def resumed(self, monitor: str) -> None:
         """A monitor holds its topics no longer."""

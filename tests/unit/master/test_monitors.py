@@ -217,6 +217,30 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
     assert (monitors.revision, monitors.enabled("a")) == (2, False)
 
 
+async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
+    """One that is loaded later under its name is as `--enable` says; so it is in the next life of control."""
+    monitors = desk.monitors()
+    await monitors.switch(["a"], False, who="eve")
+    await monitors.load({"a.rv": A.replace("{", "{ int n;", 1)}, {}, who="eve", note="")
+    assert not monitors.enabled("a")
+    await monitors.remove(["a"], who="eve")
+    await monitors.load({"a.rv": A}, {}, who="eve", note="")
+    assert monitors.enabled("a")
+    assert desk.monitors(restarted=True).enabled("a")
+
+
+async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> None:
+    """The relay that comes will hold its topics: nobody is told that they go on."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
+    monitors.connect(NoRelays())
+    with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
+        await monitors.resume(["b"], who="eve")
+    assert "monitor resumed" not in [event for event, _ in desk.events]
+    assert monitors.held == {"b"}
+
+
 async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> None:
     """Though they come at once, and the first takes its time."""
     (desk.folder / "b.rv").write_text(B)
