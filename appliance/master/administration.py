@@ -169,7 +169,7 @@ class Administration:
         match request:
             case admin.PolicyReload(confirm_within):
                 by = "disk" if who == "operator" else who
-                return _loaded(self._policies.reload(who=by, confirm_within=confirm_within))
+                return _loaded(await self._policies.reload(who=by, confirm_within=confirm_within))
             case admin.PolicyRollback(revision):
                 return _loaded(self._policies.rollback(revision, who=who))
             case admin.PolicyConfirm():

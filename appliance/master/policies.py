@@ -123,18 +123,14 @@ class Policies:
             self._end_confirmation()
             self._keep(policy, who=_DISK, note="read at start")
 
-    def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
-        """Read the file again: check, test, swap, decide again what is live. Raises `PolicyRefusedError`.
+    async def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
+        """Read the file again: check, test, swap, decide again what is live.
 
-        The revision is the disk's, whoever asked for it: `who` is for the record.
+        Raises `PolicyRefusedError`, and `RevisionChangedError` when another revision came into force meanwhile. The
+        revision is the disk's, whoever asked for it: `who` is for the record.
         """
         before = self.revision
-        try:
-            policy = self._compile(self._read(), str(self.file))
-            self._test(policy)
-        except PolicyRefusedError as error:
-            self._refused(error, who)
-            raise
+        policy = await self._prepared(self._read, str(self.file), who)
         revoked = self._keep(policy, who=_DISK, note="reloaded from disk", by=who)
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -143,17 +139,11 @@ class Policies:
     ) -> Loaded:
         """Bring a text that is not the file's into force, as `reload` does.
 
-        Raises `PolicyRefusedError`, `RevisionChangedError`. It is compiled and tested in a thread: a long text
-        does not keep a node waiting. Its rules are cited as `revision N:line`, for the file says something else.
+        Raises `PolicyRefusedError`, `RevisionChangedError`. Its rules are cited as `revision N:line`, for the file
+        says something else.
         """
         before = self.revision
-        try:
-            policy = await asyncio.to_thread(self._prepare, text, f"revision {self._next_number()}")
-        except PolicyRefusedError as error:
-            self._refused(error, who)
-            raise
-        if self.revision != before:  # a signal, or a confirmation that did not come in time
-            raise RevisionChangedError(before, self.revision)
+        policy = await self._prepared(lambda: text, f"revision {self._next_number()}", who)
         revoked = self._keep(policy, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -220,8 +210,24 @@ class Policies:
 
     # --- inside ---
 
-    def _prepare(self, text: str, file: str) -> Policy:
-        policy = self._compile(text, file)
+    async def _prepared(self, read: Callable[[], str], file: str, who: str) -> Policy:
+        """Read, compiled and tested in a thread: a long policy does not keep a node waiting."""
+        before = self.revision
+        try:
+            while True:
+                hosts = dict(self._hosts())
+                policy = await asyncio.to_thread(self._prepare, read, file, hosts)
+                if self._hosts() == hosts:
+                    break
+        except PolicyRefusedError as error:
+            self._refused(error, who)
+            raise
+        if self.revision != before:  # a signal, or a confirmation that did not come in time
+            raise RevisionChangedError(before, self.revision)
+        return policy
+
+    def _prepare(self, read: Callable[[], str], file: str, hosts: Mapping[str, Address]) -> Policy:
+        policy = self._compile(read(), file, hosts)
         self._test(policy)
         return policy
 
@@ -240,9 +246,10 @@ class Policies:
         except (OSError, UnicodeDecodeError) as error:
             raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 
-    def _compile(self, text: str, file: str) -> Policy:
+    def _compile(self, text: str, file: str, hosts: Mapping[str, Address] | None = None) -> Policy:
+        known = self._hosts() if hosts is None else hosts
         try:
-            return compile_policy(text, file=file, hosts=self._hosts(), robot=self._robot)
+            return compile_policy(text, file=file, hosts=known, robot=self._robot)
         except PolicyError as error:
             raise PolicyRefusedError([str(one) for one in error.findings]) from error
 

@@ -39,7 +39,7 @@ from appliance.master.journal import restore
 from appliance.master.lifeline import ControlLifeline
 from appliance.master.monitors import ALLOCATION, Monitors
 from appliance.master.places import NoPortError
-from appliance.master.policies import Policies, PolicyRefusedError
+from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Life
 from appliance.master.rest import RestLink
@@ -75,6 +75,8 @@ class _Control:
         self._stopping = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self._parameters_dirty = asyncio.Event()
+        self._reloading: set[asyncio.Task[None]] = set()
+        self._one_reload = asyncio.Lock()
 
     async def run(self) -> None:
         """Serve from start to end; a start that fails is told to the supervisor."""
@@ -297,13 +299,19 @@ class _Control:
     # --- what the supervisor says ---
 
     def _reload_on_signal(self) -> None:
-        try:
-            self._base.policies.reload()
-        except PolicyRefusedError as error:
-            _log.error("the policy was refused, the last good one stays in force", findings=error.findings)
-        self._reloading = asyncio.get_running_loop().create_task(
-            self._reload_hosts()
-        )  # held until it is done
+        task = asyncio.get_running_loop().create_task(self._reload())
+        self._reloading.add(task)  # held until it is done
+        task.add_done_callback(self._reloading.discard)
+
+    async def _reload(self) -> None:
+        async with self._one_reload:
+            try:
+                await _reload_policy(self._base.policies)
+            except PolicyRefusedError as error:
+                _log.error(
+                    "the policy was refused, the last good one stays in force", findings=error.findings
+                )
+            await self._reload_hosts()
 
     async def _reload_hosts(self) -> None:
         try:
@@ -323,6 +331,16 @@ class _Control:
             self._parameters_dirty.clear()
             self._base.store.save_parameters(self._parts.master.parameters.tree)
             await asyncio.sleep(_SAVE_SECONDS)
+
+
+async def _reload_policy(policies: Policies) -> None:
+    """The file as it is now, also when another revision comes into force meanwhile. Raises `PolicyRefusedError`."""
+    while True:
+        try:
+            await policies.reload()
+        except RevisionChangedError:
+            continue
+        return
 
 
 def _open_audit(settings: Settings, signing: Signing, held_by: Callable[[list[int]], None]) -> AuditLog:

@@ -2,14 +2,18 @@
 
 import asyncio
 import contextlib
+import ipaddress
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from appliance.master.policies import Policies
+from appliance.master import policies as policies_module
+from appliance.master.policies import Policies, RevisionChangedError
+from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
 
@@ -38,11 +42,13 @@ class Appliance:
         self.file.write_text(OPEN)
 
     @contextlib.contextmanager
-    def started(self, *, restarted: bool = False) -> Iterator[Policies]:
+    def started(
+        self, *, restarted: bool = False, hosts: Callable[[], Mapping[str, Address]] = dict
+    ) -> Iterator[Policies]:
         """The policies of a control that has started; it dies at the end."""
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
-        policies = Policies(self.file, store, records, robot=())
+        policies = Policies(self.file, store, records, robot=(), hosts=hosts)
         policies.start(restarted=restarted)
         try:
             yield policies
@@ -64,7 +70,7 @@ async def test_an_unconfirmed_change_goes_back_after_a_start_of_the_appliance(tm
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        policies.reload(confirm_within=1.5)
+        await policies.reload(confirm_within=1.5)
         deadline = policies.confirm_by
     with appliance.started() as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
@@ -82,7 +88,7 @@ async def test_a_file_that_was_edited_ends_the_time_limit(tmp_path: Path) -> Non
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        policies.reload(confirm_within=0.0)
+        await policies.reload(confirm_within=0.0)
     appliance.file.write_text(OTHER + "# edited\n")
     with appliance.started() as policies:
         assert (policies.revision, policies.confirm_by) == (3, None)
@@ -95,10 +101,83 @@ async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        policies.reload(confirm_within=300.0)
+        await policies.reload(confirm_within=300.0)
     with appliance.started(restarted=True) as policies:
         assert policies.confirm_by is not None
         assert policies.confirm_by > time.time()
         assert policies.confirm(who="operator")
     with appliance.started(restarted=True) as policies:
         assert (policies.revision, policies.confirm_by) == (2, None)
+
+
+class Slow:
+    """The policy's tests, which are over when the loop says so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
+        self.rounds = 0
+        self.begun, self.over = threading.Event(), threading.Event()
+        monkeypatch.setattr(policies_module, "run_cases", self._run)
+        appliance.file.with_name("policy.ini.tests.yaml").write_text("cases: []\n")
+
+    def _run(self, *_given: object) -> list[object]:
+        self.rounds += 1
+        self.begun.set()
+        assert self.over.wait(10), "the loop stood still meanwhile"
+        return []
+
+    async def until_begun(self) -> None:
+        """Wait until they run."""
+        assert await asyncio.to_thread(self.begun.wait, 10)
+
+
+async def test_a_reload_does_not_keep_nodes_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long policy with many tests is read, compiled and tested beside the loop."""
+    appliance = Appliance(tmp_path)
+    slow = Slow(monkeypatch, appliance)
+    with appliance.started() as policies:
+        appliance.file.write_text(OTHER)
+        loading = asyncio.ensure_future(policies.reload())
+        await slow.until_begun()
+        assert policies.revision == 1
+        slow.over.set()
+        assert (await loading).revision == 2
+        assert policies.current.text == OTHER
+
+
+async def test_a_reload_that_another_change_overtakes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What came into force while the file was being tested is not silently replaced."""
+    appliance = Appliance(tmp_path)
+    slow = Slow(monkeypatch, appliance)
+    with appliance.started() as policies:
+        await policies._store.settled()
+        loading = asyncio.ensure_future(policies.reload())
+        await slow.until_begun()
+        policies.rollback(1, who="not confirmed in time")
+        slow.over.set()
+        with pytest.raises(RevisionChangedError):
+            await loading
+        assert policies.revision == 2
+
+
+async def test_hosts_that_change_while_a_policy_is_tested_are_known_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A host whose certificate is revoked in that moment has no right by its old address."""
+    appliance = Appliance(tmp_path)
+    slow = Slow(monkeypatch, appliance)
+    hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
+    with appliance.started(hosts=lambda: hosts) as policies:
+        appliance.file.write_text(OPEN.replace("[Nodes]\ndefault=*", "[Nodes]\ndefault=host:ocu host:new"))
+        loading = asyncio.ensure_future(policies.reload())
+        await slow.until_begun()
+        hosts["ocu"] = ipaddress.ip_address("10.0.0.9")
+        slow.over.set()
+        await loading
+        allowed = [
+            text
+            for text in ("10.0.0.7", "10.0.0.8", "10.0.0.9")
+            if policies.current.decide(Request(ipaddress.ip_address(text), "/n", Category.NODE, "/n")).allowed
+        ]
+        assert (allowed, slow.rounds) == (["10.0.0.8", "10.0.0.9"], 2)
