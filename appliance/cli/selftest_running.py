@@ -18,6 +18,7 @@ _CALLER = "/rosrv_selftest"
 _MANY_RESTARTS = 3
 _MANY_RECORDS = 200_000
 _RECORD_SECONDS = 5.0
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 1.0
 
 
 def running(appliance: Appliance) -> Iterator[Found]:
@@ -113,7 +114,13 @@ def _call(appliance: Appliance, master: str) -> Iterator[Found]:
     text += f" in {(time.monotonic() - began) * 1000:.1f} ms"
     if before is None:
         yield skip("RVMaster", f"{text}; this user may not read the audit log")
-    elif _recorded(appliance, before, refusal):
+        return
+    try:
+        recorded = _recorded(appliance, before, refusal)
+    except (LogUnreadableError, NotRunningError) as error:
+        yield skip("RVMaster", f"{text}; whether it was recorded cannot be seen: {error}")
+        return
+    if recorded:
         yield ok("RVMaster", f"{text}, and recorded")
     else:
         yield fail("RVMaster", f"{text}, but is not in the audit log", "rosrv status; rosrv audit verify")
@@ -127,15 +134,27 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, refusal: str) -> bool:
-    """Whether a record after the sequence `before` is of our call; a refusal names its record."""
-    source, deadline = appliance.audit(), time.monotonic() + _RECORD_SECONDS
+    """Whether a record after the sequence `before` is of our call; a refusal names its record.
+
+    Looked for again and again, for over REST each look is a request: the pauses grow. Raises `LogUnreadableError` or
+    `NotRunningError` where the last look failed.
+    """
+    source, deadline, pause = appliance.audit(), time.monotonic() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:
-        page = source.search(Filter(), None, 1000, newest_first=True)
-        new = [one.record for one in page.entries if one.sequence > before]
-        if any(one.caller_id == _CALLER or (refusal and one.id in refusal) for one in new):
-            return True
-        if time.monotonic() > deadline:
-            return False
+        is_last = time.monotonic() > deadline
+        try:
+            page = source.search(Filter(), None, 1000, newest_first=True)
+        except (LogUnreadableError, NotRunningError):
+            if is_last:
+                raise
+        else:
+            new = [one.record for one in page.entries if one.sequence > before]
+            if any(one.caller_id == _CALLER or (refusal and one.id in refusal) for one in new):
+                return True
+            if is_last:
+                return False
+        time.sleep(pause)  # noqa: TID251  nothing on the other side tells who only asks
+        pause = min(2 * pause, _LONGEST_PAUSE)
 
 
 def _message(master: str) -> Iterator[Found]:
