@@ -84,6 +84,7 @@ class Certification:
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
         """Ask the authority. Raises `HostRefusedError`."""
+        self.table.require_room(name)
         try:
             return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
         except AuthorityError as error:
@@ -157,7 +158,7 @@ class Certification:
         """The authority's certificate and its list of revoked certificates, in PEM."""
         try:
             authority = await self._authority.certificate()
-            listed = await self._authority.revocations(list(self.table.revoked))
+            listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
         return {"authority": authority.decode(), "revocations": listed.decode()}
@@ -192,6 +193,7 @@ class Certification:
     def _each_hour(self) -> None:
         """Certificates that follow ended ones count; those that end soon are recorded, once each."""
         now = time.time()
+        self.table.revoked.forget_ended()
         for row in self.table.enrolled():
             if row.expires <= now:
                 self.table.take_next(row.name)

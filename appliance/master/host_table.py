@@ -4,10 +4,11 @@ Invariants:
 
 1. A name has one virtual address for good; the address of a revoked host is given to no other, nor is one that is
    kept for an awaited or declared host.
-2. A certificate that is no longer its host's is on the list of revoked ones, for good.
+2. A certificate that is no longer its host's is among the revoked ones, from the same moment on.
 3. `revision` grows with every change that an operator or a host made, over restarts too.
 """
 
+import datetime
 import ipaddress
 import itertools
 import re
@@ -16,7 +17,8 @@ from dataclasses import replace
 
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.master.declared import Declared
-from appliance.store.hosts import CertificateRow, HostRow, NextCertificate, PortsRow
+from appliance.master.revoked_certificates import RevokedCertificates
+from appliance.store.hosts import CertificateRow, HostRow, NextCertificate, PortsRow, RevokedRow
 from appliance.store.state import StateStore
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
@@ -56,7 +58,7 @@ class HostTable:
         self.declared = declared
         self.rows = {row.name: row for row in self._kept.hosts()}
         self.certificates = {row.name: row for row in self._kept.certificates()}
-        self.revoked = self._kept.revoked()
+        self.revoked = RevokedCertificates(self._kept)
         self.ports = {row.name: row for row in self._kept.ports()}
         self.revision = int(store.settings().get(_REVISION, "1"))
 
@@ -96,6 +98,29 @@ class HostTable:
     def at(self, address: str) -> HostRow | None:
         """The enrolled host with this virtual address."""
         return next((row for row in self.enrolled() if row.address == address), None)
+
+    def listed_as_revoked(self) -> list[RevokedRow]:
+        """What is on the list of revoked certificates."""
+        return self.revoked.listed(self._enrolled_names())
+
+    def missing_as_revoked(self) -> int:
+        """How many certificates that enrolled hosts had before are not on it, for it is full."""
+        return self.revoked.missing(self._enrolled_names())
+
+    def require_room(self, name: str) -> None:
+        """Raises `HostRefusedError` when no other certificate of this name could be listed as revoked."""
+        if name not in self.rows:
+            return
+        until = self.revoked.wait_for_room(self._enrolled_names() | {name})
+        if until:
+            moment = datetime.datetime.fromtimestamp(until, datetime.UTC)
+            raise HostRefusedError(
+                "the list of revoked certificates is full (charon takes 64 KiB): no certificate is replaced before"
+                f" {moment:%Y-%m-%d %H:%M}Z, when the next one on it has ended; revoking a host makes room, too"
+            )
+
+    def _enrolled_names(self) -> set[str]:
+        return {row.name for row in self.enrolled()}
 
     # --- what can be had ---
 
@@ -166,7 +191,7 @@ class HostTable:
         before = row.certificate if row is not None else ""
         since = row.made if row is not None else time.time()
         if row is not None and row.next is not None:
-            self._revoke_serial(row.next.serial)
+            self.revoked.add(name, row.next.serial, row.next.expires)
         following = NextCertificate(made.serial, made.expires, made.certificate.decode())
         self._set_certificate(CertificateRow(name, since, before, following))
         self.changed()
@@ -177,7 +202,7 @@ class HostTable:
         if certificate is None or certificate.next is None:
             return None
         following = certificate.next
-        self._revoke_serial(row.serial)
+        self.revoked.add(name, row.serial, row.expires)
         taken = self._set(replace(row, serial=following.serial, expires=following.expires))
         self._set_certificate(CertificateRow(name, time.time(), following.certificate))
         self.changed()
@@ -208,13 +233,8 @@ class HostTable:
         self._kept.save_certificate(row)
 
     def _revoke_certificates(self, row: HostRow) -> None:
-        self._revoke_serial(row.serial)
+        self.revoked.add(row.name, row.serial, row.expires)
         certificate = self.certificates.get(row.name)
         if certificate is not None and certificate.next is not None:
-            self._revoke_serial(certificate.next.serial)
+            self.revoked.add(row.name, certificate.next.serial, certificate.next.expires)
             self._set_certificate(replace(certificate, next=None))
-
-    def _revoke_serial(self, serial: str) -> None:
-        now = time.time()
-        self.revoked.append((serial, now))
-        self._kept.save_revoked(serial, now)

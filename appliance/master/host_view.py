@@ -146,6 +146,12 @@ class HostView:
                     f"the certificate of {row.name} ends in {_span(left)} and was not renewed:"
                     f" rosrv host kit {row.name}"
                 )
+        missing = self._table.missing_as_revoked()
+        if missing:
+            found.append(
+                f"the list of revoked certificates is full: {missing} are not on it, and their hosts' tunnels can be"
+                " opened with them until they end"
+            )
         if self._table.declared.error:
             found.append(self._table.declared.error)
         return found

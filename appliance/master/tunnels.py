@@ -36,6 +36,7 @@ from appliance.channel.messages import (
 from appliance.master.authority import Authority, AuthorityError
 from appliance.master.host_table import HostRefusedError, HostTable
 from appliance.master.recorder import Recorder
+from appliance.master.revocation_list import RevocationList
 
 _log = structlog.get_logger()
 _APPLIANCE_DAYS = 90.0
@@ -63,6 +64,7 @@ class Tunnels:
         self._authority = authority
         self._listen = listen
         self._say = say
+        self.revocations = RevocationList(table, authority)
         self.seen: dict[str, TunnelSeen] = {}
         self.last: dict[str, float] = {}
         self.charon: CharonStarted | None = None
@@ -174,7 +176,7 @@ class Tunnels:
         if link is None or certificate is None or esp is None:
             return
         authority = await self._authority.certificate()
-        revocations = await self._authority.revocations(list(self._table.revoked))
+        revocations = await self.revocations.signed()
         now = time.time()
         hosts = [
             TunnelHost(row.name, row.address, row.serial)

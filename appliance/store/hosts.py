@@ -22,7 +22,11 @@ CREATE TABLE IF NOT EXISTS enrolment_token (
     address TEXT NOT NULL, days REAL NOT NULL, kit TEXT NOT NULL, who TEXT NOT NULL
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS revoked_certificate (serial TEXT PRIMARY KEY, moment REAL NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS revocation (
+    serial TEXT PRIMARY KEY, name TEXT NOT NULL, moment REAL NOT NULL, expires REAL NOT NULL
+) WITHOUT ROWID;
 """
+_LONGEST_SECONDS = 398 * 86_400.0  # of a certificate's life, as the authority has it
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,16 @@ class AwaitedRow:
     days: float
     kit: dict[str, str]
     who: str
+
+
+@dataclass(frozen=True, slots=True)
+class RevokedRow:
+    """A certificate that is no longer its host's: since when, and its own end. `name` is empty where it is not known."""
+
+    serial: str
+    name: str
+    moment: float
+    expires: float
 
 
 class HostTables:
@@ -166,10 +180,27 @@ class HostTables:
             )
         ]
 
-    def save_revoked(self, serial: str, moment: float) -> None:
-        """Keep for good that a certificate is revoked."""
-        self._database.submit("INSERT OR IGNORE INTO revoked_certificate VALUES (?, ?)", (serial, moment))
+    def save_revoked(self, row: RevokedRow) -> None:
+        """Keep that a certificate is revoked."""
+        self._database.submit(
+            "INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)",
+            (row.serial, row.name, row.moment, row.expires),
+        )
 
-    def revoked(self) -> list[tuple[str, float]]:
-        """Serial numbers of all revoked certificates, and since when."""
-        return list(self._database.query("SELECT serial, moment FROM revoked_certificate ORDER BY moment"))
+    def forget_revoked(self, before: float) -> None:
+        """Certificates that ended before this moment are good for nothing, revoked or not."""
+        self._database.submit("DELETE FROM revocation WHERE expires < ?", (before,))
+        self._database.submit(
+            "DELETE FROM revoked_certificate WHERE moment < ?", (before - _LONGEST_SECONDS,)
+        )
+
+    def revoked(self) -> list[RevokedRow]:
+        """All revoked certificates, the first one first."""
+        # Before there was `revocation`, the end was not kept: it came within the longest life there is.
+        rows = self._database.query(
+            "SELECT serial, name, moment, expires FROM revocation UNION ALL"
+            " SELECT serial, '', moment, moment + ? FROM revoked_certificate"
+            " WHERE serial NOT IN (SELECT serial FROM revocation) ORDER BY moment",
+            (_LONGEST_SECONDS,),
+        )
+        return [RevokedRow(*row) for row in rows]

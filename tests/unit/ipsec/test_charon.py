@@ -1,5 +1,6 @@
 """Tests of the conversation with charon: what it says that nobody expects is an error in words, of one kind."""
 
+import base64
 import socket
 import struct
 import threading
@@ -38,6 +39,12 @@ class StandIn:
         self._listener.close()
 
 
+def pem_of(count: int) -> bytes:
+    """What stands for a list of so many bytes."""
+    text = base64.encodebytes(b"x" * count)
+    return b"-----BEGIN X509 CRL-----\n" + text + b"-----END X509 CRL-----\n"
+
+
 @pytest.fixture
 def charon(tmp_path: Path) -> Iterator[tuple[StandIn, Vici]]:
     """A charon and the conversation with it."""
@@ -59,6 +66,6 @@ def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, Vici]) -> None
 def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
     """A value has 65,535 bytes at most: more is an error that names the list, and what was loaded before stays."""
     _stand_in, vici = charon
-    vici.provision([], Material("10.113.11.1", b"authority", b"certificate", b"x" * 65_535))
+    vici.provision([], Material("10.113.11.1", b"authority", b"certificate", pem_of(65_535)))
     with pytest.raises(CharonError, match="the list of revoked certificates"):
-        vici.provision([], Material("10.113.11.1", b"authority", b"certificate", b"x" * 65_536))
+        vici.provision([], Material("10.113.11.1", b"authority", b"certificate", pem_of(65_536)))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -40,6 +41,7 @@ class NearAuthority(Authority):
         super().__init__()
         self._near = ipsec.Authority(directory)
         self.meanwhile: Callable[[], object] = lambda: None
+        self.lists = 0
 
     async def certificate(self) -> bytes:
         """Its certificate."""
@@ -56,6 +58,12 @@ class NearAuthority(Authority):
         except RequestRefusedError as error:
             raise AuthorityError(str(error), refused=True) from error
         return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
+
+    async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
+        """The list; how often it was signed is counted."""
+        self.lists += 1
+        await asyncio.sleep(0)
+        return self._near.revocations(revoked)
 
 
 class Bench:
@@ -229,7 +237,7 @@ def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path)
         body = await bench.hosts.revoke("a", "tester")
         assert bench.order == ["policy []", "expel 10.113.11.2"]
         assert body["taken_back"] == 3
-        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [body["serial"]]
+        assert [row.serial for row in bench.store.hosts.revoked()] == [body["serial"]]
         with pytest.raises(HostRefusedError, match="enrolled are: none"):
             await bench.hosts.revoke("a", "tester")
 
@@ -247,7 +255,7 @@ def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
             "a", signing_request(make_key(), "a").decode(), days=90, who="tester"
         )
         assert second["address"] == first["address"]
-        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [first["serial"]]
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
 
     run(tmp_path, work)
 
@@ -413,7 +421,7 @@ def test_a_host_renews_itself(tmp_path: Path) -> None:
         assert bench.hosts.rows()[0]["renewing"]
         assert bench.store.hosts.revoked() == []
         await bench.hosts.itself.renewed("a", "10.113.11.2")
-        assert [serial for serial, _moment in bench.store.hosts.revoked()] == [first["serial"]]
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
         assert bench.hosts.rows()[0]["serial"] == made["serial"]
         with pytest.raises(HostRefusedError, match="renew first"):
             await bench.hosts.itself.renewed("a", "10.113.11.2")
@@ -461,7 +469,7 @@ def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> No
         request = request_of("a")
         made = await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
         await bench.hosts.revoke("a", "tester")
-        assert {serial for serial, _moment in bench.store.hosts.revoked()} == {
+        assert {row.serial for row in bench.store.hosts.revoked()} == {
             first["serial"],
             made["serial"],
         }
@@ -470,6 +478,43 @@ def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> No
         again = await add(bench, "a")
         assert again["address"] == first["address"]
         assert again["serial"] not in {first["serial"], made["serial"]}
+
+    run(tmp_path, work)
+
+
+def test_the_list_is_signed_once_however_often_it_is_asked_for(tmp_path: Path) -> None:
+    """Whoever asks without a token costs no signature; who is revoked is on the next list at once."""
+
+    async def work(bench: Bench) -> None:
+        first = await add(bench, "a")
+        answers = await asyncio.gather(*(bench.hosts.revocations() for _ in range(20)))
+        assert bench.authority.lists == 1
+        assert len({one["revocations"] for one in answers}) == 1
+        await bench.hosts.revoke("a", "tester")
+        after = x509.load_pem_x509_crl((await bench.hosts.revocations())["revocations"].encode())
+        assert [f"{one.serial_number:x}" for one in after] == [first["serial"]]
+        assert bench.authority.lists == 2
+
+    run(tmp_path, work)
+
+
+def test_a_full_list_replaces_no_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused with the day when there is room; a host that is new needs none, and revoking one makes some."""
+    monkeypatch.setattr("appliance.master.revoked_certificates.ENTRIES_BYTES", 120)
+
+    async def work(bench: Bench) -> None:
+        for name in ("a", "b"):
+            await add(bench, name)
+        for _ in range(2):
+            await bench.hosts.renew("a", request_of("a"), days=90, who="tester")
+        key_before = bench.hosts.rows()[1]["serial"]
+        with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
+            await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+        assert bench.hosts.rows()[1]["serial"] == key_before
+        await add(bench, "c")
+        await bench.hosts.revoke("a", "tester")
+        await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+        assert bench.hosts.status()["troubles"] == []
 
     run(tmp_path, work)
 
