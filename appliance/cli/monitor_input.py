@@ -22,20 +22,16 @@ def usage_error(text: str) -> typer.Exit:
 
 
 def read_specifications(files: Sequence[Path]) -> dict[str, str]:
-    """The texts of specifications by name, in the order of file names; raises `SpecificationError`."""
+    """The texts of specifications by name, in the order of file names. Bytes that are no UTF-8 are half of a character
+    (`surrogateescape`), which no specification may have: it is refused with all else that is wrong.
+    """
     texts: dict[str, str] = {}
     for file in sorted(files, key=lambda path: (path.name, str(path))):
         try:
             raw = file.read_bytes()
         except OSError as error:
             raise usage_error(f"cannot read {file}: {error.strerror}") from error
-        try:
-            texts[str(file)] = raw.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            line = raw.count(b"\n", 0, error.start) + 1
-            column = error.start - raw.rfind(b"\n", 0, error.start)
-            text = "these bytes are no UTF-8; save the file as UTF-8"
-            raise SpecificationError.at(Position(str(file), line, column), text) from None
+        texts[str(file)] = raw.decode("utf-8-sig", "surrogateescape")
     return texts
 
 

@@ -23,7 +23,7 @@ from typing import Literal
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.batch import Walker, walkers
-from appliance.rosmop.compile.specification import Compiled, compile_files
+from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
 from appliance.rosmop.faults import explain, line_of
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
@@ -33,6 +33,7 @@ from appliance.rosmop.reach import reached, redefined
 from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
 
 OnFault = Literal["drop", "pass"]
@@ -66,7 +67,15 @@ class MonitorSet:
         cls, sources: Mapping[str, str], definitions: Definitions, on_fault: OnFault = "drop"
     ) -> "MonitorSet":
         """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong."""
-        files = [parse(text, name) for name, text in sources.items()]
+        files: list[tree.File] = []
+        findings: list[Finding] = []
+        for name, text in sources.items():
+            try:
+                files.append(parse(text, name))
+            except SpecificationError as error:
+                findings += error.findings
+        if findings:
+            raise SpecificationError([*findings, *findings_of(files, definitions)])
         return cls(compile_files(files, definitions), files, on_fault)
 
     # What there is
@@ -121,6 +130,19 @@ class MonitorSet:
     def wants(self, topic: str) -> bool:
         """Whether an enabled monitor has an event on this topic."""
         return topic in self._steps
+
+    def type_of(self, topic: str) -> str | None:
+        """The message type of a topic that `wants`; None of another."""
+        steps = self._steps.get(topic)
+        return steps[0].event.type if steps else None
+
+    def service_type_of(self, service: str) -> str | None:
+        """The type of a service with an enabled event; None of another."""
+        for part in ("request", "response"):
+            steps = self._requests.get((service, part))
+            if steps:
+                return steps[0].event.service_type
+        return None
 
     def write_loops(self) -> None:
         """Write the loops that `walker` offers; takes about as long as compiling the specifications."""

@@ -76,6 +76,8 @@ class Shared:
         self.measures: dict[str, Callable[[Any], int]] = {}
         self.findings: list[Finding] = []
         self.publications: list[Publication] = []
+        self.partial = False
+        """Files of the set could not be read: a name that is not known here may be declared there."""
 
     def foreign(self, own: SpecificationNames, name: str, position: Position) -> Variable | None:
         """A variable of another specification."""
@@ -166,6 +168,8 @@ class Scope:
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
         """The refusal of a name that nothing has."""
+        if self.shared.partial:
+            return SpecificationError(())
         known = [name for block in self._blocks for name in block]
         known += [*self.names.variables, *self.names.functions]
         return SpecificationError.at(position, f"there is no {what} {shown(name)}{nearest(name, known)}")

@@ -82,19 +82,10 @@ class Compiled:
 
 def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compiled:
     """Compile a set of files; raises `SpecificationError` with everything that is wrong."""
-    module, messages = Module(), Messages(definitions)
-    shared = Shared(module, messages)
-    turn = Turn()
-    _offer(module, shared.measures)
+    shared, turn = Shared(Module(), Messages(definitions)), Turn()
+    module, messages = shared.module, shared.messages
     pairs = [(file, specification) for file in files for specification in file.specifications]
-    names = [_declare(shared, module, turn, specification) for _, specification in pairs]
-    _check_names(shared, [specification for _, specification in pairs])
-    compiled = []
-    for (file, specification), own in zip(pairs, names, strict=True):
-        code = _compile(shared, own, file, specification)
-        if code is not None:
-            compiled.append(code)
-    _check_types(shared, compiled)
+    compiled = _compile_all(shared, turn, pairs)
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
@@ -107,6 +98,29 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compi
         ) from None
     warnings = tuple(sorted(findings, key=lambda finding: finding.position))
     return Compiled(module, namespace, tuple(compiled), turn, warnings, tuple(shared.publications), messages)
+
+
+def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
+    """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
+    shared = Shared(Module(), Messages(definitions))
+    shared.partial = True
+    _compile_all(shared, Turn(), [(file, one) for file in files for one in file.specifications])
+    return list(dict.fromkeys(shared.findings))
+
+
+def _compile_all(
+    shared: Shared, turn: Turn, pairs: Sequence[tuple[tree.File, tree.Specification]]
+) -> list[SpecificationCode]:
+    _offer(shared.module, shared.measures)
+    names = [_declare(shared, shared.module, turn, specification) for _, specification in pairs]
+    _check_names(shared, [specification for _, specification in pairs])
+    compiled = []
+    for (file, specification), own in zip(pairs, names, strict=True):
+        code = _compile(shared, own, file, specification)
+        if code is not None:
+            compiled.append(code)
+    _check_types(shared, compiled)
+    return compiled
 
 
 def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None:

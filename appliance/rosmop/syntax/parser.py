@@ -4,6 +4,7 @@ Bounds: a file has at most `MAX_CHARACTERS`, and nests at most `MAX_DEPTH` deep;
 its length, and no later pass meets anything deeper.
 """
 
+import re
 from functools import lru_cache
 
 from lark import Lark, Token, Tree
@@ -20,6 +21,9 @@ MAX_CHARACTERS = 128 * 1024
 MAX_DEPTH = 100
 """Statements and operators inside each other."""
 
+_NO_TEXT = re.compile("[\ud800-\udfff]")
+"""Half a character: what a reader that goes on after bytes that are no UTF-8 puts in their place."""
+
 
 class _ForbiddenWordError(Exception):
     def __init__(self, token: Token) -> None:
@@ -33,6 +37,11 @@ def parse(text: str, file: str) -> tree.File:
     if len(text) > MAX_CHARACTERS:
         raise SpecificationError.at(
             start, f"the file has more than {MAX_CHARACTERS // 1024} Ki characters; split it into several"
+        )
+    broken = _NO_TEXT.search(text)
+    if broken is not None:
+        raise SpecificationError.at(
+            start.within(text, broken.start()), "these bytes are no UTF-8; save the file as UTF-8"
         )
     parsed = _parse(text, file)
     _check_depth(parsed, file)

@@ -120,6 +120,21 @@ def test_a_file_that_is_not_utf8(tmp_path: Path) -> None:
     )  # fmt: skip
 
 
+def test_everything_wrong_with_several_files_is_told_at_once(tmp_path: Path) -> None:
+    """Errors of syntax, bytes that are no text, and errors of meaning, each in its file, in one run."""
+    one = write(tmp_path, "a.rv", "a() { int z\n event e() /t std_msgs/Empty '{}' { } }")
+    two = write(tmp_path, "b.rv", "b() { int 3; }")
+    three = write(
+        tmp_path, "c.rv", "c() { event e() /t std_msgs/Empty '{}' { z = 1; std::vector<int> v; v.sice(); } }"
+    )
+    (tmp_path / "d.rv").write_bytes(b"d() {\n \xff }")
+    result = invoke("check", one, two, three, tmp_path / "d.rv")
+    assert result.exit_code == 1
+    assert [line.split(" error: ")[0] for line in result.stdout.splitlines()] == [
+        f"{one}:2:2:", f"{two}:1:11:", f"{three}:1:69:", f"{tmp_path / 'd.rv'}:2:2:", "4 errors: refused",
+    ]  # fmt: skip
+
+
 OWN = "own() { event e(int x) /t own_msgs/Own '{level:x}' { } }"
 
 
