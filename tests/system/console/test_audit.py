@@ -78,6 +78,21 @@ def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -
     assert whole["cursor"] is None
 
 
+def test_numbers_of_records_are_told_whole(opened: Callable[..., Reader]) -> None:
+    """What a record is looked up by is never rounded, however long the log."""
+    page = opened().go("audit")
+    answer = {
+        "ok": True, "log": "ab" * 16, "records": 1_234_567, "first": 400_001, "last": 1_634_567, "removed": 400_000,
+        "checkpoints": 9, "signed_checkpoints": 9, "signed_through": 1_634_001, "unsealed": 566, "key": "cd" * 32,
+        "findings": [], "elsewhere": None,
+    }  # fmt: skip
+    page.route("**/v1/audit/verify", lambda route: route.fulfill(json=answer))
+    page.get_by_role("button", name="Verify").click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("400,001 to 1,634,567")
+    expect(dialog).to_contain_text("through record 1,634,001")
+
+
 def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
     """Verify says that the chain is whole; Export gives what the filter finds as a file of JSON lines."""
     refuse(attempt, "/exported")

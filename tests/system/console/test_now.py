@@ -39,6 +39,17 @@ def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Calla
         expect(row).to_contain_text(str(process["pid"]))
 
 
+def test_processes_of_one_role_are_told_apart(opened: Callable[..., Reader]) -> None:
+    """Several relay processes are numbered as `rosrv status` numbers them; who is alone is not."""
+    page = opened().go("now")
+    named = """async (processes) => {
+      const { numbered } = await import("/console/static/js/now/view.js");
+      return numbered(processes).map((one) => one.name);
+    }"""
+    rows = [{"role": role} for role in ("control", "relay", "api", "relay")]
+    assert page.evaluate(named, rows) == ["control", "relay 0", "api", "relay 1"]
+
+
 def test_the_page_says_that_it_is_not_live_and_comes_back(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:

@@ -9,6 +9,11 @@ export function count(value) {
   return Math.abs(value) < 100_000 ? WHOLE.format(value) : SHORT.format(value);
 }
 
+/** Every figure of it: the number of a record, which is looked up by it. @param {number} value */
+export function whole(value) {
+  return WHOLE.format(value);
+}
+
 /** Per second; three figures. @param {number | null | undefined} value */
 export function rate(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";

@@ -1,7 +1,7 @@
 /** The proof that the log is whole, and the log as a file. */
 
 import { html, useState } from "../html.js";
-import { count } from "../numbers.js";
+import { count, whole } from "../numbers.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Given } from "../parts/given.js";
@@ -24,10 +24,10 @@ export function Verify() {
 }
 
 function Verdict(/** @type {{value: any}} */ { value }) {
-  return html`${value.ok ? html`<${Notice} tone="allow" title="The chain is whole">Each of the ${count(value.records)} records is as it was written, and every signature holds.</${Notice}>`
+  return html`${value.ok ? html`<${Notice} tone="allow" title="The chain is whole">Each of the ${whole(value.records)} records is as it was written, and every signature holds.</${Notice}>`
     : html`<${Notice} tone="deny" title="The log is not whole">Keep a copy of it now, and look at what was found below.</${Notice}>`}
-    <dl class="facts"><dt>Log</dt><dd><${Given} value=${value.log} mono /></dd><dt>Records</dt><dd>${count(value.first)} to ${count(value.last)}${value.removed ? `, ${count(value.removed)} removed by retention` : ""}</dd>
-      <dt>Checkpoints</dt><dd>${count(value.checkpoints)}, signed ${count(value.signed_checkpoints)}, the last one through record ${count(value.signed_through)}</dd><dt>Not sealed yet</dt><dd>${count(value.unsealed)}</dd><dt>Key</dt><dd><${Given} value=${value.key} mono /></dd></dl>
+    <dl class="facts"><dt>Log</dt><dd><${Given} value=${value.log} mono /></dd><dt>Records</dt><dd>${whole(value.first)} to ${whole(value.last)}${value.removed ? `, ${count(value.removed)} removed by retention` : ""}</dd>
+      <dt>Checkpoints</dt><dd>${count(value.checkpoints)}, signed ${count(value.signed_checkpoints)}, the last one through record ${whole(value.signed_through)}</dd><dt>Not sealed yet</dt><dd>${whole(value.unsealed)}</dd><dt>Key</dt><dd><${Given} value=${value.key} mono /></dd></dl>
     ${value.findings.length > 0 && html`<ul class="stack-tight">${value.findings.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}><${Notice} tone="deny" title=${`${one.kind}: ${one.first}${one.last === one.first ? "" : ` to ${one.last}`}`}><${Given} value=${one.message} most=${500} /></${Notice}></li>`)}</ul>`}
     <p class="muted small">The signer's own memory of checkpoints is looked at by <code>rosrv audit verify</code> on the machine.</p>`;
 }

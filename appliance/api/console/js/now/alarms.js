@@ -26,7 +26,7 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
   return html`<section class="panel" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hides the alarms below on this machine; conditions stay until they are over">Mark as reviewed</button></span>`}</div>
     ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? html`<${Empty} icon="check" title="Nothing is open">Alarms of monitors, processes and the audit log appear here.</${Empty}>`
-      : html`<ul class="alarm-list">${alarms.map((one) => html`<li key=${one.kind} class=${`alarm ${one.severity}`}><${Badge} word=${one.severity} />
+      : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class=${`alarm ${one.severity}`}><${Badge} word=${one.severity} />
           <${Link} to=${PLACES[/** @type {keyof typeof PLACES} */ (one.about)]} class="alarm-text"><${Given} value=${one.text} most=${300} /></${Link}></li>`)}
         ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}

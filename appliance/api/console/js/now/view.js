@@ -22,7 +22,7 @@ export function Now() {
   const incidents = useStore(notable, (one) => one.incidents);
   const now = useNow(5000);
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
-  return html`<div class="head"><h1>Now</h1><span class="head-sub">in service for ${lasting(now / 1000 - status.since)}</span></div>
+  return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
       <div class="now-alarms"><${Alarms} alarms=${alarms} incidents=${incidents} /></div>
@@ -42,7 +42,7 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
     <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
     <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>
-    <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : "Written"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
+    <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded || audit.forwarding?.trouble ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : audit.forwarding?.trouble ? "Not forwarded" : "Written"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
   </section>`;
 }
 
@@ -63,6 +63,14 @@ function Curves() {
 function Processes(/** @type {{status: any}} */ { status }) {
   return html`<section class="panel" aria-labelledby="processes"><div class="panel-head"><h2 id="processes">Processes</h2></div>
     <div class="table-wrap"><table class="table"><thead><tr><th>Role</th><th class="number">Process</th><th>Since</th><th class="number">Restarts</th></tr></thead>
-    <tbody>${status.processes.map((/** @type {any} */ one) => html`<tr key=${one.role}><td><${Given} value=${one.role} /></td><td class="number">${one.pid}</td><td class="nowrap"><${Moment} at=${one.since} /></td>
+    <tbody>${numbered(status.processes).map(({ name, one }) => html`<tr key=${name}><td><${Given} value=${name} /></td><td class="number">${one.pid}</td><td class="nowrap"><${Moment} at=${one.since} /></td>
       <td class="number">${one.restarts ? html`<${Badge} word=${String(one.restarts)} tone="warn" />` : "0"}</td></tr>`)}</tbody></table></div></section>`;
+}
+
+/** Processes by the names that `rosrv status` has for them: those of one role are numbered from 0. @param {any[]} processes @returns {{name: string, one: any}[]} */
+export function numbered(processes) {
+  return processes.map((one, at) => {
+    const same = (/** @type {any} */ other) => other.role === one.role;
+    return { name: processes.filter(same).length > 1 ? `${one.role} ${processes.slice(0, at).filter(same).length}` : one.role, one };
+  });
 }
