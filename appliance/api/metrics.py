@@ -18,7 +18,7 @@ from starlette.responses import Response
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
-from appliance.channel.serving import no_relay, probe_failed
+from appliance.channel.serving import no_relay, probe_failed, process_names
 from appliance.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -133,7 +133,9 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         **_forwarding(audit["forwarding"]),
         "rosrv_policy_revision": [((), policy["revision"])],
         "rosrv_policy_differs_from_file": [((), policy["differs_from_file"])],
-        "rosrv_process_restarts_total": [((one["role"],), one["restarts"]) for one in status["processes"]],
+        "rosrv_process_restarts_total": [
+            ((name,), one["restarts"]) for name, one in _named(status["processes"])
+        ],
         "rosrv_process_resident_bytes": list(_memory(status["processes"])),
         "rosrv_rest_calls_total": body["rest"],
     }
@@ -173,10 +175,15 @@ def _tunnels(hosts: list[dict[str, Any]]) -> dict[str, _Samples]:
     }
 
 
-def _memory(processes: Iterable[dict[str, Any]]) -> Iterator[tuple[tuple[str, ...], float]]:
-    for one in processes:
+def _named(processes: Sequence[dict[str, Any]]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A series of each: two of one role would be one series twice."""
+    return zip(process_names(processes), processes, strict=True)
+
+
+def _memory(processes: Sequence[dict[str, Any]]) -> Iterator[tuple[tuple[str, ...], float]]:
+    for name, one in _named(processes):
         try:
             pages = Path(f"/proc/{one['pid']}/statm").read_text().split()[1]
         except OSError:
             continue  # it ended just now
-        yield (one["role"],), float(int(pages) * _PAGE_BYTES)
+        yield (name,), float(int(pages) * _PAGE_BYTES)

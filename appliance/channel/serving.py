@@ -1,6 +1,6 @@
-"""Whether nodes are served, read from control's status: one answer for health checks, REST, metrics, `rosrv status`."""
+"""How control's status is read: one answer for health checks, REST, metrics and `rosrv status`. Pure."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -29,3 +29,12 @@ def unserved(status: Mapping[str, Any]) -> str | None:
     if relay is not None:
         return relay
     return None if status["rosmaster"] == "reachable" else "the ROS Master is being rebuilt: calls wait"
+
+
+def process_names(processes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the processes are called, in their order: by their roles; those of one role are numbered from 0."""
+    roles = [str(row["role"]) for row in processes]
+    return [
+        f"{role} {roles[:place].count(role)}" if roles.count(role) > 1 else role
+        for place, role in enumerate(roles)
+    ]

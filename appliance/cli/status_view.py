@@ -8,6 +8,8 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from appliance.channel.serving import process_names
+
 _YELLOW = "yellow"
 _COLUMN = 38  # columns that one process takes
 
@@ -19,24 +21,13 @@ def processes_table(rows: Sequence[Mapping[str, Any]], width: int, now: float | 
     table = Table(
         *["process", "pid", "for", "restarts"] * across, box=None, padding=(0, 2, 0, 0), header_style="dim"
     )
-    shown = [_cells(row, name, now) for row, name in zip(rows, _names(rows), strict=True)]
+    shown = [_cells(row, name, now) for row, name in zip(rows, process_names(rows), strict=True)]
     for line in range(high):
         cells: list[Text] = []
         for place in range(line, len(shown), high):
             cells += shown[place]
         table.add_row(*cells)
     return table
-
-
-def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    roles = [str(row["role"]) for row in rows]
-    seen: dict[str, int] = {}
-    names = []
-    for role in roles:
-        number = seen.get(role, 0)
-        seen[role] = number + 1
-        names.append(f"{role} {number}" if roles.count(role) > 1 else role)
-    return names
 
 
 def _cells(row: Mapping[str, Any], name: str, now: float | None) -> list[Text]:

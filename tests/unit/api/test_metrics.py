@@ -1,5 +1,6 @@
 """Tests of `appliance.metrics` and `appliance.api.metrics`."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -128,3 +129,15 @@ def test_the_page_is_what_the_code_says() -> None:
     """docs/metrics.md lists what is measured (python -m appliance.metrics)."""
     generated = PAGE.read_text().split("<!-- generated: python -m appliance.metrics -->\n")[1]
     assert generated.startswith(markdown())
+
+
+def test_processes_of_one_role_are_series_of_their_own() -> None:
+    """Of several relay processes each has its restarts and its memory: no series is given twice."""
+    answer = body()
+    answer["status"]["processes"] = [
+        {"role": "relay", "pid": os.getpid(), "restarts": 1},
+        {"role": "relay", "pid": os.getpid(), "restarts": 2},
+    ]
+    lines = [one for one in rendered(answer).decode().splitlines() if one.startswith("rosrv_process")]
+    assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
+    assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines

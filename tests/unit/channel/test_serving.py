@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.serving import no_relay, unserved
+from appliance.channel.serving import no_relay, process_names, unserved
 
 SERVING: dict[str, Any] = {
     "probe": "passed",
@@ -43,3 +43,9 @@ def test_one_relay_away_is_not_all_away() -> None:
     """With several relay processes it is said how many are away."""
     assert no_relay("connected") is None
     assert no_relay("1 of 3 are away") != no_relay("away")
+
+
+def test_processes_of_one_role_are_numbered() -> None:
+    """Who is alone has the name of its role."""
+    rows = [{"role": role} for role in ("control", "relay", "api", "relay")]
+    assert process_names(rows) == ["control", "relay 0", "api", "relay 1"]
