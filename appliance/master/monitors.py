@@ -27,12 +27,12 @@ from appliance.master.allocation import Allocation
 from appliance.master.moving import Relays
 from appliance.master.observed import MonitorRecords
 from appliance.master.recorder import Recorder
+from appliance.master.specification_folder import SpecificationFolder
 from appliance.master.specifications import (
     Checked,
     Sources,
     SpecificationsRefusedError,
     check,
-    read_folder,
 )
 from appliance.master.stating import Revision, Stating
 from appliance.store.state import MonitorRevisionRow, StateStore
@@ -94,6 +94,7 @@ class Monitors:
         allocation: Allocation | None = None,
     ) -> None:
         self.folder = folder
+        self._folder = SpecificationFolder(folder)
         self._enable = enable
         self._store = store
         self._recorder = recorder
@@ -125,7 +126,7 @@ class Monitors:
             sources = Sources(**json.loads(last.sources))
             self._enforce(sources, _check_kept(sources, last), last)
         else:
-            sources = self._read()
+            sources = self._folder.read()
             checked = check(sources)
             if last is not None and Sources(**json.loads(last.sources)) == sources:
                 self._enforce(sources, checked, last)
@@ -168,10 +169,7 @@ class Monitors:
     @property
     def differs_from_folder(self) -> bool:
         """Whether what is in force is something else than the folder has now."""
-        try:
-            return self._read() != self.sources
-        except SpecificationsRefusedError:
-            return True
+        return self._folder.looked_at() != self.sources
 
     def enabled(self, name: str) -> bool:
         """Whether a monitor's events happen."""
@@ -206,7 +204,7 @@ class Monitors:
         """Take what the folder has now. Raises `SpecificationsRefusedError`."""
         async with self._changing:
             self._expect(expected)
-            sources = await asyncio.to_thread(self._read)
+            sources = await asyncio.to_thread(self._folder.read)
             return await self._change(sources, _DISK, who, "reloaded from disk")
 
     async def remove(self, names: list[str], *, who: str, expected: str | None = None) -> Replaced:
@@ -307,9 +305,6 @@ class Monitors:
         self._stating.lost(relay)
 
     # --- inside ---
-
-    def _read(self) -> Sources:
-        return read_folder(self.folder) if self.folder is not None else Sources()
 
     def _named(self) -> set[str]:
         return set() if self._enable in {"all", "none"} else {one.strip() for one in self._enable.split(",")}
