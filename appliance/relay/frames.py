@@ -5,7 +5,7 @@ into and returns all frames that are whole after each read as one `Batch`, walke
 
 - Small frames are received into a scratch area that all receivers of the process share; only the torn frame
   at the end of a read, if there is one, is set aside until the rest arrives.
-- A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 2 MiB is used again
+- A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 8 MiB is used again
   for the next large frame unless a queue has kept it; a larger one is anonymous memory, so that a length which
   is declared and never sent costs address space only.
 

@@ -156,15 +156,15 @@ class Middle:
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
         """Why a publisher's messages cannot be understood by the monitors of its topic; empty when they can."""
-        if self.monitors is None or not self.monitors.wants(topic):
+        name = self.monitors.type_of(topic) if self.monitors is not None else None
+        if self.monitors is None or name is None:
             return ""
-        name = self.monitors.topics[topic]
         return _other_definition(topic, name, self.monitors.md5sum(name), header)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
         """The same of a service, by the header it answers with."""
-        name = self.monitors.services.get(service) if self.monitors is not None else None
-        if self.monitors is None or name is None or not self._serves(service):
+        name = self.monitors.service_type_of(service) if self.monitors is not None else None
+        if self.monitors is None or name is None:
             return ""
         return _other_definition(service, name, self.monitors.definitions.service_md5sum(name), header)
 
@@ -219,7 +219,7 @@ class Middle:
     def _service(self, key: str, service: str, part: str, body: bytes) -> Judged:
         if self.blocked:
             return Judged(b"", self.blocked)
-        if self.monitors is None or not self._serves(service):
+        if self.monitors is None or self.monitors.service_type_of(service) is None:
             return Judged(body)
         if self.spent > LONGEST:
             return Judged(b"", TOO_LONG)
@@ -240,13 +240,6 @@ class Middle:
             self.telling.changed(outcome, place, body[:SHOWN], len(body))
             return Judged(bytes(outcome.buffer))
         return Judged(body)
-
-    def _serves(self, service: str) -> bool:
-        return self.monitors is not None and any(
-            monitor.enabled and step.event.topic == service and step.event.part is not None
-            for monitor in self.monitors.monitors
-            for step in monitor.steps
-        )
 
     # --- time ---
 

@@ -252,7 +252,7 @@ def refusal(outcome: Outcome, part: str) -> str:
     """What the client of a service reads."""
     if outcome.reason:
         return outcome.reason
-    said = "" if outcome.fatal is not None else _said(outcome)
+    said = f": {outcome.fatal.text}" if outcome.fatal is not None else _said(outcome)
     return f"the {part} is refused by the monitor {outcome.dropped_by}{said}"
 
 

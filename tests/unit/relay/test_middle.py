@@ -471,6 +471,16 @@ def test_a_request_that_is_refused_never_reaches_the_service(world: Monitored) -
     assert b"it is open" in world.ends(once)
 
 
+def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world: Monitored) -> None:
+    """The fault, as well as what a monitor says; services whose monitors are off are not judged."""
+    world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
+    middle = world.engine._middle
+    refused = middle.request("k", "/mode", b"\0").refused
+    assert refused == "the request is refused by the monitor gate: division by zero"
+    world.state(MonitorSwitched("gate", False))
+    assert middle.request("k", "/mode", b"\0").refused is None
+
+
 def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Monitored) -> None:
     """Those of other topics have taken too long: only what they would have to judge is refused."""
     world.load(LATCH)
