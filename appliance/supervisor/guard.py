@@ -1,6 +1,6 @@
 """Looks after the enclosure while the appliance runs: probes it, keeps control informed of it.
 
-What the enclosure does takes time, so each call is made in a thread, one after the other; the
+What the enclosure does takes time, so each call is made in a thread, one after the other (a few that only look); the
 supervisor's loop goes on meanwhile. The threads are daemons: one that hangs does not keep the appliance
 from ending.
 
@@ -29,6 +29,7 @@ from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure
 
 PROBE_SECONDS = 60.0
+_ROUTES_AT_ONCE = 4
 
 T = TypeVar("T")
 
@@ -45,6 +46,7 @@ class Guard:
         self._tell = tell
         self._every = every
         self._one_at_a_time = asyncio.Lock()
+        self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # routes are only looked up
         self._probe: Message | None = None
         self._report = FirewallReported(isolation=enclosure.kind, report={})
 
@@ -96,7 +98,8 @@ class Guard:
     async def route_to(self, host: str) -> str | None:
         """The machine's address by which `host` reaches the appliance; None when its own route is right."""
         try:
-            return await in_thread(lambda: self.enclosure.route_to(host))
+            async with self._few_at_a_time:
+                return await in_thread(lambda: self.enclosure.route_to(host))
         except Exception as error:  # noqa: BLE001  see the invariant
             log.warning("no route to a host", host=host, error=_words(error))
             return None

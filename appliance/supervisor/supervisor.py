@@ -62,6 +62,7 @@ from appliance.supervisor.users import account_of
 ADMIN = "admin"
 _READERS = "rosrv-api"  # the user whose group may read the audit log
 _START_SECONDS = 180.0
+_MOST_UNANSWERED = 4096  # hosts of which control asks the way
 
 _FROM_ANY: tuple[type[Message], ...] = (Pong, Ready, Failed)
 _FROM_CONTROL: tuple[type[Message], ...] = (
@@ -121,6 +122,7 @@ class Supervisor:
         self._failure: str | None = None
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
+        self._unanswered = 0
         self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
@@ -260,11 +262,11 @@ class Supervisor:
                 if name != ADMIN:
                     self._kept.drop(name)
             case RouteWanted(host):
-                self._spawn(self._route(life, host))
+                self._answer(life, self._route(life, host))
             case EndpointWanted():
-                self._spawn(self._tell_endpoint(life))
+                self._answer(life, self._tell_endpoint(life))
             case TunnelsWanted(pool, address):
-                self._spawn(self._open_tunnels(life, pool, address))
+                self._answer(life, self._open_tunnels(life, pool, address))
             case LogHeld(processes):
                 self._free_log(processes)
             case ApplianceStopRequested(reason):
@@ -325,6 +327,18 @@ class Supervisor:
                 return
             self._is_ready = True
             life.send(Announced())
+
+    def _answer(self, life: Life, work: Coroutine[Any, Any, None]) -> None:
+        """Work that ends with an answer to control, which may wait for many, but not for any number."""
+        if self._unanswered >= _MOST_UNANSWERED:
+            work.close()
+            self._violated(life, f"asks for more than {_MOST_UNANSWERED} things at once")
+            return
+        self._unanswered += 1
+        self._spawn(work).add_done_callback(self._answered)
+
+    def _answered(self, _task: asyncio.Task[None]) -> None:
+        self._unanswered -= 1
 
     async def _route(self, life: Life, host: str) -> None:
         life.send(RouteFound(host, await self._guard.route_to(host)))

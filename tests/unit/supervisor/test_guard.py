@@ -190,3 +190,36 @@ def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundi
     assert asyncio.run(Guard(surroundings, lambda _message: None).endpoint()) == EndpointFound(
         None, "isolation container has no tunnels: use isolation netns or container"
     )
+
+
+def test_a_crowd_of_new_hosts_costs_a_few_threads(
+    surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many routes are asked for at once, a bounded number is looked up at a time, and all are answered."""
+    lock, entered, most = threading.Lock(), [0], [0]
+    release = threading.Event()
+
+    def route_to(host: str) -> str:
+        with lock:
+            entered[0] += 1
+            most[0] = max(most[0], entered[0])
+        assert release.wait(30)
+        with lock:
+            entered[0] -= 1
+        return f"way to {host}"
+
+    monkeypatch.setattr(surroundings, "route_to", route_to)
+
+    async def scene() -> list[str | None]:
+        guard = Guard(surroundings, lambda _message: None)
+        asked = [asyncio.create_task(guard.route_to(str(number))) for number in range(200)]
+        async with asyncio.timeout(30):
+            while most[0] == 0:
+                await asyncio.sleep(0)
+        for _ in range(200):
+            await asyncio.sleep(0)
+        release.set()
+        return await asyncio.gather(*asked)
+
+    assert asyncio.run(scene()) == [f"way to {number}" for number in range(200)]
+    assert most[0] <= 8

@@ -9,6 +9,7 @@ from typing import cast
 
 import pytest
 
+from appliance.channel.messages import RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.life import Life
@@ -29,6 +30,12 @@ class StandIn:
     def __init__(self) -> None:
         self.heard_of = 0
         self.told: list[str] = []
+        self.killed = False
+        self.pid = 1
+
+    def kill(self) -> None:
+        """Noted."""
+        self.killed = True
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
         """Noted by its kind."""
@@ -114,3 +121,19 @@ def test_a_machine_without_processes_is_not_asked_in_a_tight_loop(
         return delays
 
     assert asyncio.run(scene()) == [0.0, 0.2, 0.5, 1.0, 1.0]
+
+
+def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) -> None:
+    """What is not answered yet has a bound; what was asked before it is answered."""
+
+    async def scene() -> tuple[StandIn, int]:
+        supervisor, control = made(tmp_path, CONTROL), StandIn()
+        for number in range(10_000):
+            supervisor._control_said(cast(Life, control), RouteWanted(f"10.0.0.{number}"), ())
+            if control.killed:
+                return control, number
+        return control, -1
+
+    control, asked = asyncio.run(scene())
+    assert control.killed
+    assert 1000 < asked < 5000
