@@ -39,6 +39,7 @@ _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
 _LARGEST_PAGE = 1000
+_MOST_NEIGHBOURS = 1000  # as the command line takes
 
 RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
 _RECORD_REF = {"$ref": "#/components/schemas/AuditRecord"}
@@ -279,7 +280,7 @@ def routes(services: Services) -> APIRouter:
     )
     async def audit_record(
         record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")],
-        neighbours: Annotated[int, Query(ge=0, le=100)] = 5,
+        neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5,
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
         shown = await desk.read(show, desk.path, record_id, neighbours)

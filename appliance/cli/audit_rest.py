@@ -1,6 +1,7 @@
 """The running appliance's audit log, read over REST."""
 
 import json
+import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from appliance.cli.rest import ProblemError, RestClient
 
 _PATH = "/v1/audit"
 _PAGE = 1000
+_ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence; anything else is no record's
 _NOT_THE_RECORDS = ("schema", "sequence")
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream says something every 15 s
@@ -51,7 +53,7 @@ class RestLog:
 
     def show(self, record_id: str, neighbours: int) -> Shown | None:
         """One record with its neighbours; None when there is none."""
-        if not record_id.isalnum() or not record_id.isascii():
+        if not _ID.fullmatch(record_id):
             return None
         try:
             found = self._get(f"/{record_id}", {"neighbours": neighbours})

@@ -96,6 +96,8 @@ def test_one_record_and_what_was_around_it(appliance: Appliance, rest: Rest) -> 
     assert shown["record"] == record
     assert shown == rest.get(f"/v1/audit/{record['sequence']}").json | {"after": shown["after"]}
     assert all(one["host"] == "127.0.0.1" for one in shown["before"] + shown["after"] if one["host"])
+    assert rest.get(f"/v1/audit/{record['id']}?neighbours=1000").status == 200
+    assert rest.get(f"/v1/audit/{record['id']}?neighbours=1001").status == 422
     assert rest.get("/v1/audit/ffffffffffffffffffff").status == 404
     assert rest.get("/v1/audit/99999999").status == 404
 

@@ -40,8 +40,9 @@ class Rest:
     def __init__(self, *answers: Answer | Exception) -> None:
         self.answers = list(answers)
 
-    def call(self, _method: str, _path: str, **_more: Any) -> dict[str, Any]:
+    def call(self, _method: str, path: str, **_more: Any) -> dict[str, Any]:
         """A page without records."""
+        assert path == "/v1/audit"
         return {"records": [], "cursor": None}
 
     @contextmanager
@@ -114,3 +115,11 @@ def test_following_gives_up_when_nobody_answers(monkeypatch: pytest.MonkeyPatch)
     rest += [NotRunningError("cannot be reached")] * 5
     with pytest.raises(NotRunningError, match="cannot be reached"):
         list(log_of(*rest).follow(Filter(), 0, on=True))
+
+
+@pytest.mark.parametrize(
+    "record_id", ["XYZ", "18E9AA02EFC40ABB0E51", "a" * 21, "verify", "stream", "", "../x", "é"]
+)
+def test_what_is_no_id_is_no_record(record_id: str) -> None:
+    """As where the log's file is read: there is no such record, and REST is not asked."""
+    assert log_of().show(record_id, 500) is None
