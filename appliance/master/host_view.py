@@ -1,5 +1,6 @@
 """The hosts as operators see them: one row for each, what diverges from hosts.yaml, what to look at."""
 
+import math
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -143,7 +144,7 @@ class HostView:
                 found.append(f"the certificate of {row.name} has ended: rosrv host kit {row.name}")
             elif soon(self._table, row, now):
                 found.append(
-                    f"the certificate of {row.name} ends in {_span(left)} and was not renewed:"
+                    f"the certificate of {row.name} ends in {span(left)} and was not renewed:"
                     f" rosrv host kit {row.name}"
                 )
         missing = self._table.missing_as_revoked()
@@ -157,7 +158,10 @@ class HostView:
         return found
 
 
-def _span(seconds: float) -> str:
+def span(seconds: float) -> str:
+    """Days, hours, minutes or seconds in words, whichever says enough."""
     if seconds >= 2 * 86_400:
         return f"{int(seconds // 86_400)} days"
-    return f"{int(seconds // 3600)} hours" if seconds >= 7200 else f"{int(seconds // 60)} minutes"
+    if seconds >= 7200:
+        return f"{int(seconds // 3600)} hours"
+    return f"{int(seconds // 60)} minutes" if seconds >= 120 else f"{math.ceil(seconds)} seconds"

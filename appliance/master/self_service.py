@@ -8,6 +8,8 @@ Invariants:
    name's present key.
 3. Until the host says that the next certificate is in place, the present one is good: a host that is cut off in the
    middle comes back with either.
+4. A host renews at most 20 times in the life of its certificate, over restarts too: each time makes the list of
+   revoked certificates longer.
 """
 
 import asyncio
@@ -19,10 +21,12 @@ from appliance.audit.record import Severity
 from appliance.master.awaited import BadEnrolmentTokenError
 from appliance.master.certification import Certification
 from appliance.master.host_table import HostForbiddenError, HostRefusedError
+from appliance.master.host_view import span
 from appliance.store.hosts import HostRow
 
 _ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
-_RENEWALS_SECONDS = 3600.0
+_RENEWALS = 20  # in the life of a certificate: each leaves one on the list of revoked ones
+_RENEWED = "hosts.renewed."
 
 
 class SelfService:
@@ -33,7 +37,12 @@ class SelfService:
         self._table = certification.table
         self._tunnels = certification.tunnels
         self._recorder = certification.recorder
-        self._renewals: dict[str, float] = {}
+        kept = certification.store.settings()
+        self._renewals = {  # by name, seconds since the epoch
+            name.removeprefix(_RENEWED): float(moment)
+            for name, moment in kept.items()
+            if name.startswith(_RENEWED)
+        }
 
     async def enrol(self, token: str, request: str, peer: str) -> dict[str, Any]:
         """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
@@ -74,7 +83,7 @@ class SelfService:
                     name, request, life / 86_400, proof=proof, former=certificate.certificate.encode()
                 )
             self._table.keep_next(name, made)
-            self._renewals[name] = time.monotonic()
+            self._note_renewal(name)
             await self._certification.store.settled()
             authority = await self._certification.authority_certificate()
             return {
@@ -112,7 +121,11 @@ class SelfService:
         return row
 
     def _require_patience(self, name: str, life: float) -> None:
-        wait = min(_RENEWALS_SECONDS, life / 10)
-        since = time.monotonic() - self._renewals.get(name, -wait)
-        if since < wait:
-            raise HostRefusedError(f"{name} renewed {since:.0f} s ago: again in {wait - since:.0f} s")
+        wait = life / _RENEWALS
+        since = time.time() - self._renewals.get(name, -wait)
+        if 0 <= since < wait:  # a clock that was set back makes nobody wait
+            raise HostRefusedError(f"{name} renewed {span(since)} ago: again in {span(wait - since)}")
+
+    def _note_renewal(self, name: str) -> None:
+        self._renewals[name] = time.time()
+        self._certification.store.save_setting(_RENEWED + name, repr(self._renewals[name]))

@@ -91,7 +91,7 @@ class AwaitedRow:
 
 @dataclass(frozen=True, slots=True)
 class RevokedRow:
-    """A certificate that is no longer its host's: since when, and its own end. `name` is empty where it is not known."""
+    """A certificate that is no longer its host's: since when, and its own end. `name` is empty if not known."""
 
     serial: str
     name: str

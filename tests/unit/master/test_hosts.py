@@ -2,6 +2,8 @@
 
 import asyncio
 import ipaddress
+import itertools
+import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -427,6 +429,43 @@ def test_a_host_renews_itself(tmp_path: Path) -> None:
             await bench.hosts.itself.renewed("a", "10.113.11.2")
         with pytest.raises(HostRefusedError, match="again in"):
             await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+
+    run(tmp_path, work)
+
+
+def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
+    """A twentieth of the certificate's life, whether control was started anew meanwhile or not; a kit needs no wait."""
+    keys = [make_key(), make_key(), make_key()]
+
+    async def first(bench: Bench) -> None:
+        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=90, who="tester")
+        request = signing_request(keys[1], "a").decode()
+        await bench.hosts.itself.renew("a", request, sign(keys[0], request), "10.113.11.2")
+        await bench.hosts.itself.renewed("a", "10.113.11.2")
+
+    async def second(bench: Bench) -> None:
+        await bench.hosts.start()
+        request = signing_request(keys[2], "a").decode()
+        with pytest.raises(HostRefusedError, match="again in 4 days"):
+            await bench.hosts.itself.renew("a", request, sign(keys[1], request), "10.113.11.2")
+        await bench.hosts.renew("a", request, days=90, who="tester")
+
+    run(tmp_path, first)
+    run(tmp_path, second)
+
+
+def test_a_short_life_needs_a_short_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is renewed often ends soon, and is on the list of revoked certificates for as short a time."""
+
+    async def work(bench: Bench) -> None:
+        keys = [make_key(), make_key(), make_key()]
+        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=100 / 86_400, who="tester")
+        for former, key in itertools.pairwise(keys):
+            request = signing_request(key, "a").decode()
+            await bench.hosts.itself.renew("a", request, sign(former, request), "10.113.11.2")
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
+            now = time.time()
+            monkeypatch.setattr(time, "time", lambda now=now: now + 6)
 
     run(tmp_path, work)
 
