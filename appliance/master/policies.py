@@ -131,6 +131,7 @@ class Policies:
         """
         before = self.revision
         policy = await self._prepared(self._read, str(self.file), who)
+        self._note_confirmation(confirm_within)
         revoked = self._keep(policy, who=_DISK, note="reloaded from disk", by=who)
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -144,6 +145,7 @@ class Policies:
         """
         before = self.revision
         policy = await self._prepared(lambda: text, f"revision {self._next_number()}", who)
+        self._note_confirmation(confirm_within)
         revoked = self._keep(policy, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -302,6 +304,12 @@ class Policies:
         return Loaded(self.revision, before, [str(one) for one in policy.warnings], revoked, self.confirm_by)
 
     # --- back by itself unless confirmed ---
+
+    def _note_confirmation(self, confirm_within: float | None) -> None:
+        """In the store before the revision is: control may die while the change is made."""
+        if confirm_within is not None:
+            back_to = self._back_to if self.confirm_by is not None else self.revision
+            self._store.save_setting("confirm", f"{back_to} {time.time() + confirm_within}")
 
     def _await_confirmation(self, back_to: int, deadline: float) -> None:
         self.confirm_by = deadline

@@ -181,3 +181,27 @@ async def test_hosts_that_change_while_a_policy_is_tested_are_known_to_it(
             if policies.current.decide(Request(ipaddress.ip_address(text), "/n", Category.NODE, "/n")).allowed
         ]
         assert (allowed, slow.rounds) == (["10.0.0.8", "10.0.0.9"], 2)
+
+
+class DiedError(Exception):
+    """Control dies."""
+
+
+async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_is_made(
+    tmp_path: Path,
+) -> None:
+    """Whoever may lock himself out is safe from the moment on in which the new revision is the one in force."""
+    appliance = Appliance(tmp_path)
+
+    def die(_policy: object) -> int:
+        raise DiedError
+
+    with appliance.started() as policies:
+        appliance.file.write_text(OTHER)
+        policies.changed = die
+        with pytest.raises(DiedError):
+            await policies.reload(confirm_within=1.0)
+    with appliance.started(restarted=True) as policies:
+        assert (policies.revision, policies.current.text) == (2, OTHER)
+        await until(policies, 3)
+        assert policies.current.text == OPEN
