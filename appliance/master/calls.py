@@ -1,10 +1,10 @@
 """The table of the Master API: one row per call. A call that is not here is denied.
 
 The columns are explained at `Call`. To add a call, write its function beside its kin (`registration`, `lookups`,
-`parameters`) and its row here; the policy knows it by `policy/commands.py`.
+`parameters`, `parameter_search`) and its row here; the policy knows it by `policy/commands.py`.
 """
 
-from appliance.master import lookups, monitor_calls, parameters, registration
+from appliance.master import lookups, monitor_calls, parameter_search, parameters, registration
 from appliance.master.arguments import (
     CALLER_API,
     KEY,
@@ -107,7 +107,7 @@ _PARAMETERS = (
     Call("hasParam", parameters.has_param, (KEY,), denial=False, touches=Touch.READ, reads=True),
     Call("setParam", parameters.set_param, (KEY, VALUE), touches=Touch.WRITE),
     Call("deleteParam", parameters.delete_param, (KEY,), touches=Touch.WRITE),
-    Call("searchParam", parameters.search_param, (SEARCH_KEY,), denial="", reads=True),
+    Call("searchParam", parameter_search.search_param, (SEARCH_KEY,), denial="", reads=True),
     Call("getParamNames", parameters.get_param_names, denial=[], reads=True),
     Call(
         "subscribeParam",

@@ -314,19 +314,6 @@ async def delete_param(master: "Master", caller: Caller, arguments: tuple[object
     return answer
 
 
-async def search_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`searchParam(caller_id, key)`: the name that is found must be one the host may read."""
-    answer = await master.rosmaster.call("searchParam", caller.caller_id, str(arguments[0]))
-    policy = master.policy()
-    if answer[0] == 1 and isinstance(answer[2], str) and policy.has_section(Category.READ) and not caller.own:
-        request = Request(caller.peer.host, caller.caller_id, Category.READ, answer[2])
-        decision = policy.decide(request)
-        if not decision.allowed:
-            master.recorder.decided(caller, "searchParam", Category.READ.value, answer[2], decision)
-            return [0, decision.reason, ""]
-    return answer
-
-
 async def get_param_names(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`getParamNames(caller_id)`: those that the host may read."""
     answer = await master.rosmaster.call("getParamNames", caller.caller_id)
