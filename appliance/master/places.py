@@ -125,7 +125,8 @@ class Places:
                 del self._sockets[name]
                 sock.close()
                 self._drop(name)
-                self._unused.append(port)
+                if port in self._range:  # it may be from before the range was another
+                    self._unused.append(port)
         last = max(claimed, default=0)
         self._unused = deque(sorted(self._unused, key=lambda port: (port <= last, port)))
 

@@ -97,3 +97,20 @@ def test_other_relays_after_a_restart_of_the_appliance(first: int) -> None:
     assert fewer.reopen(node)
     assert node.ports == had[:2]
     fewer.close_unclaimed(set())
+
+
+def test_a_port_of_another_range_is_not_given_out(first: int) -> None:
+    """What was kept from before the policy had this range is closed, and is nobody's from then on."""
+    before = Places("127.0.0.1", range(first + 4, first + 8), keep=lambda *_: None, drop=lambda _: None)
+    kept = before.open()
+    dropped: list[str] = []
+    after = Places("127.0.0.1", range(first, first + 4), keep=lambda *_: None, drop=dropped.append)
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
+    assert dropped == [f"port:{port}" for port in kept]
+    assert [*after.open(), *after.open()] == [*range(first, first + 4)]
+    with pytest.raises(NoPortError):
+        after.open()
+    after.close_unclaimed(set())
