@@ -42,7 +42,7 @@ from appliance.master.policies import Policies
 from appliance.master.publisher import OwnPublisher
 from appliance.master.reconcile import Reconciler
 from appliance.master.recorder import Recorder
-from appliance.master.registration import withdraw
+from appliance.master.registration import withdraw_lost
 from appliance.master.registry import Incarnation, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.master.reminders import Reminders
@@ -143,8 +143,7 @@ class _Wires:
         self.reconciler().wake()
 
     async def withdraw(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
-        for registration in registrations:
-            await withdraw(self.master(), incarnation, registration.kind, registration.resource)
+        await withdraw_lost(self.master(), incarnation, registrations)
 
     def node_handler(self, incarnation: Incarnation) -> Handler:
         return self.pipeline().handler(NODE_CALLS, target=incarnation)

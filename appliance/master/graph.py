@@ -42,6 +42,8 @@ class Graph:
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
         """ROSMaster took a registration."""
         self._take_name(incarnation)
+        if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
+            self.returned(incarnation)
         if kind is Kind.SERVICE:
             for provider in list(self._registry.registered(Kind.SERVICE, resource)):
                 if provider is not incarnation:  # ROSMaster keeps one provider of a service: the last

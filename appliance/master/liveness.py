@@ -118,9 +118,9 @@ class Liveness:
         return False
 
     async def revive(self, incarnation: Incarnation) -> None:
-        """A shadow registers: it is there again, and so is all it had. Raises `CallFailedError`."""
+        """A shadow registers: it is there again, and so is all it had."""
         self._answered[incarnation.key] = time.monotonic()
-        await self._put_back(incarnation, self._bring_back(incarnation))
+        await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
 
     def _bring_back(self, incarnation: Incarnation) -> list[Registration]:
         registrations = self._graph.returned(incarnation)

@@ -133,6 +133,8 @@ class Reconciler:
         """
         try:
             async with self._rosmaster.alone():
+                if (await self._rosmaster.call_now("getPid", _NAME))[2] != self._pid:
+                    raise CallFailedError("the ROS Master is new: the next round tells it everything")
                 for one in registrations:
                     if (
                         incarnation.life is Life.LIVE

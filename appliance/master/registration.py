@@ -4,11 +4,12 @@ A registration outlasts control before its node is told of it (the store writes 
 twice, and ROSMaster, which knows the rest, can die in the same moment as control.
 """
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Answer, Caller
-from appliance.master.registry import Incarnation, Kind
+from appliance.master.registry import Incarnation, Kind, Life, Registration
 from appliance.ros.uris import service_uri
 
 if TYPE_CHECKING:
@@ -146,6 +147,16 @@ async def withdraw(master: "Master", incarnation: Incarnation, kind: Kind, resou
             )
         case Kind.PARAMETER:
             await master.rosmaster.call("unsubscribeParam", incarnation.name, inner, resource)
+
+
+async def withdraw_lost(
+    master: "Master", incarnation: Incarnation, registrations: Iterable[Registration]
+) -> None:
+    """Unregister what a lost node had; what is left of it stays when it comes back meanwhile."""
+    for one in registrations:
+        if incarnation.life is Life.LIVE:
+            return
+        await withdraw(master, incarnation, one.kind, one.resource)
 
 
 def stand_in(incarnation: Incarnation) -> str:

@@ -22,7 +22,7 @@ from appliance.master.liveness import Liveness, LivenessSettings
 from appliance.master.parameters import ParameterMirror
 from appliance.master.pipeline import Pipeline
 from appliance.master.reconcile import Reconciler
-from appliance.master.registration import withdraw
+from appliance.master.registration import withdraw_lost
 from appliance.master.registry import Incarnation, Kind, Registration, Registry, new_key
 from appliance.master.revocation import Revocation
 from appliance.master.rosmaster import RosMaster
@@ -84,10 +84,15 @@ class Deliveries:
 
 
 class Grants(Nothing):
-    """The relays: only the grants are kept."""
+    """The relays: the grants, and who returned."""
 
     def __init__(self) -> None:
         self.rows: list[PermissionRow] = []
+        self.returned: list[str] = []
+
+    def node_returned(self, incarnation: Incarnation) -> None:
+        """As `RelayControl`."""
+        self.returned.append(incarnation.name)
 
     def permissions(self) -> list[PermissionRow]:
         """As `RelayControl`."""
@@ -114,13 +119,11 @@ class HiddenMaster:
         self.tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in _TABLES.values()}
         self.nodes: dict[str, str] = {}
         self.parameters: dict[str, Value] = {"run_id": "1"}
-        self.away = False
+        self.pid = 4711
 
     async def call(self, method: str, *params: Value) -> Answer:
         """One call, which takes a turn of the loop."""
         await asyncio.sleep(0)
-        if self.away:
-            raise CallFailedError("away")
         self.calls.append((method, *params))
         for beginning in ("register", "unregister"):
             kind = _TABLES.get(method.removeprefix(beginning))
@@ -133,7 +136,7 @@ class HiddenMaster:
             return [-1, "unknown", ""]
         asked = str(params[-1])
         values: dict[str, Value] = {
-            "getPid": 4711,
+            "getPid": self.pid,
             "getSystemState": [
                 [[resource, list(nodes)] for resource, nodes in table.items() if nodes]
                 for table in self.tables.values()
@@ -158,6 +161,12 @@ class HiddenMaster:
             self.nodes[name] = rest[-1]
             return [1, "", []]
         return [1, "", int(table.pop(name, None) is not None)]
+
+    def restart(self) -> None:
+        """It died, and another is there that knows nothing."""
+        self.pid += 1
+        self.tables = {kind: {} for kind in _TABLES.values()}
+        self.nodes, self.parameters = {}, {}
 
     def has(self, kind: Kind, resource: str) -> list[str]:
         """Who has registered it."""
@@ -284,16 +293,15 @@ class ControlParts:
         self._serve = Pipeline(self.master, limits=Limits(), offload=1 << 20).handler(MASTER_CALLS)
 
     def _make_liveness(self, silent: float) -> Liveness:
-        async def withdraw_all(incarnation: Incarnation, registrations: list[Registration]) -> None:
-            for one in registrations:
-                await withdraw(self.master, incarnation, one.kind, one.resource)
+        async def withdrawn(incarnation: Incarnation, registrations: list[Registration]) -> None:
+            await withdraw_lost(self.master, incarnation, registrations)
 
         liveness = Liveness(
             self.registry,
             self.graph,
             LivenessSettings(silent=silent),
             Limits(),
-            withdraw=withdraw_all,
+            withdraw=withdrawn,
             put_back=self.reconciler.put_back,
             returned=self.revocation.returned,
         )

@@ -1,5 +1,7 @@
 """Nodes that go away and come back: what they had, what others got meanwhile, what the policy took."""
 
+import asyncio
+
 import pytest
 
 from appliance.master import liveness
@@ -159,3 +161,50 @@ async def test_a_node_that_returns_leaves_the_name_to_one_that_everything_was_ta
     world.reload(OPEN)
     await world.settle()
     assert world.registry.holder("/n") is second
+
+
+async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
+    """The answer comes in the moment in which ROSMaster is told that the node is lost: nothing of it is left out."""
+    world = await parts()
+    node = world.node("/n")
+    for topic in ("/a", "/b", "/c"):
+        await world.register(node, Kind.PUBLICATION, topic)
+    world.clients.silent = {"/n"}
+    losing = asyncio.ensure_future(world.liveness._look(node))
+    while node.life is Life.LIVE:
+        await asyncio.sleep(0)
+    await world.liveness.revive(node)
+    await losing
+    await world.settle()
+    assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/a", "/b", "/c")] == [["/n"]] * 3
+
+
+async def test_a_call_of_a_node_that_is_lost_meanwhile_brings_all_of_it_back() -> None:
+    """The relays carry what it had, subscribers are told, and ROSMaster has it after the next round."""
+    world = await parts()
+    node, ear = world.node("/n", 1), world.node("/ear", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/a")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    world.deliveries.told.clear()
+    await world.register(node, Kind.PUBLICATION, "/b")
+    assert world.relay.returned == ["/n"]
+    assert ("/ear", "publisherUpdate", ("/a", [node.outer_uri("10.0.0.1")])) in world.deliveries.told
+    await world.round()
+    assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]
+
+
+async def test_a_node_that_returns_while_the_master_is_new_is_told_by_the_rebuild() -> None:
+    """Its call goes on: what it had comes with everything else, and the call itself waits at the door."""
+    world = await parts()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    world.rosmaster.shut()
+    world.hidden.restart()
+    await world.liveness.revive(node)
+    assert not world.rosmaster.reachable
+    await world.round()
+    assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]

@@ -2,6 +2,7 @@
 
 import pytest
 
+from appliance.master.client import CallFailedError
 from appliance.master.registry import Kind, Registration
 from tests.support.control_parts import POLICY, ControlParts
 
@@ -73,3 +74,20 @@ async def test_a_parameter_that_is_granted_again_is_told() -> None:
     world.reload(NO_SECRET)
     await world.settle()
     assert world.deliveries.told == [("/n", "paramUpdate", ("/speed/", 2))]
+
+
+async def test_a_new_master_is_whole_before_it_is_asked_anything() -> None:
+    """A node that returns while ROSMaster is new opens no door to it: the rebuild does, which tells it everything."""
+    world = ControlParts(silent=3600.0)
+    await world.round()
+    node, other = world.node("/n", 1), world.node("/other", 2)
+    await world.register(node, Kind.PUBLICATION, "/t")
+    await world.register(other, Kind.PUBLICATION, "/u")
+    world.rosmaster.shut()
+    world.hidden.restart()
+    with pytest.raises(CallFailedError):
+        await world.reconciler.put_back(node, list(node.registrations.values()))
+    assert (world.rosmaster.reachable, world.reconciler._woken.is_set()) == (False, True)
+    await world.round()
+    assert (world.rosmaster.reachable, world.reconciler._pid) == (True, world.hidden.pid)
+    assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/t", "/u")] == [["/n"], ["/other"]]
