@@ -24,7 +24,14 @@ from appliance.api.problems import ProblemError
 from appliance.api.rates import Buckets
 from appliance.api.roles import answered
 from appliance.api.services import Services
-from appliance.channel.admin import AdminRequest, HostEnrol, HostRenewed, HostRenewItself, RevocationsWanted
+from appliance.channel.admin import (
+    AdminRequest,
+    AuthorityWanted,
+    HostEnrol,
+    HostRenewed,
+    HostRenewItself,
+    RevocationsWanted,
+)
 from appliance.ipsec.kit import archive, members
 
 _ALL = "all"
@@ -113,7 +120,7 @@ def _add_renewal(router: APIRouter, services: Services) -> None:
     @router.get("/v1/authority", operation_id="authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
         """The certificate of the appliance's authority."""
-        body = await _ask(services, RevocationsWanted())
+        body = await _ask(services, AuthorityWanted())
         return Response(body["authority"], media_type="application/x-pem-file")
 
 

@@ -248,12 +248,16 @@ class HostsReload(AdminRequest, frozen=True, tag="hosts reload"):
 
 
 class RevocationsWanted(AdminRequest, frozen=True, tag="host revocations"):
-    """The authority's certificate and its signed list of revoked certificates, in PEM."""
+    """The authority's signed list of revoked certificates, in PEM."""
+
+
+class AuthorityWanted(AdminRequest, frozen=True, tag="host authority"):
+    """The authority's certificate, in PEM."""
 
 
 HostRequest = (
     HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | HostRenewed | HostList | HostKit | HostRevoke
-    | HostPorts | HostsReload | RevocationsWanted | HostEndpoint
+    | HostPorts | HostsReload | RevocationsWanted | AuthorityWanted | HostEndpoint
 )  # fmt: skip
 RestRequest = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions

@@ -155,13 +155,16 @@ class Certification:
         }
 
     async def revocations(self) -> dict[str, Any]:
-        """The authority's certificate and its list of revoked certificates, in PEM."""
+        """The authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
-            authority = await self._authority.certificate()
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
-        return {"authority": authority.decode(), "revocations": listed.decode()}
+        return {"revocations": listed.decode()}
+
+    async def authority(self) -> dict[str, Any]:
+        """The authority's certificate, in PEM. Raises `HostRefusedError`."""
+        return {"authority": (await self.authority_certificate()).decode()}
 
     async def authority_certificate(self) -> bytes:
         """The authority's own, in PEM. Raises `HostRefusedError`."""

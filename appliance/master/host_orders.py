@@ -8,7 +8,7 @@ from appliance.master.hosts import Hosts
 MINE = (
     admin.HostAdd, admin.HostToken, admin.HostEnrol, admin.HostRenew, admin.HostRenewItself, admin.HostRenewed,
     admin.HostList, admin.HostKit, admin.HostRevoke, admin.HostPorts, admin.HostsReload, admin.RevocationsWanted,
-    admin.HostEndpoint,
+    admin.AuthorityWanted, admin.HostEndpoint,
 )  # fmt: skip
 
 
@@ -21,17 +21,28 @@ async def manage_hosts(hosts: Hosts, request: admin.HostRequest, who: str) -> di
             return await hosts.kit(name)
         case admin.HostEndpoint():
             return await hosts.endpoint()
-        case admin.RevocationsWanted():
-            return await hosts.revocations()
-        case admin.HostEnrol() | admin.HostRenewItself() | admin.HostRenewed():
+        case (
+            admin.HostEnrol()
+            | admin.HostRenewItself()
+            | admin.HostRenewed()
+            | admin.RevocationsWanted()
+            | admin.AuthorityWanted()
+        ):
             return await _itself(hosts, request)
         case _:
             return await _change(hosts, request, who)
 
 
-async def _itself(
-    hosts: Hosts, request: admin.HostEnrol | admin.HostRenewItself | admin.HostRenewed
-) -> dict[str, Any]:
+_OfItself = (
+    admin.HostEnrol
+    | admin.HostRenewItself
+    | admin.HostRenewed
+    | admin.RevocationsWanted
+    | admin.AuthorityWanted
+)
+
+
+async def _itself(hosts: Hosts, request: _OfItself) -> dict[str, Any]:
     match request:
         case admin.HostEnrol(token, text, peer):
             return await hosts.itself.enrol(token, text, peer)
@@ -39,6 +50,10 @@ async def _itself(
             return await hosts.itself.renew(name, text, proof, peer)
         case admin.HostRenewed(name, peer):
             return await hosts.itself.renewed(name, peer)
+        case admin.RevocationsWanted():
+            return await hosts.revocations()
+        case admin.AuthorityWanted():
+            return await hosts.authority()
 
 
 _Change = (

@@ -47,6 +47,7 @@ class Hosts:
         self._view = HostView(self._table, self._awaited, self._tunnels)
         self.itself = SelfService(certification)
         self.revocations = certification.revocations
+        self.authority = certification.authority
         self.ports = CheckedPorts(certification, self._view)
         self.changed: Callable[[], int] = lambda: 0
         self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control

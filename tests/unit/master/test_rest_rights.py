@@ -13,7 +13,7 @@ TOKENS = [TokenKept("0", role, role, b"", b"", 1e12) for role in ("viewer", "ope
 FOR_NOBODY = {
     admin.StatusWanted, admin.PolicyWanted, admin.PolicyRevisions, admin.RegistrationsWanted, admin.GraphWanted,
     admin.MetricsWanted, admin.MonitorsWanted, admin.HostList, admin.HostEnrol, admin.HostRenewItself,
-    admin.HostRenewed, admin.RevocationsWanted, admin.HostEndpoint,
+    admin.HostRenewed, admin.RevocationsWanted, admin.AuthorityWanted, admin.HostEndpoint,
 }  # fmt: skip
 
 
