@@ -22,7 +22,10 @@ umask 077
 # What openssl finds out about the signature of a list it says, and does not tell by its exit status.
 if ask --fail -o "$work/crl.pem" "$rest/v1/revocations" && LC_ALL=C openssl crl -in "$work/crl.pem" -noout \
     -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>&1 | grep -qx "verify OK"; then
-    install -D -m 0644 "$work/crl.pem" "$swanctl/x509crl/rosrv-crl.pem"
+    # In DER: swanctl takes 64 KiB of a list at most, and PEM is a third longer.
+    openssl crl -in "$work/crl.pem" -outform DER -out "$work/crl.der"
+    install -D -m 0644 "$work/crl.der" "$swanctl/x509crl/rosrv.crl"
+    rm -f "$swanctl/x509crl/rosrv-crl.pem"
 fi
 
 # What was left in the middle: a certificate that is in place and was not confirmed.

@@ -185,16 +185,12 @@ def renew(site: TunnelSite, laptop: ScriptHost) -> None:
     after = row(site, "laptop")
     assert after["serial"] != before
     assert not after["renewing"]
-    revoked = laptop.run(
-        "openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv-crl.pem", "-noout", "-text"
-    ).stdout
+    revoked = laptop.run("openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv.crl", "-noout", "-text").stdout
     assert before.upper() not in revoked, "the list is from before the renewal"
     early = laptop.run("/etc/rosrv/renew.sh", "--now", check=False)
     assert early.returncode == 1
     assert "again in" in early.stderr
-    fresh = laptop.run(
-        "openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv-crl.pem", "-noout", "-text"
-    ).stdout
+    fresh = laptop.run("openssl", "crl", "-in", "/etc/swanctl/x509crl/rosrv.crl", "-noout", "-text").stdout
     assert before.upper() in fresh
 
 

@@ -9,6 +9,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.kit import filled
@@ -74,7 +76,7 @@ class Host:
     @property
     def list_of_revoked(self) -> Path:
         """Where charon finds the list."""
-        return self.swanctl / "x509crl" / "rosrv-crl.pem"
+        return self.swanctl / "x509crl" / "rosrv.crl"
 
 
 @pytest.fixture
@@ -84,11 +86,21 @@ def host(tmp_path: Path) -> Host:
 
 
 def test_the_authoritys_list_of_revoked_certificates_is_kept(host: Host) -> None:
-    """Each look brings the list anew; a certificate that is new is not renewed."""
+    """Each look brings the list anew, in the shorter form; a certificate that is new is not renewed."""
     done = host.renew()
     assert done.returncode == 0, done.stderr
     assert "nothing to do" in done.stdout
-    assert host.list_of_revoked.read_bytes() == (host.answers / "revocations").read_bytes()
+    given = x509.load_pem_x509_crl((host.answers / "revocations").read_bytes())
+    assert host.list_of_revoked.read_bytes() == given.public_bytes(Encoding.DER)
+
+
+def test_a_list_of_an_earlier_kit_is_taken_away(host: Host) -> None:
+    """It stood under another name, and strongSwan would take whichever it finds first."""
+    earlier = host.swanctl / "x509crl" / "rosrv-crl.pem"
+    earlier.parent.mkdir()
+    earlier.write_bytes(host.authority.revocations([]))
+    assert host.renew().returncode == 0
+    assert [path.name for path in earlier.parent.iterdir()] == ["rosrv.crl"]
 
 
 @pytest.mark.parametrize("forged", ["another authority's", "no list"])
