@@ -237,6 +237,10 @@ class Hosts:
         for name in sorted(before - after):
             address = ipaddress.ip_address(self._table.rows[name].address)
             taken += self.expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
+        meant = self.addresses
+        await self.start()
+        if self.addresses != meant:  # the first tunnel of all: only now is clear text kept out
+            taken += self.changed()
         divergence = [f"{row['name']}: {row['divergence']}" for row in self._view.rows() if row["divergence"]]
         self._recorder.happened(
             "hosts reloaded",
@@ -248,7 +252,6 @@ class Hosts:
             divergence=divergence,
             who=who,
         )
-        await self.start()
         return {
             "revision": self._table.revision,
             "declared": sorted(self._table.declared.hosts),

@@ -645,6 +645,29 @@ def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) -> None:
+    """What `host:NAME` means is told when clear text is kept out, which a reload may be the first to ask for."""
+
+    async def enrol(bench: Bench) -> None:
+        await add(bench, "a")
+
+    async def again(bench: Bench) -> None:
+        await bench.hosts.start()
+        assert not bench.asked
+        bench.declared.unlink()
+        body = await bench.hosts.reload("tester")
+        assert body["opened"] == ["a"]
+        assert list(bench.hosts.addresses) == ["a"]
+        assert bench.order[-1] == "policy ['a']"
+        bench.order.clear()
+        await bench.hosts.reload("tester")
+        assert not bench.order
+
+    run(tmp_path, enrol)
+    (tmp_path / "hosts.yaml").write_text("hosts:\n  - {name: a, tunnel: false}\n")
+    run(tmp_path, again)
+
+
 def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
     """In the log once, in the status as long as it is so; a short life warns in its last third."""
 
