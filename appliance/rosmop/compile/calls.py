@@ -54,8 +54,10 @@ def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
     macro = _MACRO.match(parts[0]) if len(parts) == 1 else None
     if macro is not None:
         return _macro(scope, node, macro, value_of)
-    if parts in (("printf",), ("std", "printf"), ("puts",)):
+    if parts in (("printf",), ("std", "printf")):
         return _log(scope, node, "INFO", node.arguments, value_of)
+    if parts in (("puts",), ("std", "puts")):
+        return _line(scope, node, value_of)
     known = _known(scope, node, parts, value_of)
     if known is not None:
         return known
@@ -176,6 +178,15 @@ def _log(
     template, *rest = (value_of(scope, argument) for argument in arguments)
     text = formatted(scope, template, rest)
     code = f"{scope.context}.log({level!r}, {text}, {scope.site(node)})"
+    return Value(kinds.VOID, code, node.position, pure=False)
+
+
+def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
+    """`puts(text)`: no format."""
+    if len(node.arguments) != 1:
+        raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
+    text = convert(scope, value_of(scope, node.arguments[0]), kinds.STRING)
+    code = f"{scope.context}.log('INFO', {text}, {scope.site(node)})"
     return Value(kinds.VOID, code, node.position, pure=False)
 
 

@@ -22,6 +22,8 @@ FUNCTIONS = {
     "p_fixed": output.to_text_fixed,
     "p_precise": output.to_text_precise,
     "p_character": output.to_text_character,
+    "p_alternate": output.to_text_alternate,
+    "p_hexadecimal": output.to_text_hexadecimal,
     "p_moment": output.to_text_moment,
     "p_join": output.join_all,
 }
@@ -65,7 +67,7 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> str:
 
 
 def _conversion(scope: Scope, found: re.Match[bytes], value: Value, where: Position) -> tuple[bytes, str]:
-    flags, width, precision, _, letter = found.groups()
+    flags, width, precision, size, letter = found.groups()
     shown = found[0].decode("utf-8", "replace")
     if b"*" in (width, precision) or max(int(width or 0), int(precision or 0)) > _MAX_WIDTH:
         raise SpecificationError.at(where, f"the width in `{shown}` must be a number up to {_MAX_WIDTH}")
@@ -85,20 +87,46 @@ def _conversion(scope: Scope, found: re.Match[bytes], value: Value, where: Posit
     if not kinds.is_number(value.type):
         hint = "; write %s" if isinstance(value.type, _TEXTS) else "; write `.toSec()`"
         raise SpecificationError.at(value.position, f"`{shown}` needs a number; this is {value.type}{hint}")
+    if letter in b"aA":
+        if precision is not None:
+            raise SpecificationError.at(where, f"`{shown}`: write `%a` without a precision")
+        code = number(value.code, value.type, kinds.DOUBLE)
+        left = b"-" if b"-" in flags else b""
+        return b"%" + left + width + b"s", f"p_hexadecimal({code}, {b'+' in flags}, {letter == b'A'})"
     if letter in _FLOATING:
-        python = {b"a": b"g", b"A": b"G"}.get(letter, letter)
-        return head + python, number(value.code, value.type, kinds.DOUBLE)
-    return _integer(head, letter, value)
+        return head + letter, number(value.code, value.type, kinds.DOUBLE)
+    code = _integer(letter, size, value)
+    return _integer_head(flags, width, precision, letter, code)
 
 
-def _integer(head: bytes, letter: bytes, value: Value) -> tuple[bytes, str]:
-    """An integer conversion: a floating-point value is truncated, an unsigned conversion wraps."""
+def _integer(letter: bytes, size: bytes | None, value: Value) -> str:
+    """Code for what an integer conversion prints: as wide as its letters say, signed or unsigned as they say.
+
+    Without a size it is as wide as the value; a floating-point value is truncated.
+    """
     kind = kinds.promoted(value.type)
-    if not isinstance(kind, kinds.Integer):
-        kind = kinds.LONG
-    if letter in _UNSIGNED and kind.signed:
-        kind = kinds.ULONG if kind.bits == 64 else kinds.UINT
-    return head + letter.replace(b"u", b"d"), number(value.code, value.type, kind)
+    bits = kind.bits if isinstance(kind, kinds.Integer) else 64
+    bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)
+    target = kinds.Integer(bits, letter in _SIGNED, "")
+    if isinstance(kind, kinds.Integer):
+        return number(value.code, value.type, target)
+    return number(number(value.code, value.type, kinds.LONG), kinds.LONG, target)
+
+
+def _integer_head(
+    flags: bytes, width: bytes, precision: bytes | None, letter: bytes, code: str
+) -> tuple[bytes, str]:
+    """What Python writes for an integer conversion, and the argument; where the two differ, C's answer."""
+    if letter in _UNSIGNED:
+        flags = flags.replace(b"+", b"").replace(b" ", b"")
+    if precision is not None:
+        flags = flags.replace(b"0", b"")
+    point = b"" if precision is None else b"." + precision
+    python = letter.replace(b"u", b"d")
+    if b"#" in flags and letter in b"oxX":
+        template = b"%" + flags.replace(b"#", b"") + width + point + python
+        return b"%s", f"p_alternate({template!r}, {code})"
+    return b"%" + flags.replace(b"#", b"") + width + point + python, code
 
 
 class Stream:

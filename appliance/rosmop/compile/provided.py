@@ -30,6 +30,7 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
     "h_atof": texts.lenient_floating,
     "h_filled": texts.filled,
     "h_filled_at_most": texts.filled_at_most,
+    "h_printed": texts.printed,
     "h_extended": texts.extended,
     "h_compare": texts.compare,
     "h_len": len,
@@ -206,18 +207,19 @@ def _prints(call: Arguments) -> Value:
     call.count(2, 100)
     target = _buffer(call)
     text = formatted(call.scope, call.values[1], call.values[2:])
-    code = store(call.scope, target, f"h_filled({target.code}, {text}, {call.site})")
-    return Value(kinds.INT, f"(h_len({code}) * 0)", call.position, pure=False)
+    made = call.scope.temporary()
+    code = store(call.scope, target, f"h_filled({target.code}, {made}, {call.site})")
+    return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
 
 
 def _prints_at_most(call: Arguments) -> Value:
     call.count(3, 100)
     target = _buffer(call)
-    limit = number(call.values[1].code, call.values[1].type, kinds.LONG)
+    limit = number(call.values[1].code, call.values[1].type, kinds.ULONG)
     text = formatted(call.scope, call.values[2], call.values[3:])
-    cut = f"{text}[:h_max({limit} - 1, 0)]"
-    code = store(call.scope, target, f"h_filled({target.code}, {cut}, {call.site})")
-    return Value(kinds.INT, f"(h_len({code}) * 0)", call.position, pure=False)
+    made = call.scope.temporary()
+    code = store(call.scope, target, f"h_printed({target.code}, {made}, {limit}, {call.site})")
+    return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
 
 
 LIBRARY: Mapping[str, Function] = MappingProxyType(

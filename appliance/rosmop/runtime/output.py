@@ -39,6 +39,31 @@ def to_text_character(value: int) -> bytes:
     return bytes((value & 0xFF,))
 
 
+def to_text_alternate(template: bytes, value: int) -> bytes:
+    """`printf` with the flag `#`: octal begins with a 0, hexadecimal with 0x unless it is zero."""
+    if not value:
+        return template % value
+    if template[-1:] != b"o":
+        return (b"%#" + template[1:]) % value
+    digits = len(b"%o" % value)
+    _, point, precision = template[:-1].partition(b".")
+    if not point:
+        plain = template % value
+        if len(plain) > digits and plain[:1] == b"0":
+            return plain  # padded with zeros
+        return (template[:-1] + b".%do" % (digits + 1)) % value
+    return (template[: -1 - len(precision)] + b"%do" % max(int(precision or 0), digits + 1)) % value
+
+
+def to_text_hexadecimal(value: float, plus: bool, upper: bool) -> bytes:
+    """`%a`: the shortest hexadecimal form of a floating-point number."""
+    digits, exponent, power = value.hex().partition("p")
+    text = (digits.rstrip("0").rstrip(".") if "." in digits else digits) + exponent + power
+    if plus and value >= 0:
+        text = "+" + text
+    return (text.upper() if upper else text).encode()
+
+
 def to_text_moment(nanoseconds: int) -> bytes:
     """`std::cout << time`: seconds, a point, nine digits."""
     sign = b"-" if nanoseconds < 0 else b""

@@ -147,6 +147,11 @@ def filled_at_most(buffer: bytes, text: bytes, count: int, site: int) -> bytes:
     return copied + b"\0" * (count - len(copied)) + buffer[count:]
 
 
+def printed(buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
+    """A `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
+    return filled(buffer, text[: limit - 1], site) if limit else buffer
+
+
 def extended(buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcat(buffer, text)`."""
     return filled(buffer, terminated(buffer) + terminated(text), site)
