@@ -42,12 +42,12 @@ class Traffic:
     delay_seconds: float = 0.0
     delay: float = 0.0  # of a message, on average, in the last report; seconds
 
-    def add(self, row: TopicTraffic, now: float) -> None:
-        """Count what the relay reported; it reports once a second, and only what changed."""
+    def add(self, row: TopicTraffic, now: float, over: float) -> None:
+        """Count what the relay reported; it reports once a second, and only what changed, in `over` seconds."""
         self.messages += row.messages
         self.bytes += row.bytes
         self.dropped += row.dropped
-        passed = max(now - self.seconds, 1.0) if self.seconds else 1.0
+        passed = max(now - self.seconds, 1.0) if self.seconds else max(over, 1.0)
         self.messages_per_second = row.messages / passed
         self.bytes_per_second = row.bytes / passed
         self.seconds = now
@@ -90,12 +90,22 @@ class Carried:
         for one in [one for one in self.traffic if one[0] == key]:
             del self.traffic[one]
 
-    def reported(self, rows: list[TopicTraffic]) -> None:
+    def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         """A relay's counters; the last words about a node that is forgotten count for nothing."""
         now = time.monotonic()
         for row in rows:
             if self._name_of(row.key) is not None:
-                self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now)
+                self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
+
+    def unrecorded(self, connections: int) -> None:
+        """So many connections came and went while a relay had no control."""
+        if connections:
+            self._recorder.happened(
+                "records lost",
+                f"{connections} connections through a relay ended unrecorded while it had no control",
+                severity=Severity.ALARM,
+                lost=connections,
+            )
 
     def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
         """Somebody is connected."""

@@ -314,7 +314,8 @@ class RelayControl:
                     self.carried.upstream_lost(message, str(incarnation.host))
                     self._broken(incarnation)
             case messages.TrafficReported():
-                self.carried.reported(message.rows)
+                self.carried.reported(message.rows, message.over)
+                self.carried.unrecorded(message.unrecorded)
             case messages.ConnectionOpened():
                 self.carried.opened(post.index, message)
             case messages.ConnectionClosed():

@@ -390,12 +390,18 @@ class Engine:
         if farewell.live:
             self._farewells.add(farewell)
 
-    def _tick(self) -> None:
+    def _rows(self) -> list[TopicTraffic]:
+        """What went through since the last call."""
         rows = [row for topic, _publisher in self._topics.values() if (row := topic.traffic()) is not None]
         rows += [
             row for (key, name), one in self._services.items() if (row := one.row(key, name)) is not None
         ]
         rows, self._last_rows = self._last_rows + rows, []
+        return rows
+
+    def _tick(self) -> None:
+        for topic, _publisher in self._topics.values():
+            topic.tidy()
         self._middle.tick()
-        self._reporter.tick(rows)
+        self._reporter.tick(self._rows)
         self._loop.after(self._limits.report_every, self._tick)

@@ -1,14 +1,16 @@
 """What the relay tells control: connections, refusals (folded), lost publishers, traffic.
 
-Without a link the counters go on; connections that are open are reported again to a new control.
+Without a link the counters go on, and refusals are counted; a new control is told of both, of the connections that are
+open, and of those that have ended meanwhile.
 
 Invariants:
 - `TrafficReported` is sent at most once per `report_every`.
 - Equal refusals within that time are one message with a count, and there are at most `refusals` different
   ones; what a flood of strangers sends cannot grow the relay or fill the link.
+- Of the connections that end without a link, `_KEPT` are kept to be told; the others are counted.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable
 
 from appliance.channel.messages import (
     ConnectionClosed,
@@ -23,6 +25,7 @@ from appliance.relay.links import Link
 
 _Refusal = tuple[str, str, str, str, str]
 _TEXT = 300
+_KEPT = 1000
 
 
 class Reporter:
@@ -34,6 +37,9 @@ class Reporter:
         self._open: dict[int, ConnectionOpened] = {}
         self._number = 0
         self._refused: dict[_Refusal, int] = {}
+        self._ended: list[tuple[ConnectionOpened, str]] = []  # without a link
+        self._unrecorded = 0
+        self._silent = 0  # ticks without a link
 
     def attach(self, link: Link | None) -> None:
         """Speak to this control from now on."""
@@ -45,7 +51,11 @@ class Reporter:
         return self._link is not None
 
     def repeat_connections(self) -> None:
-        """Tell a new control which connections are open."""
+        """Tell a new control which connections have ended while there was none, and which are open."""
+        ended, self._ended = self._ended, []
+        for opened, reason in ended:
+            self.send(opened)
+            self.send(ConnectionClosed(opened.number, reason))
         for message in list(self._open.values()):
             self.send(message)
 
@@ -64,8 +74,15 @@ class Reporter:
 
     def closed(self, number: int, reason: str) -> None:
         """A connection that was served has ended."""
-        if self._open.pop(number, None) is not None:
+        opened = self._open.pop(number, None)
+        if opened is None:
+            return
+        if self._link is not None:
             self.send(ConnectionClosed(number, reason))
+        elif len(self._ended) < _KEPT:
+            self._ended.append((opened, reason))
+        else:
+            self._unrecorded += 1
 
     def refused(self, key: str, resource: str, host: str, caller_id: str, reason: str) -> None:
         """A connection is refused: told at once the first time, then counted until the next `tick`."""
@@ -73,20 +90,23 @@ class Reporter:
         if refusal in self._refused:
             self._refused[refusal] += 1
         elif len(self._refused) < self._limits.refusals:
-            self._refused[refusal] = 0
+            self._refused[refusal] = int(self._link is None)
             self.send(ConnectionRefused(*refusal, 1))
         else:
             folded = ("", "", "", "", "further refusals of other peers, not told one by one")
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
-    def tick(self, traffic: Iterable[TopicTraffic]) -> None:
-        """Send the counts since the last tick."""
+    def tick(self, traffic: Callable[[], list[TopicTraffic]]) -> None:
+        """Send the counts since the last tick; without a link they stay (`traffic` takes them) for the next."""
+        if self._link is None:
+            self._silent += 1
+            return
         for refusal, count in self._refused.items():
             if count:
                 self.send(ConnectionRefused(*refusal, count))
         self._refused.clear()
-        if self._link is None:
-            return
-        rows = list(traffic)
-        if rows:
-            self.send(TrafficReported(rows))
+        rows = traffic()
+        if rows or self._unrecorded:
+            over = (1 + self._silent) * self._limits.report_every
+            self.send(TrafficReported(rows, over, self._unrecorded))
+        self._silent = self._unrecorded = 0

@@ -232,10 +232,13 @@ class RelayedTopic:
         for member in self.members:
             member.cut(reason)
 
-    def traffic(self) -> TopicTraffic | None:
-        """The counters since the last call, a second ago or so; None when nothing has changed."""
+    def tidy(self) -> None:
+        """A second is over: what was kept for a moment is given up."""
         if self._recent is not None:
             self._recent.forget_old(self._clock())
+
+    def traffic(self) -> TopicTraffic | None:
+        """The counters since the last call; None when nothing has changed."""
         if self._reported:
             return None
         row = TopicTraffic(

@@ -197,9 +197,15 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
 
 
 class TrafficReported(Message):
-    """Counters of all relayed topics and services that changed; once a second at most."""
+    """Counters of all relayed topics and services that changed; once a second at most.
+
+    `over`: the seconds that they are of. `unrecorded` connections came and went without a control, beyond those that
+    are told one by one.
+    """
 
     rows: list[TopicTraffic]
+    over: float = 1.0
+    unrecorded: int = 0
 
 
 class SpecificationsStated(Message):

@@ -224,3 +224,15 @@ async def test_a_publisher_that_is_cut_for_what_it_sent_is_recorded() -> None:
     say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
     assert len(world.records) == 1
     world.close()
+
+
+async def test_what_a_relay_could_not_tell_is_said() -> None:
+    """Connections that nobody recorded, and traffic of the seconds without control as the rate that it was."""
+    world = World()
+    row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
+    world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
+    assert world.relay.traffic["key", "/left"].messages_per_second == 10
+    ((event, reason, fields),) = world.records
+    assert (event, fields["lost"]) == ("records lost", 7)
+    assert "7 connections" in reason
+    world.close()

@@ -66,9 +66,9 @@ def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: 
     for _ in range(5):
         reporter.refused("k", "/chatter", "10.0.0.2", "/x", "no grant")
     assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
-    reporter.tick([])
+    reporter.tick(list)
     assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 4)]
-    reporter.tick([])
+    reporter.tick(list)
     assert control.heard() == []
 
 
@@ -76,7 +76,7 @@ def test_many_different_refusals_are_bounded(control: Control, reporter: Reporte
     """Beyond the bound they are counted together, and none is lost from the count."""
     for number in range(1000):
         reporter.refused("k", "/chatter", "10.0.0.2", f"/x{number}", "no grant")
-    reporter.tick([])
+    reporter.tick(list)
     heard = control.heard()
     assert len(heard) == 4
     assert sum(message.count for message in heard) == 1000
@@ -111,6 +111,47 @@ def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Re
 
 def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -> None:
     """And none when nothing has moved."""
-    reporter.tick([ROW, ROW])
-    reporter.tick([])
+    reporter.tick(lambda: [ROW, ROW])
+    reporter.tick(list)
     assert control.heard() == [TrafficReported([ROW, ROW])]
+
+
+def test_refusals_without_a_control_are_told_to_the_next_one(control: Control, reporter: Reporter) -> None:
+    """With all that there were, however many seconds it took; so is the traffic, with the seconds that it is of."""
+    reporter.attach(None)
+    taken: list[int] = []
+    for _ in range(3):
+        reporter.refused("k", "/chatter", "10.0.0.2", "/x", "no grant")
+        reporter.tick(lambda: taken.append(1) or [ROW])  # type: ignore[func-returns-value]  # it is told if it is asked
+    assert taken == []
+    reporter.attach(control.link)
+    reporter.tick(lambda: [ROW])
+    assert control.heard() == [
+        ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 3),
+        TrafficReported([ROW], 4.0),
+    ]
+    reporter.tick(lambda: [ROW])
+    assert control.heard() == [TrafficReported([ROW])]
+
+
+def test_connections_that_ended_without_a_control_are_told_or_counted(
+    control: Control, reporter: Reporter
+) -> None:
+    """One by one as far as the relay keeps them."""
+    before = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
+    control.heard()
+    reporter.attach(None)
+    reporter.closed(before, "gone")
+    for _ in range(1001):
+        reporter.closed(reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/b"), "")
+    reporter.attach(control.link)
+    reporter.repeat_connections()
+    heard = control.heard()
+    for _ in range(2000):
+        control.loop.turn(0)
+        heard += control.heard()
+    assert (type(heard[0]), heard[1]) == (ConnectionOpened, ConnectionClosed(before, "gone"))
+    assert len(heard) == 2000
+    reporter.tick(list)
+    reporter.tick(list)
+    assert control.heard() == [TrafficReported([], 1.0, 2)]

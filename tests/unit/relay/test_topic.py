@@ -190,10 +190,10 @@ def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
     """It is let go at the next look at the counters, though no other message comes."""
     story = monitored()
     story.receive(batch(b"1"))
-    story.topic.traffic()
+    story.topic.tidy()
     assert story.budget.used > 0
     story.now += 1.5
-    story.topic.traffic()
+    story.topic.tidy()
     assert story.budget.used == 0
 
 
