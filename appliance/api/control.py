@@ -109,9 +109,14 @@ class ControlLink:
                 self._channel.send(self._kept[0])
             except (ChannelFullError, ChannelClosedError):
                 return
+            except UnicodeEncodeError as error:  # one that can never be told keeps the others from nothing
+                _log.error("a REST call cannot be recorded", reason=str(error))
+                self._dropped += self._kept[0].count
             self._kept.popleft()
         if self._dropped and self._channel is not None:
-            _log.warning("REST calls were not recorded while control was away", calls=self._dropped)
+            _log.warning(
+                "REST calls were not recorded: control was away, or could not be told", calls=self._dropped
+            )
             self._dropped = 0
 
     def close(self) -> None:
@@ -128,8 +133,8 @@ class ControlLink:
                     waiting.set_result(answer)
             case messages.TokensStated(tokens):
                 self.known = True
-                self._tell_kept()
                 self._tokens_stated(tokens)
+                self._tell_kept()
             case _:
                 _log.error("control said something that is not for the api", message=type(message).__name__)
 

@@ -29,6 +29,8 @@ class Journal:
         self, *, host: str, who: str, method: str, path: str, status: int, reason: str, duration_us: int
     ) -> None:
         """One answer was given."""
+        # What a client wrote may hold what is no text (JSON's \ud800); control could not be told it.
+        path, reason = _text(path), _text(reason)
         self.calls[method if method in _METHODS else "other", str(status)] += 1
         if who and method not in _READS:
             self._tell(RestCalled(host, who, method, path, status, reason, duration_us))
@@ -49,3 +51,7 @@ class Journal:
         for kind, count in repeated.items():
             if count:
                 self._tell(RestCalled(*kind, 0, count))
+
+
+def _text(given: str) -> str:
+    return given if given.isascii() else given.encode("utf-8", "backslashreplace").decode()

@@ -39,7 +39,7 @@ def to_columns(record: Record, sequence: int) -> StoredColumns:
             return columns
     except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
         pass
-    return _columns(_plain_record(record), sequence)
+    return _columns(plain_record(record), sequence)
 
 
 def _columns(record: Record, sequence: int) -> StoredColumns:
@@ -81,7 +81,8 @@ def from_columns(columns: StoredColumns) -> Record:
     )  # fmt: skip
 
 
-def _plain_record(record: Record) -> Record:
+def plain_record(record: Record) -> Record:
+    """The same with everything in a form that can be stored, whatever it holds."""
     rule = record.rule
     if rule is not None:
         rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), _integer(rule.line) or 0)

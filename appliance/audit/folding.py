@@ -9,7 +9,8 @@ Invariants:
 3. A kind is forgotten when it did not repeat for `seconds`; its next denial is recorded in full again.
 4. An allow for the same host, caller, category and resource ends the kinds it contradicts: their summaries
    come before it.
-5. What passed is never folded, also when it passed only because a policy is on trial (`would deny`): a policy
+5. What is counted is kept on disk: a kind is told by texts that can be stored (`columns.plain_record`).
+6. What passed is never folded, also when it passed only because a policy is on trial (`would deny`): a policy
    is learned from all of it.
 """
 
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 
 import msgspec
 
+from appliance.audit.columns import plain_record
 from appliance.audit.record import Record, RuleReference, Severity
 
 Key = tuple[str | int | None, ...]
@@ -98,10 +100,11 @@ class Folder:
                 yield record
         else:
             if record.decision == "allow":
-                yield from self._end_subject(_subject(record))
+                yield from self._end_subject(_subject(_keepable(record)))
             yield record
 
     def _count(self, record: Record, now: float) -> bool:
+        record = _keepable(record)
         key, scope = self._key(record)
         state = self._states.get(key)
         if state is None:
@@ -183,6 +186,21 @@ class Folder:
             state.count = 0
             state.tallies = {}
             self.touched.add(key)
+
+
+def _keepable(record: Record) -> Record:
+    """The record, in a form of which key and state can be stored."""
+    rule = record.rule
+    texts = [record.host, record.caller_id, record.category, record.resource, record.reason, record.event]
+    texts += [str(record.detail[name]) for name in _ABOUT if name in record.detail]
+    texts += [] if rule is None else [rule.section, rule.key, rule.file]
+    try:
+        for text in texts:
+            if text is not None and not text.isascii():
+                text.encode()
+    except UnicodeEncodeError:
+        return plain_record(record)
+    return record
 
 
 def _subject(record: Record) -> Key:

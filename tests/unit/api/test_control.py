@@ -118,3 +118,21 @@ def test_what_happened_meanwhile_is_told_to_the_next_control() -> None:
         assert link.connected
 
     run(play)
+
+
+def test_what_cannot_be_told_keeps_nothing_else_from_being_told() -> None:
+    """A call whose text no message can hold is left out; tokens are known, and the calls after it are told."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], tokens: list[TokenKept]) -> None:
+        link.tell(call(1))
+        link.tell(RestCalled("h", "w", "GET", "/\ud800", 200, "", 1))
+        link.tell(call(2))
+        there = control()
+        token = TokenKept("0123456789ab", "a", "viewer", b"", b"", 1.0)
+        there.channel.send(messages.TokensStated([token]))
+        assert [one.path for one in await there.until(2)] == ["/1", "/2"]
+        assert tokens == [token]
+        link.tell(call(3))
+        assert [one.path for one in await there.until(3)][-1] == "/3"
+
+    run(play)

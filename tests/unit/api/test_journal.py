@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import msgspec
+
 from appliance.api.journal import Journal
 from appliance.channel.messages import RestCalled
 
@@ -65,3 +67,12 @@ def test_strange_methods_are_one_number() -> None:
         answered(journal, method=f"M{number}", status=405)
     answered(journal)
     assert journal.calls == {("other", "405"): 50, ("GET", "200"): 1}
+
+
+def test_what_is_no_text_is_told_escaped() -> None:
+    """What a client wrote that no message can hold is told by its code points."""
+    told: list[RestCalled] = []
+    journal = Journal(told.append)
+    answered(journal, reason="names: \ud800 é", path="/\udcff", method="POST")
+    assert (told[0].reason, told[0].path) == ("names: \\ud800 é", "/\\udcff")
+    assert msgspec.msgpack.encode(told[0])

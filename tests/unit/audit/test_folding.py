@@ -3,6 +3,8 @@
 import itertools
 from typing import Any
 
+import msgspec
+
 from appliance.audit.folding import Folder, FoldSettings
 from appliance.audit.record import Record
 
@@ -199,3 +201,17 @@ def test_a_count_that_is_none_counts_once() -> None:
     strange: tuple[object, ...] = (True, 0, -5, "9", 2.5, None)
     offer(folder, denial(), *(denial(detail={"count": one}) for one in strange))
     assert [one.detail["count"] for one in folder.expire(10)] == [len(strange)]
+
+
+def test_what_is_no_text_can_be_kept() -> None:
+    """Names and reasons with what no disk takes are counted like others, and key and state can be written."""
+    folder = make_folder(seconds=10)
+    strange: dict[str, Any] = {"caller_id": "/\ud800", "reason": "\udcff", "detail": {"call": "\ud801"}}
+    first, second = denial("/\udfff", **strange), denial("/\udfff", **strange)
+    assert offer(folder, first, second) == [first]
+    (key,) = folder.touched
+    assert msgspec.json.encode(key)
+    assert msgspec.json.encode(folder.state(key))
+    (allowed,) = [denial("/\udfff", **strange | {"decision": "allow"})]
+    assert [one.event for one in offer(folder, allowed)] == ["denials folded", "decision"]
+    assert len(folder) == 0
