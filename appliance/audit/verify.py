@@ -144,6 +144,8 @@ class _Verifier:
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
         self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
         self._findings: list[Finding] = []
+        self._further: Finding | None = None
+        self._untold = 0
         self._sealed: dict[int, bytes] = {}
         self._reported: set[int] = set()
         self._shift = 0
@@ -164,6 +166,8 @@ class _Verifier:
         elsewhere = self._check_copies(removed)
         audit = self._checkpoints
         self._findings.sort(key=lambda one: one.first)
+        if self._further is not None:
+            self._findings.append(self._further)
         return Verification(
             ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
             removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
@@ -188,6 +192,11 @@ class _Verifier:
         if len(self._findings) < _MOST_FINDINGS:
             name = f"record {first}" if first == last else f"records {first} to {last}"
             self._findings.append(Finding(kind, first, last, f"{name}: {message}"))
+        else:
+            first = first if self._further is None else self._further.first
+            self._untold += 1
+            message = f"records {first} to {last}: {self._untold} further findings, not told one by one"
+            self._further = Finding(kind, first, last, message)
 
     # --- the database itself --------------------------------------------------------------------------------
 

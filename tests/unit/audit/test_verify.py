@@ -521,3 +521,13 @@ def test_signed_while_it_is_verified(
     result = verify(log, signer=tmp_path / "signer")
     assert result.findings == []
     assert result.checkpoints > before
+
+
+def test_more_findings_than_are_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a log with findings without end the first are told, and how many more there are, up to which record."""
+    monkeypatch.setattr("appliance.audit.verify._MOST_FINDINGS", 10)
+    attack(log, "DELETE FROM record WHERE sequence % 5 = 0 AND sequence <= 150")
+    result = verify(log)
+    removed = [one for one in result.findings if one.kind is Kind.MISSING]
+    assert [(one.first, one.last) for one in removed[:10]] == [(5 * n, 5 * n) for n in range(1, 11)]
+    assert result.findings[-1].message == "records 55 to 150: 20 further findings, not told one by one"
