@@ -10,6 +10,7 @@ httptools (llhttp) parses; this module bounds. Invariants:
 3. An address that no rule names is answered before its body is read.
 4. Hosts are served in turn (`turns`): one host has at most `slots_per_host` requests being served.
 5. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
+6. Who goes over a limit is told so, in a fault that says which; of connections that are too many, a few at a time.
 """
 
 import asyncio
@@ -26,6 +27,7 @@ import structlog
 
 from appliance.master.turns import Turns
 from appliance.policy.model import Address
+from appliance.ros.xmlrpc import build_fault
 
 _log = structlog.get_logger()
 
@@ -53,6 +55,8 @@ class HttpLimits:
     held_bytes_per_host: int = 64 << 20
     held_bytes: int = 512 << 20
     linger_seconds: float = 2.0
+    turned_away_per_host: int = 8  # connections that are too many and are being told so
+    turned_away: int = 256
 
     @property
     def framing_bytes(self) -> int:
@@ -92,6 +96,7 @@ class Visitors:
         self.connections: set[_Connection] = set()
         self._per_host: dict[Address, int] = {}
         self._total = 0
+        self._turned_away: Counter[Address] = Counter()
         self._held: Counter[Address] = Counter()
         self._held_in_all = 0
 
@@ -114,6 +119,22 @@ class Visitors:
             self._per_host[host] = remaining
         else:
             del self._per_host[host]
+
+    def turn_away(self, host: Address) -> bool:
+        """Whether a connection that is too many may stay until it was told so; it is counted then."""
+        if (
+            self._turned_away[host] >= self._limits.turned_away_per_host
+            or self._turned_away.total() >= self._limits.turned_away
+        ):
+            return False
+        self._turned_away[host] += 1
+        return True
+
+    def turned_away(self, host: Address) -> None:
+        """Such a connection is gone."""
+        self._turned_away[host] -= 1
+        if not self._turned_away[host]:
+            del self._turned_away[host]
 
     def hold(self, host: Address, size: int) -> str | None:
         """Count bytes in that are kept for a host; a sentence instead (nothing is counted) when it is too much."""
@@ -190,6 +211,7 @@ class _Connection(asyncio.Protocol):
         self._limits = server.limits
         self.deadline = time.monotonic() + server.limits.head_seconds
         self._counted = False
+        self._turned_away = False
         self._busy: asyncio.Task[None] | None = None
         self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
@@ -214,9 +236,7 @@ class _Connection(asyncio.Protocol):
         self.peer = Peer(host, str(host), str(plain_address(sockname[0])))
         too_many = self.server.visitors.enter(host)
         if too_many is not None:
-            self._closing = True
-            self.server.troubled(self.peer, too_many)
-            transport.abort()
+            self._turn_away(too_many)
             return
         self._counted = True
         self.server.visitors.connections.add(self)
@@ -231,6 +251,9 @@ class _Connection(asyncio.Protocol):
             self._counted = False
             self._release(len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending))
             self._body, self._unsent = bytearray(), 0
+        if self._turned_away:
+            self.server.visitors.turned_away(self.peer.host)
+            self._turned_away = False
         self.server.visitors.connections.discard(self)
         self._pending.clear()
         if self._busy is not None and self._waiting:
@@ -428,8 +451,22 @@ class _Connection(asyncio.Protocol):
             self._transport.close()
 
     def _reject(self, status: bytes, what: str) -> None:
-        self.server.troubled(self.peer, f"{self.peer.text} {what}")
-        self._write(status, b"", keep=False, unread=True)
+        self._refuse(status, f"{self.peer.text} {what}")
+
+    def _refuse(self, status: bytes, why: str) -> None:
+        self.server.troubled(self.peer, why)
+        self._write(status, build_fault(int(status[:3]), why), keep=False, unread=True)
+
+    def _turn_away(self, why: str) -> None:
+        """One connection too many: it is told so, if not too many are being told."""
+        if self.server.visitors.turn_away(self.peer.host):
+            self._turned_away = True
+            self.server.visitors.connections.add(self)
+            self._refuse(b"503 Service Unavailable", why)
+        else:
+            self._closing = True
+            self.server.troubled(self.peer, why)
+            self._transport.abort()
 
     def expire(self) -> None:
         """Called by the sweep when the deadline passed."""

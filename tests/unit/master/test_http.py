@@ -23,6 +23,7 @@ from appliance.master.http import (
     plain_address,
 )
 from appliance.master.turns import Turns
+from appliance.ros.xmlrpc import FaultReceived, parse_response
 
 LIMITS = HttpLimits()
 HOST = ipaddress.ip_address("10.0.0.1")
@@ -39,6 +40,13 @@ def post(body: bytes, *headers: str, path: str = "/", length: int | None = None)
         f"Content-Length: {len(body) if length is None else length}",
     ]
     return "\r\n".join([*lines, *headers, "", ""]).encode() + body
+
+
+def fault(body: bytes) -> str:
+    """The words of a fault."""
+    with pytest.raises(FaultReceived) as received:
+        parse_response(body)
+    return received.value.text
 
 
 class Client:
@@ -342,7 +350,9 @@ def test_malformed(request_bytes: bytes, status: int, reason: str) -> None:
         async with serving() as server:
             client = await server.connect()
             await client.send(request_bytes)
-            assert (await client.response())[0] == status
+            code, _headers, body = await client.response()
+            assert code == status
+            assert reason in fault(body)
             assert await client.ended() == b""
             assert [reason in trouble for trouble in server.troubles] == [True], server.troubles
             assert not server.requests
@@ -577,7 +587,8 @@ def test_connections_per_host() -> None:
             for client in clients:
                 await client.send(post(b"x"))
                 await client.response()
-            assert await (await server.connect()).ended() == b""
+            status, _headers, body = await (await server.connect()).response()
+            assert (status, fault(body)) == (503, "127.0.0.1 has 3 connections open, the limit for one host")
             assert "127.0.0.1 has 3 connections open" in await server.trouble()
             await clients[0].close()
             await until(lambda: server.visitors._total == 2)
@@ -586,6 +597,35 @@ def test_connections_per_host() -> None:
             assert (await late.response())[0] == 200
 
     run(test())
+
+
+def test_connections_that_are_too_many_do_not_stay() -> None:
+    """A few at a time are told why; the others are cut, and so are those that do not leave."""
+
+    async def test() -> None:
+        limits = replace(LIMITS, connections_per_host=1, turned_away_per_host=2, linger_seconds=0.2)
+        async with serving(limits=limits) as server:
+            first = await server.connect()
+            await first.send(post(b"x"))
+            await first.response()
+            late = [await server.connect() for _ in range(6)]
+            told = [(await one.ended())[:12] for one in late]
+            assert told.count(b"HTTP/1.1 503") == 2
+            assert told.count(b"") == 4
+            await until(lambda: len(server.visitors.connections) == 1)
+            assert not server.visitors._turned_away
+            assert (await (await server.connect()).response())[0] == 503
+
+    run(test())
+
+
+def test_connections_turned_away_in_all() -> None:
+    """All hosts together have a limit there as well."""
+    visitors = Visitors(replace(LIMITS, turned_away=1))
+    assert visitors.turn_away(HOST)
+    assert not visitors.turn_away(OTHER)
+    visitors.turned_away(HOST)
+    assert visitors.turn_away(OTHER)
 
 
 def test_bytes_per_host() -> None:
