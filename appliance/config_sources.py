@@ -36,7 +36,10 @@ _PATH_KEYS = (
     ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
 )  # fmt: skip
 KeyPath = tuple[str | int, ...]
-_SHORT_NAMES: dict[str, KeyPath] = {"ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file")}
+_SHORT_NAMES: dict[str, KeyPath] = {
+    "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
+    "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
+}
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Model = typing.TypeVar("_Model", bound=BaseModel)
 
@@ -121,9 +124,7 @@ class _Gathered:
         for name in sorted(environment):
             if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
                 continue
-            path = _SHORT_NAMES.get(name) or tuple(
-                part.lower() for part in name.removeprefix(_PREFIX).split("__")
-            )
+            path: KeyPath = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
             value: Any = environment[name]
             if value[:1] in "[{":
                 try:
@@ -131,6 +132,8 @@ class _Gathered:
                 except yaml.YAMLError as error:
                     self._mistakes.append(Mistake(name, f"is not YAML: {error}"))
                     continue
+            if name in _SHORT_NAMES and not isinstance(value, dict):
+                path = _SHORT_NAMES[name]
             self._set(path, value, name)
 
     def add_flags(self, flags: Mapping[str, Any]) -> None:

@@ -152,3 +152,17 @@ def test_a_mistake_about_two_keys_stands_where_one_of_them_was_said() -> None:
     with pytest.raises(ConfigError) as caught:
         resolve(None, {}, {"policy": Path("/a.ini"), "mediation": "monitored"})
     assert str(caught.value) == "--mediation: monitored needs relaying: monitored (--relay monitored)"
+
+
+def test_the_variable_of_a_flag_with_another_key() -> None:
+    """`ROSRV_RELAY` is `--relay`; a table, and what is in the section of that name, go to the section."""
+    assert (
+        resolve(None, {"ROSRV_RELAY": "monitored", "ROSRV_MEDIATION": "monitored"}, {}).relaying
+        == "monitored"
+    )
+    with pytest.raises(ConfigError, match=r"ROSRV_RELAY: relaying: .*'some'"):
+        resolve(None, {"ROSRV_RELAY": "some"}, {})
+    key, value = next(iter(Settings().relay.model_dump().items()))
+    as_table = resolve(None, {"ROSRV_RELAY": f"{{{key}: {value}}}"}, {})
+    as_key = resolve(None, {f"ROSRV_RELAY__{key.upper()}": str(value)}, {})
+    assert as_table == as_key == resolve(None, {}, {})
