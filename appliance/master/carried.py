@@ -10,6 +10,9 @@ from appliance.channel import messages
 from appliance.channel.messages import TopicTraffic
 from appliance.master.recorder import Recorder
 
+MOST_RESOURCES = 2000
+OTHERS = "(others)"  # no name of ROS has a bracket
+
 _STILL_SECONDS = 3.0  # without a report: nothing flows
 
 
@@ -56,6 +59,14 @@ class Traffic:
             self.delay_seconds += row.delay_seconds
         self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
 
+    def include(self, other: "Traffic") -> None:
+        """Count what another has counted, too."""
+        self.messages += other.messages
+        self.bytes += other.bytes
+        self.dropped += other.dropped
+        self.delays = [a + b for a, b in zip_longest(self.delays, other.delays, fillvalue=0)]
+        self.delay_seconds += other.delay_seconds
+
 
 class Carried:
     """Connections and traffic of all relays; `name(key)` is the name of an incarnation, None of an unknown one."""
@@ -66,6 +77,11 @@ class Carried:
         self._relays = relays
         self.connections: dict[tuple[int, int], Connection] = {}
         self.traffic: dict[tuple[str, str], Traffic] = {}
+        self.past: dict[str, Traffic] = {}
+        """What went through topics and services of incarnations that are forgotten: counters never go back.
+
+        Of at most `MOST_RESOURCES`; the rest is under `OTHERS`.
+        """
 
     def flow(self, key: str, resource: str) -> dict[str, float]:
         """What went and goes through a topic or service of an incarnation, in plain values."""
@@ -88,7 +104,8 @@ class Carried:
     def forgotten(self, key: str) -> None:
         """An incarnation is gone for good."""
         for one in [one for one in self.traffic if one[0] == key]:
-            del self.traffic[one]
+            name = one[1] if one[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
+            self.past.setdefault(name, Traffic()).include(self.traffic.pop(one))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         """A relay's counters; the last words about a node that is forgotten count for nothing."""

@@ -4,15 +4,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from appliance.master.carried import MOST_RESOURCES, OTHERS, Carried, Traffic
 from appliance.master.core import Master
 from appliance.master.observed import KINDS
 from appliance.master.registry import Life
 from appliance.policy.model import Category
 
-MOST_RESOURCES = 2000
 MOST_DELAYED = 200  # topics with a histogram of their own
-OTHERS = "(others)"  # no name of ROS has a bracket
-
 
 _Labels = tuple[str, str]
 _DECISIONS = tuple(
@@ -29,10 +27,6 @@ def measures_of(master: Master) -> dict[str, Any]:
     lives = Counter(one.life for one in master.registry.all() if not one.own)
     kinds = Counter(one.kind.value for node, one in master.registry.in_order() if not node.own)
     records = master.monitors.records
-    relayed = by_resource(
-        (resource, (traffic.messages, traffic.bytes, traffic.dropped))
-        for (_key, resource), traffic in master.relay.traffic.items()
-    )
     values = master.recorder.meter.values()
     decided = {(category, outcome): count for category, outcome, count in values["decisions"]}
     return {
@@ -40,15 +34,7 @@ def measures_of(master: Master) -> dict[str, Any]:
         "decisions": [[*labels, count] for labels, count in from_zero(decided, _DECISIONS).items()],
         "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         "registrations": dict(kinds),
-        "relayed": relayed,
-        "delayed": by_resource(
-            (
-                (resource, (*traffic.delays, traffic.delay_seconds))
-                for (_key, resource), traffic in master.relay.traffic.items()
-                if traffic.delays
-            ),
-            MOST_DELAYED,
-        ),
+        **carried_of(master.relay.carried),
         "monitors": [
             [kind, name, count]
             for (kind, name), count in from_zero(
@@ -62,6 +48,18 @@ def measures_of(master: Master) -> dict[str, Any]:
             for kind in ("drop", "change")
         },
         "connections": dict(Counter(one.kind for one in master.relay.connections.values())),
+    }
+
+
+def carried_of(carried: Carried) -> dict[str, dict[str, list[float]]]:
+    """What went through each topic and service since control started, and how late; all incarnations together."""
+    rows: list[tuple[str, Traffic]] = [*carried.past.items()]
+    rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
+    return {
+        "relayed": by_resource((name, (one.messages, one.bytes, one.dropped)) for name, one in rows),
+        "delayed": by_resource(
+            ((name, (*one.delays, one.delay_seconds)) for name, one in rows if one.delays), MOST_DELAYED
+        ),
     }
 
 

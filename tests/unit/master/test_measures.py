@@ -1,6 +1,13 @@
 """Tests of what control measures: bounded, whatever names others choose."""
 
-from appliance.master.measures import MOST_RESOURCES, OTHERS, by_resource, from_zero
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel.messages import TopicTraffic
+from appliance.master import carried
+from appliance.master.carried import MOST_RESOURCES, OTHERS, Carried
+from appliance.master.measures import by_resource, carried_of, from_zero
 
 
 def test_sums_by_name() -> None:
@@ -27,3 +34,23 @@ def test_few_topics_have_a_histogram_of_their_own() -> None:
     """Histograms have many series each, so fewer names are told one by one."""
     sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
     assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}
+
+
+def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that restarts is another incarnation: its topic counts on, bounded in names."""
+    monkeypatch.setattr(carried, "MOST_RESOURCES", 2)
+    counted = Carried(cast(Any, None), lambda _key: "/node", 1)
+    for number in range(4):
+        rows = [
+            TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
+            TopicTraffic(f"k{number}", f"/own{number}", 1, 1, 0, 1),
+        ]
+        counted.reported(rows)
+        before = carried_of(counted)
+        counted.forgotten(f"k{number}")
+        after = carried_of(counted)
+        assert (after["relayed"]["/a"], after["delayed"]) == (before["relayed"]["/a"], before["delayed"])
+    assert carried_of(counted) == {
+        "relayed": {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
+        "delayed": {"/a": [4, 8, 2.0]},
+    }
