@@ -8,6 +8,8 @@ from appliance.rosmop.compile.conversion import condition, constant_value, conve
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
 from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.context import FaultError
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -74,6 +76,25 @@ def _integer(node: tree.Number, text: str, suffix: str) -> Value:
         if value <= kind.most:
             return constant_value(node.position, kind, value)
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
+
+
+def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
+    """The value that `make` makes of the operands; if all are numbers that are known, so is what comes of them."""
+    if not all(isinstance(operand.constant, int | float) for operand in operands):
+        return make(*operands)
+    known = [
+        constant_value(operand.position, operand.type, operand.constant)
+        for operand in operands
+        if operand.constant is not None
+    ]
+    value = make(*known)
+    if not kinds.is_number(value.type):
+        return value
+    try:
+        constant = eval(value.code, scope.module.namespace)  # noqa: S307  our own code, as in module.py
+    except FaultError:
+        return value
+    return constant_value(value.position, value.type, constant)
 
 
 # Each kind of expression
@@ -161,7 +182,12 @@ def _message_constant(scope: Scope, node: tree.Name) -> Value:
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Unary)
-    return operators.unary(node.operator, value_of(scope, node.operand), node.position, scope.site(node))
+    site = scope.site(node)
+    return folded(
+        scope,
+        (value_of(scope, node.operand),),
+        lambda operand: operators.unary(node.operator, operand, node.position, site),
+    )
 
 
 def _step(scope: Scope, node: tree.Expression) -> Value:
@@ -182,9 +208,13 @@ def _step(scope: Scope, node: tree.Expression) -> Value:
 
 def _binary(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Binary)
-    left, right = value_of(scope, node.left), value_of(scope, node.right)
-    return operators.binary(
-        node.operator, operators.Operands(scope, node.position, left, right, scope.site(node))
+    operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
+    return folded(
+        scope,
+        operands,
+        lambda left, right: operators.binary(
+            node.operator, operators.Operands(scope, node.position, left, right, site)
+        ),
     )
 
 
@@ -225,8 +255,12 @@ def _character_or_text(scope: Scope, node: tree.Expression) -> str:
 
 def _conditional(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Conditional)
-    test = condition(value_of(scope, node.condition))
-    yes, no = value_of(scope, node.yes), value_of(scope, node.no)
+    values = tuple(value_of(scope, part) for part in (node.condition, node.yes, node.no))
+    return folded(scope, values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
+
+
+def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
+    test = condition(tested)
     if kinds.is_number(yes.type) and kinds.is_number(no.type):
         kind = yes.type if yes.type == no.type else kinds.common(yes.type, no.type)
         codes = [number(each.code, each.type, kind) for each in (yes, no)]
@@ -241,7 +275,8 @@ def _conditional(scope: Scope, node: tree.Expression) -> Value:
             no.position, f"`?:` between {yes.type} and {no.type}; make them the same type"
         )
     code = f"({codes[0]} if {test} else {codes[1]})"
-    return Value(kind, code, node.position, owned=yes.owned and no.owned, pure=yes.pure and no.pure)
+    pure = tested.pure and yes.pure and no.pure
+    return Value(kind, code, position, owned=yes.owned and no.owned, pure=pure)
 
 
 def _sequence(scope: Scope, node: tree.Expression) -> Value:
@@ -273,8 +308,11 @@ def _member(scope: Scope, node: tree.Expression) -> Value:
 def _cast(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Cast)
     target = resolve(node.type, scope.messages)
-    value = value_of(scope, node.operand)
-    return Value(target, convert(scope, value, target), node.position, pure=value.pure)
+    return folded(
+        scope,
+        (value_of(scope, node.operand),),
+        lambda value: Value(target, convert(scope, value, target), node.position, pure=value.pure),
+    )
 
 
 def _call(scope: Scope, node: tree.Expression) -> Value:
@@ -284,7 +322,10 @@ def _call(scope: Scope, node: tree.Expression) -> Value:
 
 def _construct(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Construct)
-    return calls.construct(scope, node.position, resolve(node.type, scope.messages), node.arguments, value_of)
+    kind = resolve(node.type, scope.messages)
+    if kinds.is_number(kind) and len(node.arguments) == 1:
+        return _cast(scope, tree.Cast(node.position, node.type, node.arguments[0]))
+    return calls.construct(scope, node.position, kind, node.arguments, value_of)
 
 
 def _new(scope: Scope, node: tree.Expression) -> Value:

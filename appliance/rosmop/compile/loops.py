@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 
-from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
+from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Loop, Scope
 from appliance.rosmop.compile.vector_members import element_value
 from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.numbers import wrap
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -168,11 +169,15 @@ def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[str, i
             raise SpecificationError.at(
                 case.value.position, "a case needs a constant: a number or a character"
             )
-        wanted = constant_value(value.position, kind, int(constant))
-        if int(constant) in table:
-            raise SpecificationError.at(case.value.position, f"case {int(constant)} occurs twice")
-        table[int(constant)] = index
-        convert(scope, wanted, kind)
+        if not -(1 << kind.bits - 1) <= constant < 1 << kind.bits:
+            raise SpecificationError.at(
+                case.value.position,
+                f"case {int(constant)} can never be: {kind} holds {kind.least} to {kind.most}",
+            )
+        wanted = wrap(int(constant), kind.bits, kind.signed)
+        if wanted in table:
+            raise SpecificationError.at(case.value.position, f"case {wanted} occurs twice")
+        table[wanted] = index
     return ", ".join(f"{constant}: {index}" for constant, index in table.items()), default
 
 

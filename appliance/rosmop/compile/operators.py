@@ -1,11 +1,8 @@
 """Operators as code, with the types C++ gives their results."""
 
-from collections.abc import Callable
-
 from appliance.rosmop.compile import cursors
 from appliance.rosmop.compile.conversion import (
     condition,
-    constant_value,
     convert,
     number,
     wrapped,
@@ -224,30 +221,8 @@ def unary(operator: str, operand: Value, position: Position, site: int) -> Value
     kind = kinds.promoted(operand.type)
     if not kinds.is_number(kind) or (operator == "~" and not isinstance(kind, kinds.Integer)):
         raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
-    folded = _folded(operator, operand, kind)
-    if folded is not None:
-        return constant_value(position, kind, folded)
     code = number(operand.code, operand.type, kind)
     changed = f"({operator}{code})" if operator != "+" else code
     if isinstance(kind, kinds.Integer) and operator != "+":
         changed = wrapped(changed, kind)
     return Value(kind, changed, position, pure=operand.pure)
-
-
-_FOLDED: dict[str, Callable[[int | float], int | float]] = {
-    "-": lambda value: -value,
-    "+": lambda value: value,
-}
-
-
-def _folded(operator: str, operand: Value, kind: Type) -> int | float | None:
-    if (
-        operator not in _FOLDED
-        or not isinstance(operand.constant, int | float)
-        or isinstance(operand.constant, bool)
-    ):
-        return None
-    value = _FOLDED[operator](operand.constant)
-    if isinstance(kind, kinds.Integer):
-        return numbers.wrap(int(value), kind.bits, kind.signed)
-    return value

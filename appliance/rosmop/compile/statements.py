@@ -63,9 +63,12 @@ def known(
     """The value of a `const` number whose value is written down, for sizes of arrays and cases; None for others."""
     if not name.constant or not kinds.is_number(kind) or declarator.is_array:
         return None
-    if declarator.value is None or isinstance(declarator.value, tree.Elements):
+    node = declarator.value
+    if node is None and declarator.arguments is not None and len(declarator.arguments) == 1:
+        node = declarator.arguments[0]
+    if node is None or isinstance(node, tree.Elements):
         return None
-    value = value_of(scope, declarator.value).constant
+    value = value_of(scope, node).constant
     if isinstance(kind, kinds.Floating):
         return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
     if not isinstance(value, int):

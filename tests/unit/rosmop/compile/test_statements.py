@@ -54,6 +54,54 @@ def test_a_switch_falls_through_until_a_break(data: int, lines: str) -> None:
     assert printed(SWITCH, data=data) == lines
 
 
+CONSTANT_CASES = [
+    ("const int N = 2 * 3; switch (x) { case N + 1: %s }", 7),
+    ("switch (x) { case (1 << 2): %s }", 4),
+    ("switch (x) { case true ? 5 : 6: %s }", 5),
+    ("switch (x) { case (char) 300: %s }", 44),
+    ("switch (x) { case int(2.5) * 2 == 4: %s }", 1),
+    ("switch (x) { case ~1: %s }", -2),
+    ("const bool B = 3 > 2 && !false; switch (x) { case B: %s }", 1),
+    ("unsigned u = 4294967295; switch (u) { case -1: %s }", 0),
+    ("switch (x) { case 4294967295u: %s }", -1),
+    ("switch (x) { case std_msgs::Empty_::X: %s }", None),
+    ("switch (x) { case 1 / 0: %s }", None),
+]
+
+
+@pytest.mark.parametrize(("body", "data"), CONSTANT_CASES)
+def test_a_case_is_a_constant_expression_of_the_type_of_the_switch(body: str, data: int | None) -> None:
+    """What can be computed when the file is loaded is a constant, and is converted as C++ converts it."""
+    if data is None:
+        assert refused_action(body % ";")
+    else:
+        assert printed(body % 'ROS_INFO("yes"); break; default: ROS_INFO("no");', data=data) == "yes"
+
+
+def test_a_case_that_its_type_cannot_hold_is_refused() -> None:
+    """It would never match."""
+    found = refused_action("switch (x) { case 4294967296: ; }")
+    assert found[0].text == "case 4294967296 can never be: int holds -2147483648 to 2147483647"
+    assert refused_action("switch (x) { case -1: ; case 4294967295u: ; }")[0].text == "case -1 occurs twice"
+
+
+SIZES = [
+    ("const int N = 2*3; int q[N];", 6),
+    ("const int N(4); int q[N - 1];", 3),
+    ("int q[(1 << 3) | 1];", 9),
+    ("const double D = 2.5; int q[(int) (D * 2)];", 5),
+    ("int q[10 / 3 % 2 + 1];", 2),
+    ("const unsigned U = -1; int q[U == 4294967295 ? 2 : 1];", 2),
+]
+
+
+@pytest.mark.parametrize(("declaration", "size"), SIZES)
+def test_the_size_of_an_array_is_a_constant_expression(declaration: str, size: int) -> None:
+    """For local and for shared arrays."""
+    assert printed(f'{declaration} ROS_INFO("%d", (int) q.size());') == str(size)
+    assert printed('ROS_INFO("%d", (int) q.size());', before=declaration) == str(size)
+
+
 def test_a_switch_without_a_fitting_case_does_nothing() -> None:
     """Without `default` nothing runs."""
     assert printed('switch (x) { case 1: ROS_INFO("one"); }', data=3) == ""
