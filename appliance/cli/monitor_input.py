@@ -1,5 +1,6 @@
 """What the monitor verbs read: specifications, and folders of message definitions."""
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from appliance.ros.standard import standard_definitions
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
 
+_NOT_UTF_8 = re.compile("[\udc80-\udcff]")
+_SAVE_AS_UTF_8 = "these bytes are no UTF-8; save the file as UTF-8"
+_STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line
 BESIDE = "msg"
 """The folder of definitions that is looked into beside every specification."""
 
@@ -40,17 +44,57 @@ def read_definitions(files: Sequence[Path], folders: Sequence[Path]) -> Definiti
 
     Later ones win. Raises `SpecificationError` for a definition that cannot be read.
     """
+    definitions = standard_definitions()
+    for folder in _folders_of(files, folders):
+        texts, places = _definition_texts(folder)
+        try:
+            definitions = definitions.extended(Definitions.from_files(texts))
+        except DefinitionError as error:
+            place = places.get(error.source, str(folder / error.source))
+            raise SpecificationError.at(Position(place, max(error.line, 1), 1), error.text) from None
+    return definitions
+
+
+def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> tuple[dict[str, str], dict[str, str]]:
+    """Specifications by the names that the appliance knows them by, and the definitions for them, as files.
+
+    The same files are taken and refused as by `read_specifications` and `read_definitions`; what the definitions say is
+    judged where they are sent to. Raises `SpecificationError`.
+    """
+    named: dict[str, Path] = {}
+    for file in files:
+        other = named.setdefault(file.name, file)
+        if other.resolve() != file.resolve():
+            raise usage_error(
+                f"{other} and {file} have one name, and the appliance knows specifications by the names of their "
+                "files: load them under different names"
+            )
+    definitions: dict[str, str] = {}
+    for folder in _folders_of(files, folders):
+        texts, places = _definition_texts(folder)
+        definitions |= {name: _sendable(text, places[name]) for name, text in texts.items()}
+    texts = read_specifications(files)
+    for path, text in texts.items():
+        found = _NOT_UTF_8.search(text)
+        if found is not None:
+            line, column = (
+                text.count("\n", 0, found.start()) + 1,
+                found.start() - text.rfind("\n", 0, found.start()),
+            )
+            raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
+    return {Path(path).name: text for path, text in texts.items()}, definitions
+
+
+def _folders_of(files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise usage_error(f"--msg: {folder} is no folder")
     beside = dict.fromkeys(file.parent / BESIDE for file in files)
-    definitions = standard_definitions()
-    for folder in [*(path for path in beside if path.is_dir()), *folders]:
-        definitions = definitions.extended(_definitions_in(folder))
-    return definitions
+    return [*(path for path in beside if path.is_dir()), *folders]
 
 
-def _definitions_in(folder: Path) -> Definitions:
+def _definition_texts(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """The definitions below a folder by `package/File`, and where each stands, by that name and the type's."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
     for path in _definition_files(folder):
@@ -61,11 +105,7 @@ def _definitions_in(folder: Path) -> Definitions:
         name = f"{package.name}/{path.name}"
         places[name] = places[name.rsplit(".", 1)[0]] = str(path)
         texts[name] = _text_of(path)
-    try:
-        return Definitions.from_files(texts)
-    except DefinitionError as error:
-        place = places.get(error.source, str(folder / error.source))
-        raise SpecificationError.at(Position(place, max(error.line, 1), 1), error.text) from None
+    return texts, places
 
 
 def _definition_files(folder: Path) -> Iterable[Path]:
@@ -77,3 +117,16 @@ def _text_of(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="surrogateescape")
     except OSError as error:
         raise usage_error(f"cannot read {path}: {error.strerror}") from error
+
+
+def _sendable(text: str, place: str) -> str:
+    """The same in UTF-8. Old definitions have comments in other encodings, which mean nothing; all else would."""
+    lines = text.split("\n")
+    for number, line in enumerate(lines):
+        if line.isascii() or not _NOT_UTF_8.search(line):
+            continue
+        said = line if _STRING_CONSTANT.match(line) else line.partition("#")[0]
+        if _NOT_UTF_8.search(said):
+            raise SpecificationError.at(Position(place, number + 1, 1), _SAVE_AS_UTF_8)
+        lines[number] = _NOT_UTF_8.sub("\N{REPLACEMENT CHARACTER}", line)
+    return "\n".join(lines)

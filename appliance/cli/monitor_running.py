@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from appliance.channel.admin import (
+    AdminAnswer,
     MonitorLoad,
     MonitorReload,
     MonitorRemove,
@@ -17,8 +18,10 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
-from appliance.cli.output import Json, counted, say, say_json
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.monitor_input import read_to_send
+from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.running import Appliance, body_or_exit, speaks
+from appliance.rosmop.syntax.errors import SpecificationError
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
@@ -91,14 +94,14 @@ def load(
 
     Example: rosrv monitor load safe_zone.rv
     """
-    texts = {file.name: _text(file) for file in files}
-    folders = [*dict.fromkeys(file.parent / "msg" for file in files), *(msg or [])]
-    definitions: dict[str, str] = {}
-    for folder in folders:
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in {".msg", ".srv"} and path.is_file():
-                package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
-                definitions[f"{package.name}/{path.name}"] = _text(path)
+    try:
+        texts, definitions = read_to_send(files, msg or [])
+    except SpecificationError as error:
+        found = [printable(str(finding)) for finding in error.findings]
+        body_or_exit(
+            AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
+        )
+        return
     _say_replaced(
         appliance.ask_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json
     )
@@ -192,12 +195,3 @@ def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
     names = [row["name"] for row in rows if row["file"] in files and not row["enabled"]]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else f"it is not UTF-8: {error.reason}"
-        typer.echo(f"rosrv monitor: cannot read {file}: {reason}", err=True)
-        raise typer.Exit(2) from None
