@@ -1,7 +1,7 @@
 """Specifications become monitors beside the loop, so that messages go on while a large set is compiled.
 
-One statement at a time, in the order they came; `done` is called by the loop. The first one of a relay is compiled
-at once: nothing is carried yet, and nothing may be before it is in force.
+One statement at a time, in the order they came; `done` is called by the loop. Only what has no specifications is
+"compiled" at once.
 """
 
 import os

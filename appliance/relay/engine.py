@@ -7,9 +7,12 @@ asks for.
 Invariants:
 - A connection that is served stands on a statement in the table; the withdrawal of that statement cuts it.
 - Without a link to control everything goes on as stated before; nothing new is granted.
+- What control states while the first specifications are being compiled is carried out when they are in force, in order.
 """
 
+import os
 import socket
+from collections import deque
 from collections.abc import Mapping
 
 from appliance.channel.messages import (
@@ -77,6 +80,7 @@ class Engine:
         self._farewells: set[Farewell] = set()
         self._link: Link | None = None
         self._last_rows: list[TopicTraffic] = []
+        self._later: deque[tuple[Message, tuple[int, ...]]] = deque()
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: Link | None) -> None:
@@ -86,6 +90,12 @@ class Engine:
 
     def take(self, message: Message, descriptors: tuple[int, ...]) -> None:
         """Carry out one message of control."""
+        if self._middle.preparing or self._later:
+            self._later.append((message, descriptors))
+        else:
+            self._carry_out(message, descriptors)
+
+    def _carry_out(self, message: Message, descriptors: tuple[int, ...]) -> None:
         if isinstance(message, StateBegan):
             self._table.begin(message.epoch)
         elif isinstance(message, StateEnded):
@@ -113,6 +123,10 @@ class Engine:
     def close(self) -> None:
         """Cut everything."""
         self._middle.close()
+        for _message, descriptors in self._later:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        self._later.clear()
         self._ports.close_all()
         for topic, publisher in self._topics.values():
             topic.cut_all("the relay ends")
@@ -216,6 +230,8 @@ class Engine:
         for client in list(self._clients):
             client.judge_again()
         self._ask_for_latched(topics)
+        while self._later and not self._middle.preparing:
+            self._carry_out(*self._later.popleft())
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
         """What monitors kept back of a latching publisher may go through now: it gives it to a new connection.

@@ -60,6 +60,8 @@ class Middle:
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
         self.blocked = ""
+        self.preparing = False
+        """The first specifications are being compiled: nothing is carried yet, and nothing may be."""
         self.spent = 0.0
         self.sight = object()
         self._timer: Timer | None = None
@@ -75,16 +77,18 @@ class Middle:
     def state(self, message: SpecificationsStated) -> None:
         """Take these specifications, at once or when they are compiled; the same as before keep their state."""
         self._switches = dict(message.enabled)
-        if self._compiler.busy:
-            self._compiler.later(message)
-        elif self._stated is not None and not self.blocked and _same(message, self._stated):
-            self._taken(message, [], frozenset())
-        elif self._stated is None or self.blocked:
-            self._compiler.now(message)
-        else:
-            self._compiler.later(message)
+        if not self._compiler.busy:
+            if self._stated is not None and not self.blocked and _same(message, self._stated):
+                self._taken(message, [], frozenset())
+                return
+            if not message.files and (self._stated is None or self.blocked):
+                self._compiler.now(message)
+                return
+            self.preparing = self._stated is None and not self.blocked
+        self._compiler.later(message)
 
     def _compiled(self, message: SpecificationsStated, result: Result) -> None:
+        self.preparing = False
         self.look_again()
         if isinstance(result, list):
             self._refuse(message, result)

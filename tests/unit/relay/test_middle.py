@@ -1,6 +1,7 @@
 """Monitors in the middle, told as transcripts of the whole relay: specifications in, messages through, reports out."""
 
 import struct
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +22,7 @@ from appliance.channel.messages import (
     SpecificationsTaken,
     UpstreamWanted,
 )
+from appliance.relay.compiling import Compiler
 from appliance.relay.lane import TOO_LONG
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.unit.relay.test_engine import ASK, HEADER, LOOPBACK, Peer, World
@@ -186,6 +188,36 @@ def test_other_specifications_take_over_between_two_messages_and_the_same_keep_t
     world.load(revision=5)
     publisher.send(string("worse"))
     world.gets(subscriber, string("worse"))
+
+
+def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
+    world: Monitored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long they take to compile: the loop serves on (its supervisor), and nothing goes past the monitors."""
+    compiled = threading.Event()
+    compile_now = Compiler._compile
+
+    def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
+        compiled.wait()
+        return compile_now(compiler, message)
+
+    monkeypatch.setattr(Compiler, "_compile", compile_late)
+    late = GUARD.replace("/chatter", "/late")
+    world.state(SpecificationsStated(1, [("0.rv", late)], {}, {}, True, statement=7))
+    world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
+    world.state(GrantInstalled("k", "/late", LOOPBACK, "/listener"))
+    world.state(MonitorSwitched("guard", False))
+    turned: list[bool] = []
+    world.loop.after(0, lambda: turned.append(True))
+    world.until(lambda: turned)
+    assert ("k", "/late") not in world.engine._topics
+    compiled.set()
+    taken = world.until(lambda: world.taken(SpecificationsTaken, 1))
+    assert (taken.began, taken.statement) == (["guard"], 7)
+    assert ("k", "/late") in world.engine._topics
+    assert not world.engine._middle.wants("/late")
+    world.state(MonitorSwitched("guard", True))
+    assert world.engine._middle.wants("/late")
 
 
 def test_bad_specifications_change_nothing(world: Monitored) -> None:
