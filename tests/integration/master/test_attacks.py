@@ -51,6 +51,8 @@ read default     = all
 read /secret/**  = own
 write default    = own
 write /shared/** = all
+write /shared/fixed = own
+write /leaf      = all
 
 [Commands]
 default  = all
@@ -375,6 +377,29 @@ def test_parameters_of_others(field: Field, key: str) -> None:
     assert field.call(field.robot, "getParam", "/looker", "/secret/key")[2] == 4711
 
 
+@pytest.mark.parametrize("key", ["/shared/fixed/x", "/shared//fixed/x/y/"])
+def test_a_parameter_is_not_replaced_from_below(field: Field, key: str) -> None:
+    """ROSMaster puts a namespace where something below a value is set: that is a write of the value."""
+    assert field.call(field.robot, "setParam", "/looker", "/shared/fixed", 4711)[0] == 1
+    answer = field.rogue("setParam", "/writer_below", key, 0)
+    field.denied(answer, "", rule="[Parameters] write /shared/fixed", resource="setParam")
+    [[answer]] = field.rogue("system.multicall", [part("setParam", "/writer_within", key, 0)])
+    field.denied(answer, "", rule="[Parameters] write /shared/fixed", resource="setParam")
+    assert field.call(field.robot, "getParam", "/looker", "/shared/fixed")[2] == 4711
+
+
+def test_a_key_is_no_right_to_a_namespace(field: Field) -> None:
+    """What one may set to a value, one may neither set to a dictionary nor delete while others have something in it."""
+    assert field.rogue("setParam", "/writer_leaf", "/leaf", 1)[0] == 1
+    answer = field.rogue("setParam", "/writer_leaf", "/leaf", {"a": 1})
+    field.denied(answer, "", rule="[Parameters] write default", resource="setParam")
+    assert field.call(field.robot, "setParam", "/looker", "/leaf/b", 4711)[0] == 1
+    for method, value in (("setParam", (1,)), ("deleteParam", ())):
+        answer = field.rogue(method, f"/writer_leaf_{method}", "/leaf", *value)
+        field.denied(answer, "", rule="[Parameters] write default", resource=method)
+    assert field.call(field.robot, "getParam", "/looker", "/leaf")[2] == {"b": 4711}
+
+
 @pytest.mark.parametrize("key", ["/secret/key", "/secret", "/", "//secret/"])
 def test_reading_a_secret(field: Field, key: str) -> None:
     """Neither the key nor a namespace that holds it can be read, watched or asked for."""
@@ -393,8 +418,10 @@ def test_secrets_are_not_listed(field: Field) -> None:
     """`getParamNames` and `searchParam` show what may be read."""
     assert "/secret/key" not in field.rogue("getParamNames", "/lister")[2]
     assert "/open_key" in field.rogue("getParamNames", "/lister")[2]
-    answer = field.rogue("searchParam", "/secret/inside", "key")
-    assert answer[0] != 1, answer
+    for key in ("key", "other"):
+        answer = field.rogue("searchParam", "/secret/inside", key)
+        assert answer[0] == -1, answer
+        assert "[Parameters] read /secret/**" in answer[1]
     assert field.rogue("searchParam", "/lister", "open_key")[2] == "/open_key"
 
 
