@@ -11,6 +11,8 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.master.surroundings import Surroundings
 
+ROUTES_AT_ONCE = 32  # strangers make control ask, and the supervisor takes only so many questions
+
 _log = structlog.get_logger()
 
 
@@ -30,7 +32,8 @@ class ControlLifeline:
         self.reload_requested: Callable[[], None] = lambda: None
         self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
         self.tunnels_enclosed: Callable[[messages.TunnelsEnclosed], None] = lambda answer: None  # noqa: ARG005 - as above
-        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
+        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # what is asked and not answered
+        self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
         self._early_links: list[tuple[str, int, int]] = []
 
@@ -57,10 +60,19 @@ class ControlLifeline:
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:
-        """The machine's address that `host` reaches the appliance at; None: the one it used."""
+        """The machine's address that `host` reaches the appliance at; None: the one it used.
+
+        Asked once for all who wait for the same host, and for `ROUTES_AT_ONCE` hosts at once; others wait.
+        """
+        if host not in self._routes:
+            await self._free_questions.acquire()
+            if host in self._routes:  # somebody else has asked meanwhile
+                self._free_questions.release()
+            else:
+                self._routes[host] = []
+                self.say(messages.RouteWanted(host))
         future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
-        self._routes.setdefault(host, []).append(future)
-        self.say(messages.RouteWanted(host))
+        self._routes[host].append(future)
         return await future
 
     async def endpoint(self) -> messages.EndpointFound:
@@ -131,7 +143,10 @@ class ControlLifeline:
                     if not one.done():
                         one.set_result(message)
             case messages.RouteFound(host, address):
-                for future in self._routes.pop(host, ()):
+                futures = self._routes.pop(host, None)
+                if futures is not None:
+                    self._free_questions.release()
+                for future in futures or ():
                     if not future.done():
                         future.set_result(address)
             case _:
