@@ -94,6 +94,7 @@ _WORDS = {
     "DURATION": "a duration such as `100ms`",
     "QUOTE": "a quote `'`",
     "FORMULA": "a formula",
+    "CATEGORY": "the name of a category",
     "AT": "a handler `@category { … }`",
     "BUILTIN": "a type",
     "SEMICOLON": "`;`",

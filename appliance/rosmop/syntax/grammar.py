@@ -47,7 +47,7 @@ path_step: NAME ["[" NUMBER "]"]
          | NAME ("::" NAME)+                      -> name
 
 property: NAME ":" FORMULA handler+
-handler: AT NAME block
+handler: AT CATEGORY block
 
 // Types
 type: qualifier* core qualifier*
@@ -158,6 +158,7 @@ character: CHARACTER
 // Tokens
 NAME: /[A-Za-z_][A-Za-z_0-9]*/
 MODIFIER.5: /<WORD>(?=<GAP>+(<WORD><GAP>+)*event<GAP>+[A-Za-z_])/
+CATEGORY: /[A-Za-z_][A-Za-z_0-9]*/
 BUILTIN.3: /(void|bool|char|short|int|long|float|double|signed|unsigned)(?!\w)/
 FIXED.4: /(std\s*::\s*)?(u?int(8|16|32|64)_t|size_t)(?=\s*\))/
 VECTOR.3: /(std\s*::\s*)?vector(?=\s*<)/

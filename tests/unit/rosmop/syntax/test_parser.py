@@ -162,6 +162,15 @@ def test_properties() -> None:
     assert [handler.category for handler in first.handlers] == ["match", "fail"]
 
 
+@pytest.mark.parametrize("name", ["auto", "new", "break", "try", "default", "NULL"])
+def test_a_category_may_be_a_word_of_cpp(name: str) -> None:
+    """States have names of their own; what C++ does with the word does not matter there."""
+    found = parsed(
+        f"s() {{ event e() /t std_msgs/Empty '{{}}' {{ }} fsm: {name} [ e -> {name} ] @{name} {{ }} }}"
+    )
+    assert [handler.category for handler in found.properties[0].handlers] == [name]
+
+
 NAMES = ["event", "init", "service", "every", "when", "request", "response", "hold"]
 
 
