@@ -1,0 +1,75 @@
+"""A long list of revoked certificates, with real charons at both ends: as long as there can be."""
+
+import sqlite3
+import subprocess
+import time
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from appliance.ipsec.authority import Authority
+from appliance.network.lab import Lab
+from tests.support.processes import LIMIT
+from tests.support.requirements import need_root
+from tests.support.tunnel_site import OCU, TunnelSite
+from tests.support.tunnels import JoinedHost, need_strongswan
+
+_FIRST = 1 << 70  # serial numbers are as long as the authority makes them
+
+
+def test_tunnels_stand_with_thousands_of_revoked_certificates(tmp_path: Path) -> None:
+    """Of an enrolled host 2,000, of others 3,000: the latest certificate opens the tunnel, the one before does not."""
+    need_root()
+    need_strongswan()
+    with Lab("rosrv-list") as lab, TunnelSite(lab, tmp_path) as site:
+        before = site.kit()
+        present = site.kit("kit")
+        site.appliance.stop()
+        revoke_many(site.appliance.state / "control" / "state.db")
+        site.appliance.start()
+        mark = site.mark
+        with site.join(before):
+            refused = site.recorded(mark, event="tunnel refused")
+            assert refused["host"] == OCU
+            assert "revoked" in refused["reason"]
+        with site.joined(present) as joined:
+            assert site.state() == "up"
+            takes_such_a_list_itself(joined, tmp_path)
+            mark = site.mark
+            site.appliance.rosrv("host", "revoke", "ocu-1")
+            site.recorded(mark, event="tunnel down")
+
+
+def revoke_many(state: Path) -> None:
+    """As if hosts had renewed their certificates for months."""
+    now = time.time()
+    names = ["ocu-1"] * 2_000 + ["gone"] * 3_000
+    rows = [
+        (f"{_FIRST + number:x}", name, now - 60 - number, now + 86_400) for number, name in enumerate(names)
+    ]
+    connection = sqlite3.connect(state)
+    with connection:
+        connection.executemany("INSERT INTO revocation VALUES (?, ?, ?, ?)", rows)
+    connection.close()
+
+
+def takes_such_a_list_itself(joined: JoinedHost, directory: Path) -> None:
+    """swanctl on a host loads a list of the same length."""
+    (directory / "ca").mkdir()
+    signed = Authority(directory / "ca").revocations((f"{_FIRST + one:x}", 1.0) for one in range(2_200))
+    lists = joined.folder / "swanctl" / "x509crl"
+    lists.mkdir()
+    (lists / "rosrv.crl").write_bytes(x509.load_pem_x509_crl(signed).public_bytes(Encoding.DER))
+    vici = ["--uri", f"unix://{joined.directory}/vici.sock"]
+    done = joined.popen(
+        ["swanctl", "--load-creds", "--noprompt", *vici],
+        env={"SWANCTL_DIR": str(joined.folder / "swanctl"), "PATH": "/usr/sbin:/usr/bin"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    out, _ = done.communicate(timeout=LIMIT)
+    assert done.returncode == 0, out
+    said = next(line for line in out.splitlines() if "rosrv.crl" in line)
+    assert said.startswith("loaded certificate from"), said
