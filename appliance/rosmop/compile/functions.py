@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from appliance.rosmop.compile.conversion import convert
 from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.loops import charge
-from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import initial, known, write
 from appliance.rosmop.runtime.context import MAX_CALLS
@@ -15,7 +15,6 @@ from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import shown
 from appliance.rosmop.types.resolve import resolve
 
-_LITERALS = (tree.Number, tree.Text, tree.Character, tree.Unary, tree.Name)
 _TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
 
 
@@ -39,13 +38,15 @@ def _shared_variable(
         raise SpecificationError.at(declarator.position, f"{shown(declarator.name)} is declared twice")
     scope = Scope(shared, names, "init")
     scope.lines.site = scope.site(declaration)
-    if declaration.type.name == ("auto",):
+    automatic = declaration.type.name == ("auto",)
+    if automatic and _constant(scope, declarator) is None:
         raise SpecificationError.at(
-            declaration.position, "a shared variable needs a type; `auto` is for local ones"
+            declaration.position,
+            "a shared variable needs a type; `auto` is for local ones, and for constants that are written down",
         )
     kind, _ = initial(scope, declaration.type, tree.Declarator(
         declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array,
-        value=declarator.value if declarator.is_array and declarator.size is None else None,
+        value=declarator.value if automatic or (declarator.is_array and declarator.size is None) else None,
     ))  # fmt: skip
     return Variable(
         declarator.name,
@@ -104,20 +105,23 @@ def _constants(shared: Shared, names: SpecificationNames, specification: tree.Sp
             variable = names.variables.get(declarator.name)
             if variable is not None:
                 scope.written.add(variable.code)
-                code = _constant(scope, declarator, variable.type) or scope.codecs.zero(variable.type)
+                value = _constant(scope, declarator)
+                code = scope.codecs.zero(variable.type)
+                if value is not None and kinds.convertible(value.type, variable.type):
+                    code = convert(scope, value, variable.type)
                 scope.lines.add(f"{variable.code} = {code}")
     return scope
 
 
-def _constant(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> str | None:
-    """Code for a literal; what is wrong with it is found when it is compiled as a first value."""
-    if declarator.is_array or not isinstance(declarator.value, _LITERALS):
+def _constant(scope: Scope, declarator: tree.Declarator) -> Value | None:
+    """A constant first value; what is wrong with one is found when it is compiled as a first value."""
+    if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.Elements):
         return None
     try:
         value = value_of(scope, declarator.value)
-        return None if value.constant is None else convert(scope, value, kind)
     except SpecificationError:
         return None
+    return value if value.constant is not None else None
 
 
 def _first_values(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:

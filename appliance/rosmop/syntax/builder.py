@@ -99,20 +99,34 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             items(tree.Property),
         )
 
-    def function(self, meta: Meta, children: list[Any]) -> tree.Function:
+    def function(self, meta: Meta, children: list[Any]) -> tree.Function | tree.Init:
         kind, name, parameters, body = children
+        if name == "init" and kind.name == ("void",):
+            return self.init(meta, [parameters, body])
         return tree.Function(self.at(meta), kind, str(name), parameters or (), body)
+
+    def prototype(self, meta: Meta, children: list[Any]) -> _Unsaid:
+        del meta, children
+        return _Unsaid()
 
     def procedure(self, meta: Meta, children: list[Any]) -> tree.Function:
         name, parameters, body = children
         return tree.Function(self.at(meta), None, str(name), parameters or (), body)
 
     def init(self, meta: Meta, children: list[Any]) -> tree.Init:
-        return tree.Init(self.at(meta), children[0])
+        parameters, body = children
+        if parameters:
+            self.refuse(meta, "`init` takes no parameters: it runs before the first message")
+        return tree.Init(self.at(meta), body)
 
     def parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
         del meta
         return tuple(children)
+
+    def unnamed_parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
+        if children != ["void"]:
+            self.refuse(meta, f"give the parameter a name: `{' '.join(children)} x`")
+        return ()
 
     def parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
         kind, name = children
@@ -206,7 +220,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def type(self, meta: Meta, children: list[Any]) -> tree.TypeName:
         core = next(child for child in children if isinstance(child, tree.TypeName))
-        constant, static = core.constant or "const" in children, "static" in children
+        constant = core.constant or "const" in children or "constexpr" in children
+        static = "static" in children
         return replace(core, position=self.at(meta), constant=constant, static=static)
 
     def qualifier(self, meta: Meta, children: list[Any]) -> str:

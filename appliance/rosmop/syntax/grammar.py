@@ -16,12 +16,14 @@ file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
 
 specification: NAME+ ["(" [parameters] ")"] "{" item* "}"
-?item: shared ";" | function | init | event | property | ";" -> nothing
+?item: shared ";" | function | prototype | init | event | property | ";" -> nothing
 
 function: type NAME "(" [parameters] ")" block
         | NAME "(" [parameters] ")" block         -> procedure
-init: "init" "(" ")" block
+prototype: type NAME "(" [parameters] ")" ";"
+init: "init" "(" [parameters] ")" block
 parameters: parameter ("," parameter)*
+         | BUILTIN+                               -> unnamed_parameters
 parameter: type NAME
          | type "&" NAME                          -> reference_parameter
          | type REFERENCE NAME                    -> reference_parameter
@@ -59,7 +61,7 @@ core: BUILTIN+
     | "auto"                                      -> automatic
 vector: VECTOR "<" type ">"
     | VECTOR "<" VECTOR "<" type ">>"             -> vector_of_vectors
-!qualifier: "const" | "static" | "volatile"
+!qualifier: "const" | "constexpr" | "static" | "volatile" | "inline"
 scoped: ["::"] NAME ("::" NAME)*
 
 // Statements
@@ -93,6 +95,7 @@ literals: literal ("," literal)*                  -> arguments
 ?literal: NUMBER -> number
         | MINUS number                            -> prefix
         | string | character
+        | scoped -> name
 number: NUMBER
 ?declarator: plain_declarator
     | NAME "(" arguments ")"                      -> constructed

@@ -3,7 +3,7 @@
 import pytest
 
 from appliance.rosmop.engine import MonitorSet
-from tests.unit.rosmop.acting import definitions, message, refused
+from tests.unit.rosmop.acting import definitions, message, refused, shown
 
 EVENT = "event e(int x) %s std_msgs/Int32 '{data:x}' { %s }"
 READERS = [
@@ -45,3 +45,34 @@ def test_what_faults_in_its_first_values_does_not_run_its_init() -> None:
     assert [fault.text for fault in outcome.faults] == ["division by zero"]
     assert [line.text for line in outcome.log] == ["b"]
     assert [monitor.broken for monitor in monitors.monitors] == [True, False]
+
+
+DECLARED = [
+    ("bool ok(true);", "ok", "1"),
+    ("double y(M_PI);", "(int) y", "3"),
+    ("const int N = 3; std::vector<int> v(N);", "(int) v.size()", "3"),
+    ("std::vector<int> v(3, -1), w(v);", "w[2]", "-1"),
+    ("unsigned u(std_msgs::Byte::X); ", None, "has no constant `X`"),
+    ("constexpr int N = 3; int q[N];", "(int) q.size()", "3"),
+    ("constexpr double D = 2.5;", "(int) (D * 2)", "5"),
+    ("const auto N = 3; int q[N];", "(int) q.size()", "3"),
+    ('auto t = "abc";', "(int) t.size()", "3"),
+    ("auto n = f(); int f() { return 1; }", None, "`auto` is for"),
+    ("int f(); int g() { return f(); } int f() { return 4; }", "g()", "4"),
+    ("int f(int a); int f(int a) { return a + 1; }", "f(4)", "5"),
+    ("int f(void) { return 6; }", "f()", "6"),
+    ("int f(int) { return 6; }", None, "give the parameter a name"),
+    ("inline int f(int a) { return a; } static inline int g() { return 7; }", "g()", "7"),
+    ("int n; void init() { n = 8; }", "n", "8"),
+    ("int n; void init(void) { n = 9; }", "n", "9"),
+    ("int n; init(void) { n = 9; }", "n", "9"),
+]
+
+
+@pytest.mark.parametrize(("before", "expression", "value"), DECLARED)
+def test_declarations_of_cpp(before: str, expression: str | None, value: str) -> None:
+    """Initial values in parentheses, constants, prototypes, `void` and `inline` are read as C++ reads them."""
+    if expression is None:
+        assert value in refused("s() {" + before + EVENT % ("/t", "") + "}")[0].text
+    else:
+        assert shown(expression, conversion="%d", before=before) == value
