@@ -1,54 +1,68 @@
-"""Tests of `appliance.supervisor.signals`: what is sent while nothing may be left half done."""
+"""Tests of `appliance.supervisor.signals`: what is sent while nothing may be left half done.
 
-import os
-import signal
-import threading
+Each runs in a process of its own: a signal that a thread of the test runner takes would end it.
+"""
 
+import subprocess
+import sys
+
+_BEGIN = """
+import os, signal, threading
 from appliance.supervisor import signals
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
-
-def send() -> None:
-    """Each of them, to this process."""
+def send():
     for number in ENDING:
         os.kill(os.getpid(), number)
+"""
+_HELD = """
+arrived = []
+for number in ENDING:
+    signal.signal(number, lambda found, _frame: arrived.append(found))
+with signals.held():
+    send()
+    assert arrived == []
+    with signals.heard():
+        assert sorted(arrived) == sorted(ENDING)
+    send()
+assert len(arrived) == len(ENDING)
+assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING)
+send()
+assert len(arrived) == 2 * len(ENDING)
+"""
+_THREAD = """
+blocked, done = threading.Event(), threading.Event()
+
+def work():
+    signals.block()
+    blocked.set()
+    assert done.wait(30)
+
+thread = threading.Thread(target=work)
+thread.start()
+assert blocked.wait(30)
+with signals.held():
+    send()  # would end this process
+    assert set(ENDING) <= signal.sigpending()
+done.set()
+thread.join()
+"""
+
+
+def by_itself(script: str) -> None:
+    """Run a script in a process that has one thread."""
+    done = subprocess.run(
+        [sys.executable, "-c", _BEGIN + script], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_what_is_sent_while_they_are_held_is_heard_when_somebody_listens() -> None:
     """Nothing happens at first, then each arrives; what comes later is forgotten, and all is as before."""
-    arrived: list[int] = []
-    before = {number: signal.signal(number, lambda found, _frame: arrived.append(found)) for number in ENDING}
-    try:
-        with signals.held():
-            send()
-            assert arrived == []
-            with signals.heard():
-                assert sorted(arrived) == sorted(ENDING)
-            send()
-        assert len(arrived) == len(ENDING)
-        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING) == set()
-        send()
-        assert len(arrived) == 2 * len(ENDING)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    by_itself(_HELD)
 
 
 def test_a_thread_does_not_take_them() -> None:
     """The kernel gives a signal to any thread that takes it: one that blocks them leaves it to wait."""
-    blocked, done = threading.Event(), threading.Event()
-
-    def work() -> None:
-        signals.block()
-        blocked.set()
-        assert done.wait(30)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    assert blocked.wait(30)
-    with signals.held():
-        send()  # would end this process
-        assert set(ENDING) <= signal.sigpending()
-    done.set()
-    thread.join()
+    by_itself(_THREAD)
