@@ -21,6 +21,7 @@ from appliance.relay.telling import Place, Telling
 from appliance.rosmop.batch import Prepared, Walker
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.runtime.context import BUDGET
 
 LONGEST = 2.0
 """Seconds of processor time that monitors may take until the loop comes to its timers again."""
@@ -29,6 +30,7 @@ TOO_LONG = "the monitors take too long for their messages"
 
 _unpack_length = struct.Struct("<I").unpack_from
 _LOOK_EVERY = 16  # messages
+_COSTLY = BUDGET - 50_000  # what is left of a budget after a message that took some milliseconds
 _MANY = 256  # messages
 _NEVER = 1 << 63
 
@@ -166,6 +168,7 @@ class Lane:
         view, position, end = passage.view, passage.position, passage.end
         process, topic = monitors.process, place[1]
         shows = telling.shows(place)
+        contexts = monitors.contexts(topic)
         looked = 0
         middle.look_again()
         spent = middle.spent - time.thread_time()
@@ -198,8 +201,12 @@ class Lane:
                     passage.replace(position, following, outcome.buffer)
             position = following
             looked += 1
-            if not looked % _LOOK_EVERY or outcome.faults:
+            if not looked % _LOOK_EVERY or outcome.faults or outcome.before:
                 middle.spent = spent + time.thread_time()
+            for context in contexts:
+                if context.budget < _COSTLY:
+                    middle.spent = spent + time.thread_time()
+                    break
         passage.position = position
         middle.spent = spent + time.thread_time()
 

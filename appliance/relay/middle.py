@@ -12,6 +12,7 @@ Invariants:
   from there the monotonic clock. The messages of one batch have come at the same time.
 - The relay always answers its supervisor: when monitors have taken `lane.LONGEST` seconds of processor time since the
   loop last came to its timers (they never do unless messages take them long), the messages until then are dropped.
+  Ticks that are late and take long are left out.
 """
 
 import time
@@ -35,6 +36,7 @@ from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
 
 _AFTER_DEFECT = 1.0
+_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,7 @@ class Middle:
         outcome = (
             result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
         )
+        result.patience = _patience
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
         for monitor in result.monitors:
@@ -278,6 +281,11 @@ class Middle:
             return
         self.spent += time.thread_time() - began
         self.schedule()
+
+
+def _patience() -> Callable[[], bool]:
+    ends = time.thread_time() + _TICKS_SECONDS
+    return lambda: time.thread_time() > ends
 
 
 def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:

@@ -10,14 +10,15 @@ Theory of operation:
    ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over.
 3. Time is what the caller says: nanoseconds, with every message. Ticks (`every`) up to and including the time of
    a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
-   the caller calls `advance` when `next_due` has come.
+   the caller calls `advance` when `next_due` has come. Ticks that take longer than the caller's `patience` allows are
+   left out, and that is logged; deadlines wait for the next time.
 4. `walker` offers, for most topics, loops that do what `process` does to many messages at once (`batch.py`), as far
    as these need nothing that is recorded or explained. Whoever uses them must not see a difference but in time.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
@@ -30,7 +31,7 @@ from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Ti
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
-from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, LogLine
+from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, Context, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -40,6 +41,10 @@ OnFault = Literal["drop", "pass"]
 
 MAX_TICKS = 100_000
 """Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
+
+
+def _never() -> bool:
+    return False
 
 
 class MonitorSet:
@@ -54,12 +59,15 @@ class MonitorSet:
         nodes = [node for file in files for node in file.specifications]
         self._monitors = monitors_of(compiled, nodes, 0)
         self._steps: dict[str, tuple[Step, ...]] = {}
+        self._contexts: dict[str, tuple[Context, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
         self._due: int | None = None
         self.began: tuple[str, ...] = ()
         self._timed = False
         self._walkers: Mapping[str, Walker] = {}
         self._broken = False
+        self.patience: Callable[[], Callable[[], bool]] = lambda: _never
+        """Asked when something is due: what says whether that has taken too long."""
         self._index()
 
     @classmethod
@@ -147,6 +155,10 @@ class MonitorSet:
     def write_loops(self) -> None:
         """Write the loops that `walker` offers; takes about as long as compiling the specifications."""
         self._walkers = walkers(self._compiled, self._monitors)
+
+    def contexts(self, topic: str) -> tuple[Context, ...]:
+        """What the monitors of a topic have left of their budgets after a message of it."""
+        return self._contexts.get(topic, ())
 
     def walker(self, topic: str) -> Walker | None:
         """The loops for messages on this topic; None if there are none."""
@@ -277,6 +289,7 @@ class MonitorSet:
         """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
+        over = self.patience()
         while self._due is not None and self._due <= time_ns:
             timer = self._next_timer()
             deadline = self._next_deadline()
@@ -289,6 +302,10 @@ class MonitorSet:
             else:
                 break
             self._schedule()
+            if self._due is not None and self._due <= time_ns and over():
+                outcomes.append(self._leave_out(time_ns))
+                self._schedule()
+                break
         return outcomes
 
     # One message
@@ -465,12 +482,26 @@ class MonitorSet:
             self._step_properties(step, None, due, outcome)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1
         if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
-            left_out = (time_ns - timer.due) // timer.period + 1
-            timer.due += left_out * timer.period
-            text = f"{left_out} ticks of {step.name} are left out: the time has made a leap"
-            self._turn.log.append(LogLine("WARN", text, step.monitor.name))
+            self._skip_ticks(timer, time_ns, "the time has made a leap")
         self._collect(outcome)
         return outcome
+
+    def _leave_out(self, time_ns: int) -> Outcome:
+        """No tick up to this time happens any more."""
+        outcome = Outcome(time=time_ns)
+        for monitor in self._monitors:
+            for timer in monitor.timers:
+                if monitor.enabled and timer.due is not None and timer.due <= time_ns:
+                    self._skip_ticks(timer, time_ns, "they take too long")
+        self._collect(outcome)
+        return outcome
+
+    def _skip_ticks(self, timer: Timer, time_ns: int, reason: str) -> None:
+        due = timer.due or 0
+        left_out = (time_ns - due) // timer.period + 1
+        timer.due = due + left_out * timer.period
+        text = f"{left_out} ticks of {timer.step.name} are left out: {reason}"
+        self._turn.log.append(LogLine("WARN", text, timer.step.monitor.name))
 
     def _expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
         deadline = running.run.deadline or 0
@@ -561,6 +592,10 @@ class MonitorSet:
                 step.first = not place or found[place - 1].monitor is not step.monitor
         self._steps = {topic: tuple(found) for topic, found in steps.items()}
         self._requests = {key: tuple(found) for key, found in requests.items()}
+        self._contexts = {
+            topic: tuple(step.monitor.context for step in found if step.first)
+            for topic, found in self._steps.items()
+        }
         self._timed = any(
             monitor.timers or any(running.code.property.timed for running in monitor.properties)
             for monitor in self._monitors

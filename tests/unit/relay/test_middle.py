@@ -2,6 +2,7 @@
 
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -23,8 +24,10 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.compiling import Compiler
+from appliance.relay.frames import Batch
 from appliance.relay.lane import TOO_LONG
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
+from appliance.rosmop.engine import MonitorSet
 from tests.unit.relay.test_engine import ASK, HEADER, LOOPBACK, Peer, World
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -292,6 +295,41 @@ def test_a_monitor_without_end_faults_and_its_messages_are_dropped(world: Monito
     world.event("drop", text="the monitors take too long for their messages")
     publisher.send(string("later"))
     world.gets(subscriber, string("later"))
+
+
+def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world: Monitored) -> None:
+    """Each would find more of them late than the one before: they are left out, told, and everything else goes on."""
+    slow = "slow() { int n; event tick() every 1ms { for (int i = 0; i < 60000; i++) n += i; } }"
+    world.load(slow)
+    longest = 0.0
+    ends = time.thread_time() + 1.5
+    while time.thread_time() < ends:
+        began = time.thread_time()
+        world.loop.turn(0.01)
+        longest = max(longest, time.thread_time() - began)
+    assert longest < 0.6
+    assert "they take too long" in world.event("log", monitor="slow").text
+
+
+def test_messages_that_cost_much_are_seen_by_the_clock_at_once(world: Monitored) -> None:
+    """Not after sixteen: several monitors that use up nearly all of their budgets would take a minute for them."""
+    text = """a() { int n; event e() /chatter std_msgs/String '{}' { for (int i = 0; i < 60000; i++) n += i; } }"""
+    world.load(text)
+    middle = world.engine._middle
+    lane = middle.lane("k", "/chatter")
+    seen: list[float] = []
+    process = MonitorSet.process
+
+    def watched(*given: Any) -> Any:
+        seen.append(middle.spent)
+        return process(*given)
+
+    assert middle.monitors is not None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MonitorSet, "process", watched)
+        frames = bytearray(string("x") * 4)
+        lane.through(Batch(memoryview(frames), 4, None))
+    assert seen == sorted(set(seen))
 
 
 def test_bytes_that_are_no_message_of_the_type_are_dropped(world: Monitored) -> None:

@@ -385,6 +385,21 @@ def test_a_leap_of_the_clock_leaves_ticks_out() -> None:
     assert monitors.next_due > 10**18
 
 
+def test_ticks_that_take_too_long_are_left_out_and_deadlines_wait() -> None:
+    """What is late would be ever later otherwise; the caller says how long is too long."""
+    text = """a() { int n; event e() /t std_msgs/Bool '{}' { } event tick() every 1ms { n++; ROS_INFO("%d", n); } }
+    b() { event x() /t std_msgs/Bool '{}' { }
+        tfsm: s [ x -> s, timeout 1ms -> late ] late [ ] @timeout { ROS_WARN("late"); } }"""
+    monitors = load(text)
+    monitors.process("/t", number(0), 0)
+    answers = iter([False, False, True])
+    monitors.patience = lambda: lambda: next(answers)
+    outcomes = monitors.advance(SECOND)
+    lines = [line.text for outcome in outcomes for line in outcome.log]
+    assert lines == ["1", "late", "2", "998 ticks of a.tick are left out: they take too long"]
+    assert monitors.next_due == SECOND + SECOND // 1000
+
+
 def test_a_tick_steps_the_property() -> None:
     """A timer is an event of the alphabet."""
     text = (
