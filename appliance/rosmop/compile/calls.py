@@ -218,8 +218,9 @@ def streamed(
     parts += [] if headed else [chain]
     stream = Stream(scope, scope.site(node))
     pieces = [_piece(scope, stream, part, value_of) for part in reversed(parts)]
-    code = f"{scope.context}.log({level!r}, p_join(({''.join(f'{piece}, ' for piece in pieces if piece)})), "
-    return Value(kinds.VOID, f"{code}{scope.site(node)})", node.position, pure=False)
+    row, site = "".join(f"{piece}, " for piece in pieces if piece), scope.site(node)
+    code = f"{scope.context}.log({level!r}, p_join({scope.context}, ({row}), {site}), {site})"
+    return Value(kinds.VOID, code, node.position, pure=False)
 
 
 def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> str | None:

@@ -27,7 +27,8 @@ def convert(scope: Scope, value: Value, target: Type, site: int | None = None) -
     if kinds.is_number(target):
         return number(value.code, value.type, target)
     if isinstance(target, kinds.String) and isinstance(value.type, kinds.Characters):
-        return f"c_terminated({value.code})"
+        where = scope.lines.site if site is None else site
+        return f"c_terminated({scope.context}, {value.code}, {where})"
     if isinstance(target, kinds.Characters) and isinstance(value.type, kinds.String):
         return f"({value.code} + b'\\0')"
     where = scope.lines.site if site is None else site

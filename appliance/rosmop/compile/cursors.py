@@ -59,7 +59,7 @@ def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Positio
     """`v.erase(place)`, `v.erase(first, last)`."""
     codes = [_index(base, cursor) for cursor in cursors]
     last = codes[1] if len(codes) > 1 else "None"
-    return _changed(scope, base, f"k_erase({base.code}, {codes[0]}, {last}, {at[1]})", at[0])
+    return _changed(scope, base, f"k_erase({scope.context}, {base.code}, {codes[0]}, {last}, {at[1]})", at[0])
 
 
 def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:

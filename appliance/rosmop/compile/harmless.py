@@ -19,7 +19,7 @@ FUNCTIONS = frozenset({f"h_{name}" for name in MATH}) | {
     "c_f32", "c_float", "c_terminated", "c_truncate",
     "h_abs", "h_compare", "h_isfinite", "h_isinf", "h_isnan", "h_len", "h_max", "h_min",
     "l_element", "l_len", "m_duration", "m_nanoseconds", "m_time",
-    "o_divide", "o_duration", "o_ratio", "o_remainder", "o_scaled", "o_time",
+    "o_charged", "o_divide", "o_duration", "o_ratio", "o_remainder", "o_scaled", "o_time", "o_weighed",
     "t_bytes", "t_compare", "t_float", "t_member",
     "w_count", "w_len", "w_skip", "w_skip_inner", "w_text", "w_text_end",
 }  # fmt: skip

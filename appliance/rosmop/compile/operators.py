@@ -10,7 +10,7 @@ from appliance.rosmop.compile.conversion import (
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.positions import Position
-from appliance.rosmop.runtime import numbers, texts, times
+from appliance.rosmop.runtime import numbers, texts, times, vectors
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -24,8 +24,11 @@ FUNCTIONS = {
     "o_duration": times.duration,
     "o_scaled": times.scaled,
     "o_bytes": bytes,
+    "o_charged": texts.charged,
+    "o_weighed": vectors.weighed,
 }
 COMPARISONS = frozenset({"==", "!=", "<", ">", "<=", ">="})
+_SHORT = 64  # bytes; to compare with a string of so many takes no longer than any other instruction
 _BITS = frozenset({"&", "|", "^"})
 _TEXTS = (kinds.String, kinds.Characters)
 _MOMENTS = (kinds.Time, kinds.Duration)
@@ -70,8 +73,17 @@ def binary(operator: str, operands: Operands) -> Value:
     if cursor is not None:
         return cursor
     if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | cursors.Cursor):
-        return operands.value(kinds.BOOL, f"({operands.left.code} {operator} {operands.right.code})")
+        return operands.value(kinds.BOOL, f"({_weighed(operands, left)} {operator} {operands.right.code})")
     raise operands.refused(operator, _hint(left, right))
+
+
+def _weighed(operands: Operands, kind: Type) -> str:
+    """The left operand; a vector or message is charged by what it holds."""
+    code, scope = operands.left.code, operands.scope
+    if not isinstance(kind, kinds.Vector | kinds.Record):
+        return code
+    measure = scope.module.use(scope.codecs.measure(kind))
+    return f"o_weighed({scope.context}, {code}, {measure}, {operands.site})"
 
 
 def _hint(left: Type, right: Type) -> str:
@@ -169,7 +181,21 @@ def _texts(operator: str, operands: Operands) -> Value:
     if not (isinstance(left.type, _TEXTS) and isinstance(right.type, _TEXTS)):
         raise operands.refused(operator, _text_hint(left, right))
     codes = [convert(operands.scope, value, kinds.STRING) for value in (left, right)]
-    return operands.value(kinds.BOOL, f"({codes[0]} {operator} {codes[1]})")
+    return operands.value(kinds.BOOL, _compared_texts(operands, operator, codes[0], codes[1]))
+
+
+def _compared_texts(operands: Operands, operator: str, left: str, right: str) -> str:
+    """Two strings are charged by their length, unless one is short; most are."""
+    if any(
+        isinstance(value.constant, bytes) and len(value.constant) <= _SHORT
+        for value in (operands.left, operands.right)
+    ):
+        return f"({left} {operator} {right})"
+    charged = f"o_charged({operands.scope.context}, {left}, {operands.site}) {operator} {right}"
+    known = next((code for code in (right, left) if code.isidentifier()), None)
+    if known is None:
+        return f"({charged})"
+    return f"({left} {operator} {right} if l_len({known}) <= {_SHORT} else {charged})"
 
 
 def _text_hint(left: Value, right: Value) -> str:

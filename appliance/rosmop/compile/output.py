@@ -26,9 +26,11 @@ FUNCTIONS = {
     "p_hexadecimal": output.to_text_hexadecimal,
     "p_moment": output.to_text_moment,
     "p_join": output.join_all,
+    "p_formatted": output.formatted,
 }
 _CONVERSION = re.compile(rb"%([-+ #0]*)(\*|[0-9]*)(?:\.(\*|[0-9]*))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)
 _MAX_WIDTH = 1000
+_LONG = 1024  # bytes that a text may have without being charged before it is made
 _SIGNED, _UNSIGNED, _FLOATING = b"di", b"uoxX", b"fFeEgGaA"
 _TEXTS = (kinds.String, kinds.Characters)
 
@@ -42,6 +44,7 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> str:
             )
         return convert(scope, template, kinds.STRING)
     pieces, codes = [], []
+    size, strings = len(template.constant), False
     last = 0
     waiting = list(arguments)
     for found in _CONVERSION.finditer(template.constant):
@@ -58,12 +61,23 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> str:
         piece, code = _conversion(scope, found, waiting.pop(0), template.position)
         pieces.append(piece)
         codes.append(code)
+        size += _longest(found)
+        strings = strings or piece[-1:] == b"s"
     if waiting:
         raise SpecificationError.at(
             waiting[0].position, "this argument has no conversion in the format, such as `%f` or `%s`"
         )
     text = b"".join(pieces) + template.constant[last:].replace(b"%", b"%%")
-    return f"({text!r} % ({', '.join(codes)},))" if codes else repr(text.replace(b"%%", b"%"))
+    if not codes:
+        return repr(text.replace(b"%%", b"%"))
+    if strings or size > _LONG:
+        return f"p_formatted({scope.context}, {text!r}, ({', '.join(codes)},), {size}, {scope.lines.site})"
+    return f"({text!r} % ({', '.join(codes)},))"
+
+
+def _longest(found: re.Match[bytes]) -> int:
+    """How long the text of a conversion can be, but for strings."""
+    return max(int(found[2] or 0), int(found[3] or 0) + (400 if found[5] in _FLOATING else 20))
 
 
 def _conversion(scope: Scope, found: re.Match[bytes], value: Value, where: Position) -> tuple[bytes, str]:

@@ -113,7 +113,10 @@ def _extreme(name: str) -> Function:
             raise SpecificationError.at(
                 call.position, f"`{call.name}` has no meaning for {left.type} and {right.type}"
             )
-        return call.value(left.type, f"h_{name}({left.code}, {right.code})")
+        code = left.code
+        if isinstance(left.type, kinds.String):
+            code = f"o_charged({call.scope.context}, {code}, {call.site})"
+        return call.value(left.type, f"h_{name}({code}, {right.code})")
 
     return function
 
@@ -168,7 +171,8 @@ def _lenient(kind: kinds.Type, name: str) -> Function:
 
 def _compare(call: Arguments) -> Value:
     call.count(2)
-    return call.value(kinds.INT, f"h_compare({call.text(0)}, {call.text(1)})")
+    charged = f"o_charged({call.scope.context}, {call.text(0)}, {call.site})"
+    return call.value(kinds.INT, f"h_compare({charged}, {call.text(1)})")
 
 
 def _length(call: Arguments) -> Value:
@@ -189,7 +193,11 @@ def _fills(function: str) -> Function:
     def fill(call: Arguments) -> Value:
         call.count(2)
         target = _buffer(call)
-        code = store(call.scope, target, f"{function}({target.code}, {call.text(1)}, {call.site})")
+        code = store(
+            call.scope,
+            target,
+            f"{function}({call.scope.context}, {target.code}, {call.text(1)}, {call.site})",
+        )
         return Value(kinds.CHARACTERS, code, call.position, pure=False)
 
     return fill
@@ -199,7 +207,7 @@ def _fills_at_most(call: Arguments) -> Value:
     call.count(3)
     target = _buffer(call)
     limit = number(call.values[2].code, call.values[2].type, kinds.ULONG)
-    code = f"h_filled_at_most({target.code}, {call.text(1)}, {limit}, {call.site})"
+    code = f"h_filled_at_most({call.scope.context}, {target.code}, {call.text(1)}, {limit}, {call.site})"
     return Value(kinds.CHARACTERS, store(call.scope, target, code), call.position, pure=False)
 
 
@@ -208,7 +216,7 @@ def _prints(call: Arguments) -> Value:
     target = _buffer(call)
     text = formatted(call.scope, call.values[1], call.values[2:])
     made = call.scope.temporary()
-    code = store(call.scope, target, f"h_filled({target.code}, {made}, {call.site})")
+    code = store(call.scope, target, f"h_filled({call.scope.context}, {target.code}, {made}, {call.site})")
     return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
 
 
@@ -218,7 +226,9 @@ def _prints_at_most(call: Arguments) -> Value:
     limit = number(call.values[1].code, call.values[1].type, kinds.ULONG)
     text = formatted(call.scope, call.values[2], call.values[3:])
     made = call.scope.temporary()
-    code = store(call.scope, target, f"h_printed({target.code}, {made}, {limit}, {call.site})")
+    code = store(
+        call.scope, target, f"h_printed({call.scope.context}, {target.code}, {made}, {limit}, {call.site})"
+    )
     return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
 
 

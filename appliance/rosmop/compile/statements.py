@@ -118,7 +118,7 @@ def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple
         text = converted(scope, declarator.value, kinds.STRING)
         if size is None:
             return kinds.CHARACTERS, f"({text} + b'\\0')"
-        return kinds.CHARACTERS, f"e_filled({zeros}, {text}, {scope.lines.site})"
+        return kinds.CHARACTERS, f"e_filled({scope.context}, {zeros}, {text}, {scope.lines.site})"
     if size is None:
         assert isinstance(declarator.value, tree.Elements)  # _array_size has looked
         size = len(declarator.value.items)

@@ -67,7 +67,8 @@ def _finder(function: str, start: int) -> Method:
 
 def _compare(call: Invocation) -> Value:
     call.count(1)
-    return call.value(kinds.INT, f"t_compare({call.base.code}, {call.text(0)})")
+    charged = f"o_charged({call.scope.context}, {call.base.code}, {call.site})"
+    return call.value(kinds.INT, f"t_compare({charged}, {call.text(0)})")
 
 
 def _text_append(call: Invocation) -> Value:
@@ -89,7 +90,7 @@ def _text_clear(call: Invocation) -> Value:
 
 def _text_pop(call: Invocation) -> Value:
     call.count(0)
-    return call.changes(f"t_shorten({call.base.code}, {call.site})")
+    return call.changes(f"t_shorten({call.scope.context}, {call.base.code}, {call.site})")
 
 
 def _text_resize(call: Invocation) -> Value:

@@ -1,8 +1,9 @@
 """Values as text, as C++ prints them."""
 
-from appliance.rosmop.runtime.context import FaultError
+from appliance.rosmop.runtime.context import Context, FaultError
 
 _MAX_PRECISION = 100
+_LONG = 1024  # bytes; a shorter text is not charged before it is made
 
 
 def to_text_integer(value: int) -> bytes:
@@ -70,6 +71,19 @@ def to_text_moment(nanoseconds: int) -> bytes:
     return b"%s%d.%09d" % (sign, *divmod(abs(nanoseconds), 1_000_000_000))
 
 
-def join_all(pieces: tuple[bytes, ...]) -> bytes:
+def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
     """The pieces in a row."""
+    size = sum(map(len, pieces))
+    if size > _LONG:
+        context.allocate(size, site)
     return b"".join(pieces)
+
+
+def formatted(
+    context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
+) -> bytes:
+    """`template % arguments`, charged before it is made; `size` is how long it is without its strings."""
+    size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
+    if size > _LONG:
+        context.allocate(size, site)
+    return template % arguments

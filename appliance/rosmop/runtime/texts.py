@@ -2,7 +2,7 @@
 
 import re
 
-from appliance.rosmop.runtime.context import Context, FaultError
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, FaultError
 
 NOT_FOUND = (1 << 64) - 1
 """`std::string::npos`."""
@@ -89,6 +89,13 @@ def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int
     return next((index for index in range(start, len(text)) if text[index] in wanted), NOT_FOUND)
 
 
+def charged(context: Context, text: bytes, site: int) -> bytes:
+    """The text, all bytes of which are about to be looked at or copied."""
+    if len(text) > _LONG:
+        context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
+    return text
+
+
 def compare(left: bytes, right: bytes) -> int:
     """`left.compare(right)`, `strcmp`."""
     return (left > right) - (left < right)
@@ -124,42 +131,56 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
     return text[:start] + added + text[start + count :]
 
 
-def shorten(text: bytes, site: int) -> bytes:
+def shorten(context: Context, text: bytes, site: int) -> bytes:
     """`text` after `text.pop_back()`."""
     if not text:
         raise FaultError(site, "pop_back of an empty string")
-    return text[:-1]
+    return charged(context, text, site)[:-1]
 
 
-def filled(buffer: bytes, text: bytes, site: int) -> bytes:
+def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcpy(buffer, text)`."""
-    copied = text.split(b"\0", 1)[0] + b"\0"
+    _allocate(context, buffer, site)
+    copied = _cut(text) + b"\0"
     if len(copied) > len(buffer):
         raise FaultError(site, f"strcpy of {len(copied)} characters into a buffer of {len(buffer)}")
     return copied + buffer[len(copied) :]
 
 
-def filled_at_most(buffer: bytes, text: bytes, count: int, site: int) -> bytes:
+def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, site: int) -> bytes:
     """A `char` buffer after `strncpy(buffer, text, count)`."""
+    _allocate(context, buffer, site)
     if count > len(buffer):
         raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
-    copied = text.split(b"\0", 1)[0][:count]
+    copied = _cut(text)[:count]
     return copied + b"\0" * (count - len(copied)) + buffer[count:]
 
 
-def printed(buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
+def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
     """A `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
-    return filled(buffer, text[: limit - 1], site) if limit else buffer
+    return filled(context, buffer, text[: limit - 1], site) if limit else buffer
 
 
-def extended(buffer: bytes, text: bytes, site: int) -> bytes:
+def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcat(buffer, text)`."""
-    return filled(buffer, terminated(buffer) + terminated(text), site)
+    _allocate(context, buffer, site)
+    return filled(context, buffer, _cut(buffer) + _cut(text), site)
 
 
-def terminated(buffer: bytes) -> bytes:
+def terminated(context: Context, buffer: bytes, site: int) -> bytes:
     """The string in a `char` buffer: up to the first zero."""
-    return buffer.split(b"\0", 1)[0]
+    return _cut(charged(context, buffer, site))
+
+
+def _cut(buffer: bytes) -> bytes:
+    end = buffer.find(0)
+    return buffer if end < 0 else buffer[:end]
+
+
+def _allocate(context: Context, buffer: bytes, site: int) -> None:
+    """A buffer is about to be made anew."""
+    if len(buffer) > _LONG:
+        context.allocate(len(buffer), site)
 
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:

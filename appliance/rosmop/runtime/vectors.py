@@ -6,9 +6,11 @@
 from collections.abc import Callable
 from typing import Any
 
-from appliance.rosmop.runtime.context import Context, FaultError
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, FaultError
 
 Values = list[Any]
+
+_LARGE = 1024  # bytes; what holds less is not charged when it is looked at
 
 
 def element(values: Values, index: int, site: int) -> Any:
@@ -42,6 +44,14 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
     """`values.push_back(text)`."""
     context.allocate(width + len(value), site)
     values.append(value)
+
+
+def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
+    """The vector or message, all of which is about to be looked at; `measure` says how many bytes it holds."""
+    size = measure(values)
+    if size > _LARGE:
+        context.spend(size // BYTES_PER_INSTRUCTION, site)
+    return values
 
 
 def pop(values: Values, site: int) -> None:
@@ -140,10 +150,11 @@ def _check_span(values: Values, first: int, last: int, site: int) -> None:
         raise FaultError(site, f"from {first} to {last} is not within a vector of {len(values)}")
 
 
-def erase(values: Values, first: int, last: int | None, site: int) -> None:
+def erase(context: Context, values: Values, first: int, last: int | None, site: int) -> None:
     """`values.erase(first)`, `values.erase(first, last)`."""
     last = first + 1 if last is None else last
     _check_span(values, first, last, site)
+    context.spend((len(values) - first) // 64, site)
     del values[first:last]
 
 
@@ -158,7 +169,10 @@ def insert(context: Context, values: Values, at: int, value: Any, width: int, si
 def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
     """`std::sort`: ascending."""
     _check_span(values, first, last, site)
-    context.spend((last - first) * (last - first).bit_length(), site)
+    steps = (last - first).bit_length()
+    context.spend((last - first) * steps, site)
+    if values and isinstance(values[0], bytes):
+        context.spend(sum(map(len, values[first:last])) // BYTES_PER_INSTRUCTION * steps, site)
     values[first:last] = sorted(values[first:last])
 
 

@@ -7,6 +7,7 @@ import tracemalloc
 import pytest
 
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.runtime.context import BUDGET as BUDGET_SIZE
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.unit.rosmop.acting import act, definitions, load, message, refused, refused_action
 
@@ -59,6 +60,73 @@ def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
     assert outcome.result == "dropped"
     assert took < PATIENCE
     assert peak < 200 << 20
+
+
+COSTLY = [
+    "strcpy(c, s.c_str());",
+    "strncpy(c, s.c_str(), 1000000);",
+    'strcat(c, "a");',
+    'sprintf(c, "%s", "a");',
+    'snprintf(c, 100, "a");',
+    "strlen(d);",
+    "bool b = s == t;",
+    "bool b = s + s != t;",
+    "bool b = s <= t;",
+    "bool b = d == s;",
+    "int n = s.compare(t);",
+    "int n = strcmp(s.c_str(), t.c_str());",
+    "std::string m = std::min(s, t);",
+    "s.pop_back();",
+    "bool b = v == w;",
+    "bool b = g == h;",
+    "v.erase(v.begin());",
+    "std::sort(texts.begin(), texts.end());",
+    'std::string f; f = "x"; ROS_INFO_COND(false, "%s", s.c_str());',
+    'char * e = new char[20]; snprintf(e, 20, "%s", s.c_str());',
+    'ROS_INFO_STREAM_COND(true, s << "x");',
+]
+LARGE_VALUES = """std::string s(1000000, 'x'), t(1000000, 'x'); char c[1000001]; char * d;
+    std::vector<int> v(500000), w(500000); std::vector<std::string> texts; nav_msgs::OccupancyGrid g, h;
+    init() {
+        d = new char[1000001]; strcpy(d, s.c_str()); g.data.resize(1000000); h.data.resize(1000000);
+        texts.push_back(s); texts.push_back(s);
+    }"""
+
+
+@pytest.mark.parametrize("body", COSTLY)
+def test_what_takes_long_is_charged(body: str) -> None:
+    """Whatever looks at a million bytes costs thousands of instructions, so that a loop of it ends in time."""
+    text = f"s() {{ {LARGE_VALUES} event e() /t std_msgs/Empty '{{}}' {{ {body} }} }}"
+    monitors = load(text)
+    outcome = monitors.process("/t", b"", 1)
+    assert not outcome.faults, outcome.faults
+    if "false" not in body:
+        assert BUDGET_SIZE - monitors.monitor("s").context.budget > 5000
+
+
+def test_what_is_short_is_not_charged() -> None:
+    """Names and the like are compared for nothing, as before: that is what monitors do all day."""
+    body = 'if (s == "turret" || s == t || s < t || v == w) s = t;'
+    text = (
+        "s() { std::string s, t; std::vector<int> v, w; event e() /t std_msgs/Empty '{}' { " + body + " } }"
+    )
+    monitors = load(text)
+    monitors.process("/t", b"", 1)
+    assert monitors.monitor("s").context.budget == BUDGET_SIZE
+
+
+def test_a_formatted_text_is_charged_before_it_is_made() -> None:
+    """A format that names a long text many times is a fault, not many times the memory."""
+    many = "%s" * 90
+    body = f"std::string s(1000000, 'x'); ROS_INFO(\"{many}\"{', s' * 90});"
+    streamed = f"std::string s(1000000, 'x'); ROS_INFO_STREAM(s{' << s' * 40});"
+    for each in (body, streamed):
+        tracemalloc.start()
+        outcome = act(each)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert [MEMORY in fault.text for fault in outcome.faults] == [True]
+        assert peak < 30 << 20
 
 
 def test_memory_is_measured_over_all_variables() -> None:
