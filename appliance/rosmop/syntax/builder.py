@@ -283,10 +283,12 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return tree.For(self.at(meta), None if empty else start, condition, step, body)
 
     def range_for(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
-        _, kind, *more = children
-        name, values, body = more[-3:]
-        named = _referenced(kind) if len(more) == 4 else kind
-        return tree.RangeFor(self.at(meta), named, str(name), values, body)
+        _, kind, name, values, body = children
+        return tree.RangeFor(self.at(meta), kind, str(name), values, body)
+
+    def range_for_reference(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
+        word, kind, *more = children
+        return self.range_for(meta, [word, _referenced(kind), *more])
 
     def switch(self, meta: Meta, children: list[Any]) -> tree.Switch:
         _, value, *cases = children

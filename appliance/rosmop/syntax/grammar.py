@@ -26,7 +26,6 @@ parameters: parameter ("," parameter)*
          | BUILTIN+                               -> unnamed_parameters
 parameter: type NAME
          | type "&" NAME                          -> reference_parameter
-         | type REFERENCE NAME                    -> reference_parameter
          | type "[" "]" NAME                      -> array_parameter
          | type NAME "[" "]"                      -> array_parameter_behind
 
@@ -75,7 +74,7 @@ block: "{" statement* "}"
     | DO statement "while" "(" expression ")" ";"                 -> do_
     | FOR "(" for_start [expression] ";" [expression] ")" statement -> for_
     | FOR "(" type NAME ":" expression ")" statement              -> range_for
-    | FOR "(" type REFERENCE NAME ":" expression ")" statement    -> range_for
+    | RANGE_FOR "(" type "&" NAME ":" expression ")" statement    -> range_for_reference
     | SWITCH "(" expression ")" "{" case* "}"                     -> switch
     | BREAK ";"                                   -> break_
     | CONTINUE ";"                                -> continue_
@@ -173,6 +172,7 @@ IF: "if"
 WHILE: "while"
 DO: "do"
 FOR: "for"
+RANGE_FOR.4: /for(?=<GAP>*\([^;()?=]*&<GAP>*[A-Za-z_]\w*<GAP>*:(?!:))/
 SWITCH: "switch"
 CASE: "case"
 DEFAULT: "default"
@@ -204,7 +204,6 @@ NOT: /[!~]/
 MINUS: "-"
 PLUS: "+"
 INCREMENT.3: /\+\+|--/
-REFERENCE.3: /&(?=\s*[A-Za-z_]\w*\s*:(?!:))/
 LPAR: "("
 LBRACE: "{"
 COMMENT.10: /\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\//

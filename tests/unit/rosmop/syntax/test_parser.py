@@ -188,6 +188,8 @@ STATEMENTS = [
     "x = (uint8_t) y;", "x = (size_t)3;", "x = (int64_t)x * 1000000;", "x = (std::int8_t) 200;", "x = (std :: size_t)(y);",
     "std::vector<std::vector<std::string>> v;",
     "v = std::vector<std::vector<std::string>>(3);", "auto v = std::vector<std::vector<double> >{{1.0}};", "x = (int8_t) (uint16_t) -y;", "f(size_t(3));",
+    "x = c ? x & mask : 0;", "x = c ? a&b:d;", "switch (x) { case a & b: y; }", "for (int i = c ? a & b : 0; i; ) { }",
+    "for (const auto& a : v) { }", "for (const std::vector<int> & /* each */ a : v) x = a ? b & c : d;", "for (auto &a: v) { }",
     "PUBLISH(/t, std_msgs/String, s);", 'PUBLISH("/t", "std_msgs::String", s);', "DROP;", "return;", "delete[] p;",
     "a.b[1].c().d = e ? f : g, h;", "a = b = c;", "a <<= 1; b >>= 2;", "x = -+!~y;", "a++; ++a; a--; --a;", ";;;", "do x; while (y);",
     "switch (a) { case 1: case 2: { b; } break; default: c; }", "std::cout << a << std::endl;", "double m[2] = {1, 2};",
@@ -252,6 +254,7 @@ def test_a_refusal(text: str, line: int, column: int, reason: str) -> None:
 IN_ACTIONS = [
     ("x->y = 1;", 2, "found `->`, expected an expression; there are no pointers; write `.`"),
     ("if x { }", 4, "found `x`, expected `(`"),
+    ("c ? &x : 0;", 5, "there are no addresses; pass the variable itself"),
     ("p = &x;", 5, "there are no addresses; pass the variable itself"),
     ("y = 3 4;", 7, "found `4`, expected `;` or `,` or an operator"),
     ('y = "abc;', 5, "a string ends on the line it begins on"),
