@@ -17,6 +17,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.exchange import ServiceExchange
 from appliance.relay.grants import Service
 from appliance.relay.loop import Timer
+from appliance.relay.memory import Stall
 from appliance.relay.middle import Judged
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.ros.errors import PeerError
@@ -85,6 +86,8 @@ class ServiceClient:
         self._number = 0
         self._live = True
         self._weight = 0
+        self._share = context.shares.of(host)
+        self._stall = Stall(context.limits.stall_seconds)
         self._server: Stream | None = None
         self._timer: Timer | None = None
         self._parser = HeaderParser(context.limits.header_bytes)
@@ -129,6 +132,17 @@ class ServiceClient:
             objection = self._context.middle.service_objection(self.service.service, self._header)
             if objection:
                 self._close(objection)
+
+    def look(self) -> None:
+        """A second is over: one that keeps memory for a message that nothing comes of, or is not taken, is cut."""
+        held = (
+            self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
+        )
+        if self._stall.seen(held if held > _ALWAYS_HELD else 0, self._context.loop.clock()):
+            seconds = self._context.limits.stall_seconds
+            self._close(
+                f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s"
+            )
 
     def cut(self, reason: str) -> None:
         """Close both connections: what they stand on is gone."""
@@ -214,9 +228,9 @@ class ServiceClient:
     def _weigh(self) -> None:
         """Count what this connection holds in memory; too much for the process ends it."""
         weight = self._exchange.held + self._client.backlog + (self._server.backlog if self._server else 0)
-        self._context.budget.used += weight - self._weight
+        self._share.used += weight - self._weight
         self._weight = weight
-        if weight > _ALWAYS_HELD and self._context.budget.exhausted:
+        if weight > _ALWAYS_HELD and self._share.exhausted:
             self._close("the relay has no memory left for this message")
 
     def _to_service(self, data: bytes) -> None:
@@ -266,6 +280,6 @@ class ServiceClient:
             self._timer.cancel()
         if self._server is not None:
             self._server.close()
-        self._context.budget.used -= self._weight
+        self._share.used -= self._weight
         if self._greeted:
             self._traffic.connected(-1)

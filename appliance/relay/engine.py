@@ -43,6 +43,7 @@ from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
 from appliance.relay.links import Link
 from appliance.relay.loop import Loop
+from appliance.relay.memory import HostShares
 from appliance.relay.middle import Middle
 from appliance.relay.own import OwnPublisher
 from appliance.relay.ports import Ports
@@ -65,8 +66,10 @@ class Engine:
         self._middle = Middle(loop, self._reporter)
         self._middle.publish = lambda published: self._publish(published.topic, published.data)
         self._middle.changed = self._monitors_changed
+        budget = MemoryBudget(limits.memory_bytes)
+        headers = HostShares(MemoryBudget(limits.header_memory_bytes))
         self._context = RelayContext(
-            loop, limits, self._reporter, MemoryBudget(limits.memory_bytes), scratch, self._middle
+            loop, limits, self._reporter, budget, scratch, self._middle, HostShares(budget), headers
         )
         self._table = StatedTable()
         self._ports = Ports(loop, limits, self._arrived, self._turned_away)
@@ -416,8 +419,12 @@ class Engine:
         return rows
 
     def _tick(self) -> None:
-        for topic, _publisher in self._topics.values():
+        for topic, publisher in list(self._topics.values()):
             topic.tidy()
+            if isinstance(publisher, Publisher):
+                publisher.look()
+        for client in list(self._clients):
+            client.look()
         self._middle.tick()
         self._reporter.tick(self._rows)
         self._loop.after(self._limits.report_every, self._tick)

@@ -67,6 +67,11 @@ class ServiceExchange:
         """Whether a request waits that may go to the service."""
         return bool(self._waiting) and not self._busy and not self.done
 
+    @property
+    def unfinished(self) -> int:
+        """The bytes of a request or reply that is not whole; 0 while whole requests wait for their turn."""
+        return 0 if self._waiting else self.held
+
     def from_client(self, data: bytes) -> None:
         """Bytes from the client. Raises `PeerError` when they are no request."""
         self.held += len(data)

@@ -15,6 +15,7 @@ subscribers have been sent always ends with a frame.
 
 import mmap
 import struct
+from typing import Protocol
 
 from appliance.ros.errors import LimitExceededError
 
@@ -28,17 +29,27 @@ _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
 
 
+class Memory(Protocol):
+    """Where waiting bytes are counted: of the whole process, or of one host."""
+
+    used: int
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether nothing more should be kept."""
+
+
 class MemoryBudget:
     """Counts the bytes that wait in the process: unfinished large frames and queues."""
 
     def __init__(self, limit: int) -> None:
-        self._limit = limit
+        self.limit = limit
         self.used = 0
 
     @property
     def exhausted(self) -> bool:
         """Whether nothing more should be kept."""
-        return self.used >= self._limit
+        return self.used >= self.limit
 
 
 class Batch:
@@ -85,7 +96,7 @@ class Batch:
 class FrameReceiver:
     """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
 
-    def __init__(self, scratch: memoryview, limit: int, budget: MemoryBudget) -> None:
+    def __init__(self, scratch: memoryview, limit: int, budget: Memory) -> None:
         self._scratch = scratch
         self._limit = limit
         self._budget = budget
@@ -117,6 +128,17 @@ class FrameReceiver:
         if self._area is not None:
             return self._received_in_area(self._area, count)
         return self._walk(self._scratch, len(self._torn) + count, owned=False)
+
+    def charge(self, budget: Memory) -> None:
+        """Count there from now on."""
+        budget.used += self._filled
+        self._budget.used -= self._filled
+        self._budget = budget
+
+    @property
+    def unfinished(self) -> int:
+        """The bytes that have come of a large frame that is not whole."""
+        return self._filled
 
     def abandon(self) -> None:
         """The connection is gone: nothing unfinished counts any more."""

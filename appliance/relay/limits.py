@@ -42,6 +42,12 @@ class Limits:
     memory_bytes: int = 1024 * MIB
     """Queues and unfinished messages of the whole process."""
 
+    header_memory_bytes: int = 64 * MIB
+    """Headers that are not whole, or wait for a grant, of the whole process."""
+
+    stall_seconds: float = 10.0
+    """A connection in the middle of a large message, of which nothing comes (or goes) for so long, is cut."""
+
     connect_seconds: float = 3.0
     """To connect to a publisher or a service, and from there to its header."""
 

@@ -11,7 +11,7 @@ Invariants:
 
 from collections import deque
 
-from appliance.relay.frames import MemoryBudget, boundary_at
+from appliance.relay.frames import Memory, boundary_at
 from appliance.relay.limits import Limits
 
 _VECTORS = 64
@@ -21,7 +21,7 @@ _BEHIND = 1 << 20
 class Outbox:
     """Frames on their way to one subscriber."""
 
-    def __init__(self, limits: Limits, budget: MemoryBudget) -> None:
+    def __init__(self, limits: Limits, budget: Memory) -> None:
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
         self._budget = budget

@@ -48,7 +48,7 @@ class Subscriber:
         self._reporter = context.reporter
         self._refuse = refuse
         self._ended = ended
-        self._outbox = Outbox(context.limits, context.budget)
+        self._outbox = Outbox(context.limits, context.shares.of(host))
         self._number = 0
         self._live = True
         self._loop.watch(sock.fileno(), READ, self._ready)

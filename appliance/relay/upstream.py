@@ -16,6 +16,7 @@ from appliance.channel.messages.relay import Violation
 from appliance.relay.context import RelayContext
 from appliance.relay.frames import FrameReceiver
 from appliance.relay.loop import READ, Timer
+from appliance.relay.memory import Stall
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.relay.topic import RelayedTopic
@@ -41,6 +42,8 @@ class Publisher:
         self._reporter = context.reporter
         self._limits = limits = context.limits
         self._receiver = FrameReceiver(context.scratch, limits.message_bytes, context.budget)
+        self._shares = context.shares
+        self._stall = Stall(limits.stall_seconds)
         self._buffer = self._receiver.buffer
         self._received = self._receiver.received
         self._wanted = False
@@ -92,6 +95,7 @@ class Publisher:
             return
         self._asked = False
         self._address = (host, port)
+        self._receiver.charge(self._shares.of(host))
         try:
             sock = begin_connect(host, port)
         except (OSError, OverflowError) as error:
@@ -130,6 +134,15 @@ class Publisher:
             self._pause = None
             if self._socket is not None:
                 self._loop.watch(self._socket.fileno(), READ, self._ready)
+
+    def look(self) -> None:
+        """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
+        held = self._receiver.unfinished if self._pause is None else 0
+        if self._stall.seen(held, self._clock()):
+            self._lose(
+                f"{held} bytes of a message have come, and nothing for {self._limits.stall_seconds:g} s",
+                "limit exceeded",
+            )
 
     def announce(self, names: frozenset[str], type_name: str) -> None:
         """Who is served: the publishers of some types must see it by name."""

@@ -2,7 +2,7 @@
 
 Invariants:
 - A peer has `header_seconds` and `header_bytes` for its header; until then it costs one socket and what it
-  has sent.
+  has sent, which is counted: beyond `header_memory_bytes` (a host's share of it) it is turned away.
 - A refused peer gets a TCPROS header with `error=<reason>` as from any publisher or service, and `farewell`
   seconds to read it: its connection is shut for writing first, because closing over unread data would reset
   it and destroy the reason on its way.
@@ -43,6 +43,8 @@ class Visitor:
         self._limits = limits = context.limits
         self._introduced = introduced
         self._failed = failed
+        self._share = context.headers.of(host)
+        self._weight = 0
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
         self._stream = Stream(context.loop, sock, self._received, self._broken)
@@ -50,6 +52,7 @@ class Visitor:
     def take(self) -> socket.socket:
         """Give the socket to whoever serves it."""
         self._timer.cancel()
+        self._weigh(0)
         return self._stream.take()
 
     def wait(self, seconds: float, callback: Callable[[], None]) -> None:
@@ -61,11 +64,16 @@ class Visitor:
     def close(self) -> None:
         """Cut the connection."""
         self._timer.cancel()
+        self._weigh(0)
         self._stream.close()
 
     def _received(self, data: bytes) -> None:
         if not data:
             self._failed(self, "")
+            return
+        self._weigh(self._weight + len(data))
+        if self._share.exhausted:
+            self._failed(self, "too many connection headers are unfinished")
             return
         try:
             fields = self._parser.feed(data)
@@ -75,6 +83,10 @@ class Visitor:
         if fields is not None:
             self.fields, self.rest = fields, self._parser.rest
             self._introduced(self)
+
+    def _weigh(self, weight: int) -> None:
+        self._share.used += weight - self._weight
+        self._weight = weight
 
     def _broken(self, _reason: str) -> None:
         self._failed(self, "")

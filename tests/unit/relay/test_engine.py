@@ -657,6 +657,51 @@ def test_memory_is_given_back(world: World) -> None:
     world.until(lambda: world.engine._context.budget.used == 0)
 
 
+def test_who_begins_a_large_message_and_falls_silent_is_cut() -> None:
+    """What it holds is given back: a publisher that goes on, however slowly, is waited for."""
+    patient = World(replace(LIMITS, stall_seconds=0.5))
+    subscriber = patient.connect(encode_header(ASK))
+    publisher = patient.upstream()
+    patient.gets_header(subscriber)
+    message = encode_frame(bytes(MIB))
+    for start in range(0, MIB, MIB // 4):
+        patient.push(publisher, message[start : start + MIB // 4])
+        ends = time.monotonic() + 0.2
+        patient.until(lambda: time.monotonic() > ends)  # noqa: B023 - called at once
+    patient.push(publisher, message[MIB:])
+    patient.gets(subscriber, message)
+    patient.push(publisher, message[: MIB // 2])
+    lost = patient.hears(UpstreamLost)
+    assert ("nothing for 0.5 s" in lost.reason, lost.violation) == (True, "limit exceeded")
+    assert patient.engine._context.budget.used == 0
+    client = patient.connect(encode_header(CALL))
+    service = patient.accept(patient.service)
+    patient.gets_header(service)
+    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "m"}))
+    patient.gets_header(client)
+    patient.push(client, encode_frame(bytes(3 * MIB))[: 2 * MIB])
+    patient.ends(client)
+    assert "nothing of it has come or gone" in patient.hears(ConnectionClosed).reason
+    assert patient.engine._context.budget.used == 0
+    patient.close()
+
+
+def test_headers_that_are_never_finished_are_bounded_together() -> None:
+    """Of a host's share: further ones are turned away, and what they held is given back."""
+    world = World(replace(LIMITS, header_memory_bytes=64 << 10, header_seconds=30.0))
+    unfinished = struct.pack("<I", 60_000) + bytes(20_000)
+    first = world.connect(unfinished)
+    world.until(lambda: world.engine._visitors)
+    world.until(lambda: next(iter(world.engine._visitors))._weight == len(unfinished))
+    second = world.connect(unfinished)
+    world.ends(second)
+    assert "unfinished" in world.hears(ConnectionRefused).reason
+    first.reset()
+    world.until(lambda: not world.engine._visitors)
+    assert world.engine._context.headers.of(LOOPBACK).used == 0
+    world.close()
+
+
 def test_a_call_goes_through(world: World) -> None:
     """Headers written afresh with every field, then request and reply, then the end."""
     client = world.connect(encode_header(CALL | {"session": "7"}))

@@ -10,6 +10,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.memory import HostShares
 from appliance.relay.middle import Middle
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.report import Reporter
@@ -39,9 +40,10 @@ def presences(loop: Loop) -> Iterator[Presences]:
     """The presences of one topic."""
     limits = Limits()
     reporter = Reporter(limits)
-    context = RelayContext(
-        loop, limits, reporter, MemoryBudget(1 << 20), memoryview(bytearray(64)), Middle(loop, reporter)
-    )
+    budget = MemoryBudget(1 << 20)
+    shares = HostShares(budget)
+    scratch = memoryview(bytearray(64))
+    context = RelayContext(loop, limits, reporter, budget, scratch, Middle(loop, reporter), shares, shares)
     presences = Presences(context, TOPIC)
     yield presences
     presences.close()
