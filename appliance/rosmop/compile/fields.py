@@ -148,21 +148,17 @@ def _take(scope: Scope, each: Bound) -> None:
 
 
 def write_back(scope: Scope, written: list[Bound]) -> None:
-    """Write the lines that put assigned fields into the message, unless it was dropped."""
+    """Write the lines that put assigned fields into the message, unless it was dropped.
+
+    What can fault, the encoding of fields of variable size, comes before the first byte is written: all of the action's
+    changes are relayed, or none.
+    """
     lines = scope.lines
     edits = scope.temporary("w")
     lines.add("if m.dropped: return True")
     spliced = [each for each in written if struct_code(each.type) is None]
-    for each in written:
-        code = struct_code(each.type)
-        assert each.variable is not None
-        if code is not None:
-            assert each.spot is not None
-            packed = scope.codecs.pack([(each.type, _as_field(scope, each))])
-            lines.add(f"if {each.variable.flag}: m.patch({each.spot.code}, {packed})")
-    if not spliced:
-        return
-    lines.add(f"{edits} = []")
+    if spliced:
+        lines.add(f"{edits} = []")
     for each in spliced:
         assert each.variable is not None
         start = "0" if each.spot is None else each.spot.code
@@ -170,7 +166,14 @@ def write_back(scope: Scope, written: list[Bound]) -> None:
         lines.add("    o = e_bytearray()")
         lines.add(f"    {scope.codecs.encoder(each.type)}({_as_field(scope, each)}, o)")
         lines.add(f"    {edits}.append(({start}, {each.end}, e_bytes(o)))")
-    lines.add(f"if {edits}: m.splice({edits})")
+    for each in written:
+        if struct_code(each.type) is not None:
+            assert each.variable is not None
+            assert each.spot is not None
+            packed = scope.codecs.pack([(each.type, _as_field(scope, each))])
+            lines.add(f"if {each.variable.flag}: m.patch({each.spot.code}, {packed})")
+    if spliced:
+        lines.add(f"if {edits}: m.splice({edits})")
 
 
 def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:

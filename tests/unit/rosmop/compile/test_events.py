@@ -161,6 +161,25 @@ def test_bytes_are_converted_where_they_are_written(
     assert list(fields(kind, bytes(outcome.buffer)).data) == written
 
 
+HALF = [
+    ("int q, double[] c", "header.seq:q, orientation_covariance:c", "q = 5; std::vector<double> v(3); c = v;"),
+    ("std::string f, double[] c", "header.frame_id:f, orientation_covariance:c", 'f = "longer"; std::vector<double> v; c = v;'),
+    ("double[] c, int q", "orientation_covariance:c, header.stamp.nsec:q", "std::vector<double> v(10); c = v; q = 5;"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("parameters", "pattern", "body"), HALF)
+def test_an_action_that_faults_as_its_changes_are_written_changes_nothing(
+    parameters: str, pattern: str, body: str
+) -> None:
+    """With `on_fault: pass` a message goes on as it came, not with some of the changes."""
+    data = message("sensor_msgs/Imu", header__frame_id="base")
+    monitors = load(event("sensor_msgs/Imu", parameters, pattern, body), "pass")
+    outcome = monitors.process("/t", data, 1)
+    assert "elements for an array of exactly 9" in outcome.faults[0].text
+    assert outcome.result == "passed"
+
+
 BOUND_TWICE = [
     ("double[] p, double a", "position:p, position[0]:a", "a = 9;"),
     ("double[] p, double a", "position:p, position[0]:a", "p[0] = 9;"),
