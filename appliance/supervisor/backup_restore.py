@@ -17,11 +17,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from appliance.supervisor.backup_archive import checked_archive
-from appliance.supervisor.backup_contents import BackupError
+from appliance.supervisor.backup_contents import BackupError, kept_parts
 from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import account_of
 
+_LOCK = "lock"  # by it `StateDirectory` knows an appliance's directory, also where root may not look into its parts
+_OF_THE_DISK = "lost+found"
 _SPARE = 64 << 20  # bytes of a disk that are left for others
 
 
@@ -45,7 +47,7 @@ def _room_in(state: Path) -> int:
     Raises `BackupError`.
     """
     try:
-        if os.path.lexists(state) and any(state.iterdir()):
+        if os.path.lexists(state) and any(one.name != _OF_THE_DISK for one in state.iterdir()):
             raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
         here = state.absolute()
         while not os.path.lexists(here):
@@ -64,11 +66,13 @@ def _marked(state: Path) -> Iterator[None]:
     state.chmod(0o711)
     mark = set_mark(state)
     try:
+        (state / _LOCK).touch(0o600, exist_ok=False)
         yield
     except BaseException:
-        for part in state.iterdir():
-            if part.is_dir():
-                shutil.rmtree(part)
+        for part in kept_parts():
+            if (state / part).exists():
+                shutil.rmtree(state / part)
+        (state / _LOCK).unlink(missing_ok=True)
         mark.unlink()
         if is_new:
             state.rmdir()

@@ -83,7 +83,8 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
 
 def test_a_token_is_not_given_for_nothing(alone: Compose) -> None:
     """REST is published for this machine only, so no host could bring a token: it is said, and nobody is awaited."""
-    done = alone.exec("appliance", "rosrv", "host", "add", "laptop", "--token", "--out", "-", check=False)
+    add = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE)
+    done = alone.exec("appliance", *add, "--token", "--out", "-", check=False)
     assert done.returncode == 1
     assert done.stdout == ""
     assert "publish port 8443 of the container" in done.stderr

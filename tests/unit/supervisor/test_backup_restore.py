@@ -1,6 +1,7 @@
 """Tests of putting a backup back: where to, for whom, and what a torn restore leaves."""
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from appliance.supervisor.backup_contents import BackupError
 from appliance.supervisor.backup_restore import restore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
+from appliance.supervisor.state import foreign
 from tests.support.backups import LOG, archive, header
 from tests.support.requirements import need_root
 
@@ -46,7 +48,7 @@ def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(backup_restore, "_extract", torn)
     with pytest.raises(KeyboardInterrupt):
         restore(file, state)
-    assert seen == ["restoring"]
+    assert sorted(seen) == ["lock", "restoring"]
     assert not state.exists()
     state.mkdir()
     (state / "restoring").touch()
@@ -56,13 +58,23 @@ def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.Monke
     (state / "restoring").unlink()
     assert restore(file, state) == [LOG, "api/x"]
     refuse_half_restored(state)
-    assert sorted(one.name for one in state.iterdir()) == ["api", "control"]
+    assert sorted(one.name for one in state.iterdir()) == ["api", "control", "lock"]
+
+
+def test_what_was_restored_is_an_appliances(tmp_path: Path) -> None:
+    """`rosrv up` takes it, in a container too, where root may not look into the parts: it has the lock."""
+    state = tmp_path / "state"
+    restore(archive(tmp_path / "backup"), state)
+    assert stat.S_IMODE((state / "lock").stat().st_mode) == 0o600
+    (state / "control").rename(tmp_path / "out of sight")
+    (state / "control").mkdir()
+    assert foreign(state) is None
 
 
 def test_a_folder_that_was_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an empty folder, such as a volume, a failed restore takes away only what it put there."""
+    """Of an empty folder, such as a volume or a disk, a failed restore takes away only what it put there."""
     file, state = archive(tmp_path / "backup"), tmp_path / "state"
-    state.mkdir()
+    (state / "lost+found").mkdir(parents=True)
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -70,7 +82,7 @@ def test_a_folder_that_was_there_stays(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(backup_restore, "_extract", full)
     with pytest.raises(BackupError, match="No space left"):
         restore(file, state)
-    assert list(state.iterdir()) == []
+    assert [one.name for one in state.iterdir()] == ["lost+found"]
 
 
 def test_a_folder_is_given_away_after_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
