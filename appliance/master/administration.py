@@ -254,8 +254,8 @@ class Administration:
             ),
             "services": len({one.resource for _node, one in registry.in_order() if one.kind is Kind.SERVICE}),
             "connections": len(relay.connections),
-            "messages": sum(one.messages for one in relay.traffic.values()),
-            "dropped": sum(one.dropped for one in relay.traffic.values()),
+            "messages": relay.carried.total.messages,
+            "dropped": relay.carried.total.dropped,
             "audit": {
                 "lag_records": lag_records,
                 "lag_seconds": lag_seconds,

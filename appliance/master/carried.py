@@ -83,6 +83,14 @@ class Carried:
         Of at most `MOST_RESOURCES`; the rest is under `OTHERS`.
         """
 
+    @property
+    def total(self) -> Traffic:
+        """What went through everything, forgotten incarnations included."""
+        total = Traffic()
+        for one in (*self.past.values(), *self.traffic.values()):
+            total.include(one)
+        return total
+
     def flow(self, key: str, resource: str) -> dict[str, float]:
         """What went and goes through a topic or service of an incarnation, in plain values."""
         traffic = self.traffic.get((key, resource), Traffic())

@@ -50,6 +50,7 @@ def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: py
         counted.forgotten(f"k{number}")
         after = carried_of(counted)
         assert (after["relayed"]["/a"], after["delayed"]) == (before["relayed"]["/a"], before["delayed"])
+    assert (counted.total.messages, counted.total.dropped) == (44, 4)
     assert carried_of(counted) == {
         "relayed": {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
         "delayed": {"/a": [4, 8, 2.0]},
