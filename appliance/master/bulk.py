@@ -52,11 +52,14 @@ def weigh(value: Value, enough: int) -> int:
     waiting: list[Value] = [value]
     while waiting and total < enough:
         one = waiting.pop()
-        if isinstance(one, str | bytes):
-            total += _TEXT + len(one)
-        elif isinstance(one, list):
+        kind = type(one)
+        if kind is int:
+            total += _VALUE
+        elif kind is str or kind is bytes:
+            total += _TEXT + len(one)  # type: ignore[arg-type]  # it is one of the two
+        elif kind is list:
             total += _ARRAY
-            waiting += one
+            waiting += one  # type: ignore[arg-type]  # it is one
         elif isinstance(one, dict):
             total += _STRUCT
             for name in one:

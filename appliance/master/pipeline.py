@@ -73,7 +73,10 @@ class Pipeline:
     async def _serve(self, calls: Mapping[str, Call], caller: Caller, body: bytes) -> bytes:
         async with Bulk(self._bulk, caller.peer.host) as bulk:
             try:
-                method_call = await self._parse(body, bulk)
+                if len(body) <= self._offload:
+                    method_call = parse_call(body, self._limits)
+                else:
+                    method_call = await self._parse_large(body, bulk)
             except PeerError as error:
                 return self._not_understood(caller, error)
             try:
@@ -81,27 +84,22 @@ class Pipeline:
                 known = method_call.method in calls or method_call.method == _MULTICALL
                 seconds = (time.monotonic_ns() - caller.arrived) / 1e9
                 self._master.recorder.meter.called(method_call.method if known else "unknown", seconds)
-                return await self._build(answer, bulk)
+                if weigh(answer, self._offload) < self._offload:
+                    return build_response(answer)
+                await bulk.take()
+                return await asyncio.to_thread(build_response, answer)
             except EncodingError as error:
                 _log.error("answer cannot be written", call=method_call.method, error=str(error))
                 return build_fault(
                     _INTERNAL_FAULT, f"the answer to {method_call.method} cannot be written: {error}"
                 )
 
-    async def _parse(self, body: bytes, bulk: Bulk) -> MethodCall:
-        if len(body) <= self._offload:
-            return parse_call(body, self._limits)
+    async def _parse_large(self, body: bytes, bulk: Bulk) -> MethodCall:
         await bulk.take()
         try:
             return await asyncio.to_thread(parse_call, body, self._limits)
         finally:
             bulk.give_back()  # to carry it out may take long
-
-    async def _build(self, answer: Value, bulk: Bulk) -> bytes:
-        if weigh(answer, self._offload) < self._offload:
-            return build_response(answer)
-        await bulk.take()
-        return await asyncio.to_thread(build_response, answer)
 
     def _not_understood(self, caller: Caller, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)
@@ -120,7 +118,8 @@ class Pipeline:
         self, calls: Mapping[str, Call], caller: Caller, call: MethodCall, bulk: Bulk
     ) -> Value:
         if call.method != _MULTICALL or caller.target is not None:
-            await self._prepare(call.method, call.params, bulk)
+            if self._asks_for_much(call.method, call.params):
+                await bulk.take()
             return await self._answer(calls, caller, call.method, call.params)
         if len(call.params) != 1 or not isinstance(call.params[0], list):
             why = "system.multicall takes one list of calls"
@@ -144,10 +143,9 @@ class Pipeline:
                 since = time.monotonic()
         return results
 
-    async def _prepare(self, method: str, params: tuple[Value, ...], bulk: Bulk) -> None:
-        """Wait for one's turn with a call that will be answered with a large tree of parameters."""
-        if method == "getParam" and asks_for(self._master.parameters, params, self._offload):
-            await bulk.take()
+    def _asks_for_much(self, method: str, params: tuple[Value, ...]) -> bool:
+        """Whether the call will be answered with a large tree of parameters."""
+        return method == "getParam" and asks_for(self._master.parameters, params, self._offload)
 
     async def _weigh(self, answer: Value, bulk: Bulk) -> int:
         """About how many bytes an answer has, which is kept until the other parts have theirs."""
@@ -210,7 +208,8 @@ class Pipeline:
         call = _part_of(part)
         if call is None:
             return self._part_refused(caller, _FORM)
-        await self._prepare(*call, bulk)
+        if self._asks_for_much(*call):
+            await bulk.take()
         return [await self._answer(calls, caller, *call)]
 
     def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:

@@ -8,44 +8,62 @@ decision is made when it is the writer's turn.
 """
 
 import asyncio
-import contextlib
-from collections.abc import AsyncIterator, Collection
-from typing import NamedTuple
-
-
-class _Turn(NamedTuple):
-    keys: tuple[
-        str, ...
-    ]  # each with a slash at its end: a key is above another if it is how the other begins
-    done: asyncio.Event
+from collections.abc import Collection
 
 
 class WriteTurns:
     """The writes that are under way or wait, in the order they came."""
 
     def __init__(self) -> None:
-        self._turns: dict[int, _Turn] = {}
-        self._number = 0
+        self._turns: dict[WriteTurn, None] = {}
 
     def __len__(self) -> int:
         return len(self._turns)
 
-    @contextlib.asynccontextmanager
-    async def alone(self, keys: Collection[str]) -> AsyncIterator[None]:
-        """Be the only one who writes these keys (canonical), what is above and what is below them."""
-        mine = tuple({key if key == "/" else f"{key}/" for key in keys})
-        before = [turn.done for turn in self._turns.values() if _touch(turn.keys, mine)]
-        self._number = number = self._number + 1
-        self._turns[number] = turn = _Turn(mine, asyncio.Event())
+    def alone(self, keys: Collection[str]) -> "WriteTurn":
+        """To be the only one who writes these keys (canonical), what is above and what is below them: `async with`."""
+        return WriteTurn(self._turns, tuple({key if key == "/" else f"{key}/" for key in keys}))
+
+
+class WriteTurn:
+    """One write: entered when those before it that touch it are done."""
+
+    __slots__ = ("_done", "_keys", "_turns")
+
+    def __init__(self, turns: "dict[WriteTurn, None]", keys: tuple[str, ...]) -> None:
+        self._turns = turns
+        self._keys = (
+            keys  # each with a slash at its end: a key is above another if it is how the other begins
+        )
+        self._done: asyncio.Event | None = None  # made for who waits for this one
+
+    async def __aenter__(self) -> None:
+        before = [turn for turn in self._turns if self._touches(turn)]
+        self._turns[self] = None
         try:
-            for done in before:
-                await done.wait()
-            yield
-        finally:
-            del self._turns[number]
-            turn.done.set()
+            for turn in before:
+                await turn.done().wait()
+        except BaseException:
+            self._end()
+            raise
 
+    async def __aexit__(self, *_error: object) -> None:
+        self._end()
 
-def _touch(some: tuple[str, ...], others: tuple[str, ...]) -> bool:
-    """Whether a key of one side is, or is above, one of the other side."""
-    return any(one.startswith(others) for one in some) or any(one.startswith(some) for one in others)
+    def done(self) -> asyncio.Event:
+        """Set when this one has ended."""
+        if self._done is None:
+            self._done = asyncio.Event()
+            if self not in self._turns:
+                self._done.set()
+        return self._done
+
+    def _end(self) -> None:
+        del self._turns[self]
+        if self._done is not None:
+            self._done.set()
+
+    def _touches(self, other: "WriteTurn") -> bool:
+        """Whether a key of one side is, or is above, one of the other side."""
+        mine, others = self._keys, other._keys
+        return any(one.startswith(others) for one in mine) or any(one.startswith(mine) for one in others)
