@@ -18,10 +18,8 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
-from appliance.cli.monitor_input import read_to_send
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
-from appliance.rosmop.syntax.errors import SpecificationError
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
@@ -94,6 +92,9 @@ def load(
 
     Example: rosrv monitor load safe_zone.rv
     """
+    from appliance.cli.monitor_input import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
+    from appliance.rosmop.syntax.errors import SpecificationError  # noqa: PLC0415  as above
+
     try:
         texts, definitions = read_to_send(files, msg or [])
     except SpecificationError as error:
