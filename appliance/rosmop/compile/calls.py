@@ -9,7 +9,7 @@ from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.initializers import ValueOf, elements
 from appliance.rosmop.compile.invocation import Invocation
 from appliance.rosmop.compile.output import Stream, formatted
-from appliance.rosmop.compile.places import Value
+from appliance.rosmop.compile.places import Value, path, root
 from appliance.rosmop.compile.provided import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.scope import HelperFunction, Scope
 from appliance.rosmop.compile.storing import require_place, store
@@ -117,7 +117,8 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
     for argument, parameter in zip(node.arguments, function.parameters, strict=True):
         value = value_of(scope, argument)
         if parameter in function.references:
-            targets.append(_referenced(value, parameter.type, function.name))
+            targets.append(_referenced(value, parameter.type, function))
+            _check_alone(targets, function)
             codes.append(value.code)
         elif parameter.constant and value.type == parameter.type:
             codes.append(value.code)
@@ -133,13 +134,32 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
     return Value(function.result, code, node.position, pure=False)
 
 
-def _referenced(value: Value, kind: kinds.Type, name: str) -> Value:
-    require_place(value, f"a reference parameter of `{name}`")
+def _referenced(value: Value, kind: kinds.Type, function: HelperFunction) -> Value:
+    require_place(value, f"a reference parameter of `{function.name}`")
     if value.type != kind:
         raise SpecificationError.at(
-            value.position, f"`{name}` takes a reference to {kind}; this is {value.type}"
+            value.position, f"`{function.name}` takes a reference to {kind}; this is {value.type}"
+        )
+    variable = root(value)
+    if variable is not None and variable.shared and variable.name in function.names:
+        raise SpecificationError.at(
+            value.position,
+            f"`{function.name}` names `{variable.name}` itself, and a reference is a copy until it returns;"
+            " use one of the two ways",
         )
     return value
+
+
+def _check_alone(targets: Sequence[Value], function: HelperFunction) -> None:
+    """Refuse the last reference if it shares something with another: one change would undo the other."""
+    *others, last = targets
+    for other in others:
+        if all(one == beside for one, beside in zip(path(other), path(last), strict=False)):
+            raise SpecificationError.at(
+                last.position,
+                f"`{path(last)[0]}` is handed to two references of `{function.name}`,"
+                " which are copies until it returns; hand over different variables",
+            )
 
 
 # Output

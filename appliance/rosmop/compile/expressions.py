@@ -235,6 +235,8 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
     if node.operator == "=":
         if isinstance(target.type, kinds.String) and not isinstance(node.value, tree.Elements):
             return target, _character_or_text(scope, node.value)
+        if isinstance(target.type, kinds.Characters) and isinstance(node.value, tree.Name):
+            storing.note_copy(target, value_of(scope, node.value))
         return target, converted(scope, node.value, target.type)
     if not target.pure:
         raise SpecificationError.at(

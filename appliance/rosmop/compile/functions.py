@@ -1,6 +1,6 @@
 """Helper functions, `init`, first values and handlers as Python functions."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 from appliance.rosmop.compile.conversion import convert
 from appliance.rosmop.compile.expressions import value_of
@@ -156,8 +156,13 @@ def declare_functions(shared: Shared, names: SpecificationNames, specification: 
             names.functions[node.name] = _signature(shared, names, node)
         except SpecificationError as error:
             shared.findings += error.findings
-    for function in names.functions.values():
-        function.recursive = _calls_itself(function, names.functions)
+    known = names.functions
+    called = {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
+    for name, function in known.items():
+        reached = _reached(called[name], called)
+        function.recursive = name in reached
+        if function.references:
+            function.names = frozenset().union(*(_free_names(known[one].node) for one in {name, *reached}))
 
 
 def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -> HelperFunction:
@@ -174,6 +179,7 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
             shared.module.fresh("v"),
             parameter.position,
             constant=parameter.type.constant and parameter.type.reference,
+            copied=kind == kinds.CHARACTERS and not parameter.type.reference,
         )
         parameters.append(variable)
         if parameter.type.reference and not parameter.type.constant:
@@ -183,28 +189,39 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
     )
 
 
-def _calls_itself(function: HelperFunction, functions: Mapping[str, HelperFunction]) -> bool:
-    seen: set[str] = set()
-    waiting = [function]
+def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
+    """The functions that are called from these, however far away, and these."""
+    seen = set(first)
+    waiting = list(first)
     while waiting:
-        for name in _called(waiting.pop().node.body):
-            if name == function.name:
-                return True
-            if name in functions and name not in seen:
-                seen.add(name)
-                waiting.append(functions[name])
-    return False
+        further = called[waiting.pop()] - seen
+        seen |= further
+        waiting += further
+    return seen
 
 
 def _called(node: tree.Node) -> Iterable[str]:
+    for each in _nodes(node):
+        if isinstance(each, tree.Call) and isinstance(each.callee, tree.Name):
+            yield each.callee.parts[-1]
+
+
+def _free_names(function: tree.Function) -> set[str]:
+    """The names in a function that it does not declare itself."""
+    nodes = list(_nodes(function.body))
+    own = {each.name for each in nodes if isinstance(each, tree.Declarator | tree.RangeFor)}
+    own |= {parameter.name for parameter in function.parameters}
+    return {each.parts[0] for each in nodes if isinstance(each, tree.Name) and len(each.parts) == 1} - own
+
+
+def _nodes(node: tree.Node) -> Iterable[tree.Node]:
     waiting: list[object] = [node]
     while waiting:
         current = waiting.pop()
         if isinstance(current, tuple):
             waiting += current
         elif isinstance(current, tree.Node):
-            if isinstance(current, tree.Call) and isinstance(current.callee, tree.Name):
-                yield current.callee.parts[-1]
+            yield current
             waiting += [getattr(current, name) for name in current.__dataclass_fields__]
 
 

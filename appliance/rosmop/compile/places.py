@@ -24,6 +24,8 @@ class Variable:
     """What a `const` number is, if it is written down."""
     flag: str | None = None
     alias: "Value | None" = None
+    copied: bool = False
+    """A `char *` that holds a copy of another's characters, where C++'s would point to them."""
     used: bool = False
     assigned: bool = False
 
@@ -90,6 +92,19 @@ class PartPlace(Place):
     base: Value
     part: str
     site: int
+
+
+def path(value: Value) -> tuple[str | int, ...]:
+    """Where a value lives: the name of the variable, then elements and fields, down to it."""
+    place = value.place
+    if isinstance(place, VariablePlace):
+        alias = place.variable.alias
+        return (place.variable.name,) if alias is None else path(alias)
+    if isinstance(place, ElementPlace | CharacterPlace):
+        return (*path(place.base), place.index)
+    if isinstance(place, SlotPlace):
+        return (*path(place.base), place.slot)
+    return (*path(place.base), place.part) if isinstance(place, PartPlace) else ()
 
 
 def root(value: Value) -> Variable | None:

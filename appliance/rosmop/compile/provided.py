@@ -8,7 +8,7 @@ from appliance.rosmop.compile.conversion import convert, number, require_number,
 from appliance.rosmop.compile.output import formatted
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import store
+from appliance.rosmop.compile.storing import require_original, store
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime import numbers, texts
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -186,6 +186,7 @@ def _buffer(call: Arguments) -> Value:
         raise SpecificationError.at(
             target.position, f"`{call.name}` needs a `char` buffer; for a {target.type} write `=` or `+=`"
         )
+    require_original(target)
     return target
 
 

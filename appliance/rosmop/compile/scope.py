@@ -20,7 +20,10 @@ Role = Literal["action", "timer", "handler", "init", "function"]
 
 @dataclass(eq=False)
 class HelperFunction:
-    """A helper function; `references` are the parameters that are handed back."""
+    """A helper function; `references` are the parameters that are handed back.
+
+    `names` are the names of other variables that it, or what it calls, looks at or assigns.
+    """
 
     name: str
     code: str
@@ -29,6 +32,7 @@ class HelperFunction:
     references: tuple[Variable, ...]
     node: tree.Function
     recursive: bool = False
+    names: frozenset[str] = frozenset()
 
 
 @dataclass(eq=False)

@@ -53,8 +53,16 @@ def _declaration(scope: Scope, node: tree.Statement) -> None:
             size = scope.codecs.width(kind)
             scope.lines.add(f"{scope.context}.allocate({size}, {scope.lines.site})")
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
+        variable.copied = _is_copy(scope, declarator, kind)
         variable.known = known(scope, node.type, declarator, kind)
         scope.lines.add(f"{variable.code} = {code}")
+
+
+def _is_copy(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> bool:
+    """Whether a `char *` begins with the characters of another one."""
+    if kind != kinds.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
+        return False
+    return isinstance(value_of(scope, declarator.value).type, kinds.Characters)
 
 
 def known(

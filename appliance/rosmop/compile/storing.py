@@ -16,6 +16,7 @@ from appliance.rosmop.compile.places import (
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.runtime import texts, times, vectors
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
 
 FUNCTIONS = {
     "a_put": vectors.put,
@@ -33,6 +34,24 @@ def require_place(target: Value, what: str) -> Place:
     if variable is not None and variable.constant:
         raise SpecificationError.at(target.position, f"`{variable.name}` is const")
     return target.place
+
+
+def require_original(target: Value) -> None:
+    """Refuse to write into a `char *` that is a copy: in C++ that would change what it was copied from."""
+    variable = root(target)
+    if variable is not None and variable.copied:
+        raise SpecificationError.at(
+            target.position,
+            f"`{variable.name}` is a copy here, and its original would not change; use a `std::string`"
+            " (as a parameter: `std::string&`)",
+        )
+
+
+def note_copy(target: Value, value: Value) -> None:
+    """Remember that a `char *` was given another's characters."""
+    variable = root(target)
+    if variable is not None and value.place is not None and isinstance(value.type, kinds.Characters):
+        variable.copied = variable.copied or isinstance(variable.type, kinds.Characters)
 
 
 def store(scope: Scope, target: Value, code: str) -> str:
@@ -82,6 +101,8 @@ def _store_part(scope: Scope, place: Place, code: str) -> str:
     """Strings and times do not change in place: the whole is stored anew."""
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner = require_place(place.base, "an assignment")
+    if isinstance(place.base.type, kinds.Characters):
+        require_original(place.base)
     if not place.base.pure:
         raise SpecificationError.at(
             place.base.position, "too much in one step; put the index into a variable first"

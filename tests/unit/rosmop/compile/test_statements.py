@@ -253,6 +253,51 @@ def test_reference_parameters_are_handed_back() -> None:
     assert printed(body, before=before) == "1 4 2 42"
 
 
+SWAP = "void swap(int& a, int& b) { int c = a; a = b; b = c; } "
+ALIASES = [
+    (SWAP, "int a = 1; swap(a, a);", "`a` is handed to two references of `swap`"),
+    (SWAP, "std::vector<int> v(2); swap(v[0], v[0]);", "`v` is handed to two references"),
+    (
+        "void f(std::vector<int>& v, int& a) { }",
+        "std::vector<int> v(2); f(v, v[1]);",
+        "`v` is handed to two references",
+    ),
+    ("int n; void f(int& a) { a = 1; n = 2; }", "f(n);", "`f` names `n` itself"),
+    ("int n; int g() { return n; } void f(int& a) { a = g(); }", "f(n);", "`f` names `n` itself"),
+    ("std::vector<int> v; void f(int& a) { v.clear(); }", "f(v[0]);", "`f` names `v` itself"),
+    ('void f(char * c) { strcpy(c, "x"); }', "", "`c` is a copy"),
+    ("void f(char * c) { c[0] = 'x'; }", "", "`c` is a copy"),
+    ("void f(char * c) { c[0]++; }", "", "`c` is a copy"),
+    ("", 'char c[5]; char * d = c; sprintf(d, "x");', "`d` is a copy"),
+    ("", "char c[5]; char * d; d = c; d[1] = 'x';", "`d` is a copy"),
+    ("char c[5]; char * d; init() { d = c; }", 'strcat(d, "x");', "`d` is a copy"),
+]
+
+
+@pytest.mark.parametrize(("before", "body", "text"), ALIASES)
+def test_what_would_be_one_in_cpp_and_two_here_is_refused(before: str, body: str, text: str) -> None:
+    """References are copied in and out, and buffers are values: where that shows, the file is refused."""
+    assert text in refused_action(body, before=before)[0].text
+
+
+NO_ALIASES = [
+    (SWAP, 'std::vector<int> v{1, 2}; swap(v[0], v[1]); ROS_INFO("%d", v[0]);', "2"),
+    (SWAP, 'int a = 1, b = 2; swap(a, b); ROS_INFO("%d", a);', "2"),
+    ("int n; void f(int& a) { int n = 3; a = n; }", 'f(n); ROS_INFO("%d", n);', "3"),
+    ("int n; void f(int& n) { n = 4; }", 'f(n); ROS_INFO("%d", n);', "4"),
+    ("int n; void f(int a) { n = a + 1; }", 'f(n); ROS_INFO("%d", n);', "1"),
+    ('void f(char *& c) { strcpy(c, "x"); }', 'char * c = new char[3]; f(c); ROS_INFO("%s", c);', "x"),
+    ("int f(char * c) { c = new char[3]; return strlen(c); }", 'char c[2]; ROS_INFO("%d", f(c));', "0"),
+    ("", "char c[5]; char * d = new char[5]; d[0] = 'y'; strcpy(c, d); ROS_INFO(\"%s\", c);", "y"),
+]
+
+
+@pytest.mark.parametrize(("before", "body", "lines"), NO_ALIASES)
+def test_references_and_buffers_that_are_different_are_fine(before: str, body: str, lines: str) -> None:
+    """Copies that nobody can tell from the original are none."""
+    assert printed(body, before=before) == lines
+
+
 def test_a_procedure_needs_no_type() -> None:
     """A function without a result type returns nothing, as in the samples of ROSRV."""
     assert printed('go(); go(); ROS_INFO("%d", n);', before="int n; go() { n++; }") == "2"
