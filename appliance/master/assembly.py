@@ -10,7 +10,6 @@ import socket
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import structlog
 
@@ -51,6 +50,7 @@ from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.policy.model import Address
 from appliance.ros.standard import standard_definitions
+from appliance.ros.xmlrpc import Value
 from appliance.store.state import StateStore
 
 RVMASTER, INNER = "rvmaster", "inner"
@@ -138,6 +138,9 @@ class _Wires:
     def redecide_for(self, host: Address, caller_id: str) -> int:
         return self.revocation().redecide_for(host, caller_id)
 
+    def may_be_told(self, incarnation: Incarnation, key: str, value: Value) -> bool:
+        return may_be_told(self.master(), incarnation, key, value)
+
     def rosmaster_lost(self) -> None:
         self.master().rosmaster.shut()
         self.reconciler().wake()
@@ -217,7 +220,15 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         relay_all=settings.relaying == "all",
         stand_ins=settings.mediation == "full",
     )
-    graph = Graph(registry, relay, delivery, base.recorder, mediation, closed=wires.close_faces)
+    graph = Graph(
+        registry,
+        relay,
+        delivery,
+        base.recorder,
+        mediation,
+        closed=wires.close_faces,
+        may_be_told=wires.may_be_told,
+    )
     return _Reach(registry, places, addresses, delivery, relay, mediation, graph)
 
 
@@ -332,7 +343,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
             reach.registry,
             reach.delivery,
             value_limits(base.settings),
-            may_be_told=partial(may_be_told, master),
+            tell_parameter=reach.graph.tell_parameter,
         ),
     )
 

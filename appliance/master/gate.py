@@ -8,13 +8,15 @@ nothing. A question that only the network can answer (is the node that holds thi
 import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Call, Caller, Identity, Touch
-from appliance.master.parameters import Tree, standing_at
+from appliance.master.parameters import Tree, holds_others, standing_at
 from appliance.master.registry import Incarnation, Life, Registry
 from appliance.policy import Policy
 from appliance.policy.model import Category, Decision, Request
+from appliance.ros.xmlrpc import Value
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +106,10 @@ class Gate:
         host, caller_id = caller.peer.host, caller.caller_id
         key = str(arguments[-1] if category is Category.READ else arguments[0])
         there, in_the_way = standing_at(tree, key)
-        value = arguments[1] if category is Category.WRITE and len(arguments) > 1 else None
+        value = cast(Value, arguments[1]) if category is Category.WRITE and len(arguments) > 1 else None
         decision = policy.decide_parameter(
             Request(host, caller_id, category, key),
-            namespace=isinstance(value, dict) or (isinstance(there, dict) and not call.name.startswith("un")),
+            namespace=holds_others(value) or (holds_others(there) and not call.name.startswith("un")),
         )
         if value is not None and in_the_way is not None and decision.allowed:
             decision = _both(decision, policy.decide(Request(host, caller_id, category, in_the_way)))

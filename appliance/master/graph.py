@@ -31,7 +31,9 @@ class Graph:
         mediation: Mediation,
         *,
         closed: Callable[[Incarnation], None],
+        may_be_told: Callable[[Incarnation, str, Value], bool],
     ) -> None:
+        self._may_be_told = may_be_told
         self._registry = registry
         self._relay = relay
         self._delivery = delivery
@@ -218,8 +220,13 @@ class Graph:
             self._empty(subscriber, topic)
 
     def tell_parameter(self, subscriber: Incarnation, key: str, value: Value, size: int) -> None:
-        """Tell a node the value of a parameter as ROSMaster does: keys end with `/`, and an unset one has `{}`."""
-        self._delivery.push(subscriber, NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), size))
+        """Tell a node the value of a parameter as ROSMaster does: keys end with `/`, and an unset one has `{}`.
+
+        It is told what it may read: ROSMaster tells all that comes to be below a key to those who subscribed to it,
+        which was decided by what was there then.
+        """
+        if self._may_be_told(subscriber, key.rstrip("/") or "/", value):
+            self._delivery.push(subscriber, NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), size))
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""

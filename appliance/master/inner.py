@@ -2,8 +2,7 @@
 
 The path of the request is the incarnation's key, which only ROSMaster was ever told. Lists of publishers are not
 taken from here (`graph` makes them from the registry, when it changes); a list for a topic is only the sign that
-ROSMaster saw a change. A parameter is told to who may read it: ROSMaster tells all that comes to be below a key to
-those who subscribed to it, which was decided by what was there then.
+ROSMaster saw a change. A parameter's value goes the way of all that nodes are told of them (`Graph.tell_parameter`).
 """
 
 from collections.abc import Callable
@@ -21,7 +20,7 @@ _log = structlog.get_logger()
 
 
 class InnerFace:
-    """Serves ROSMaster's calls to nodes. `may_be_told(node, key, value)`: whether it may have this parameter."""
+    """Serves ROSMaster's calls to nodes. `tell_parameter(node, key, value, size)` passes a new value on."""
 
     def __init__(
         self,
@@ -29,9 +28,9 @@ class InnerFace:
         delivery: Delivery,
         limits: Limits,
         *,
-        may_be_told: Callable[[Incarnation, str, Value], bool],
+        tell_parameter: Callable[[Incarnation, str, Value, int], None],
     ) -> None:
-        self._may_be_told = may_be_told
+        self._tell_parameter = tell_parameter
         self._registry = registry
         self._delivery = delivery
         self._limits = limits
@@ -55,8 +54,7 @@ class InnerFace:
             case "publisherUpdate", _:
                 return [1, "", 0]
             case "paramUpdate", (_, str(key), value):
-                if self._may_be_told(incarnation, key.rstrip("/") or "/", value):
-                    self._delivery.push(incarnation, NodeCall("paramUpdate", (key, value), size))
+                self._tell_parameter(incarnation, key, value, size)
                 return [1, "", 0]
             case "shutdown", (_, str(reason)):
                 self._delivery.push(incarnation, NodeCall("shutdown", (reason,)))

@@ -150,6 +150,11 @@ def _parts(key: str) -> list[str]:
     return [part for part in key.split("/") if part]
 
 
+def holds_others(value: Value) -> bool:
+    """Whether a value is a namespace with something in it: whose rights are asked, too."""
+    return isinstance(value, dict) and bool(value)
+
+
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
     """What `key` (canonical) has, None for nothing; and its parent that has a value and is no namespace, if any.
 
@@ -189,7 +194,7 @@ def _hidden(master: "Master", caller: Caller, method: str, key: str, answer: Ans
     ):
         return None
     request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
-    decision = policy.decide_parameter(request, namespace=bool(answer[2]))
+    decision = policy.decide_parameter(request, namespace=holds_others(answer[2]))
     if decision.allowed:
         return None
     return denial_text(decision, master.recorder.decided(caller, method, Category.READ.value, key, decision))
@@ -218,7 +223,7 @@ def may_be_told(master: "Master", incarnation: Incarnation, key: str, value: Val
     if incarnation.own or not policy.has_section(Category.READ):
         return True
     request = Request(incarnation.host, incarnation.name, Category.READ, key)
-    decision = policy.decide_parameter(request, namespace=isinstance(value, dict) and bool(value))
+    decision = policy.decide_parameter(request, namespace=holds_others(value))
     if not decision.allowed:
         peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
         caller = Caller(peer, incarnation.name, time.monotonic_ns())

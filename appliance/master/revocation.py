@@ -15,6 +15,7 @@ from appliance.audit.record import Severity
 from appliance.master.allocation import TOPIC
 from appliance.master.client import CallFailedError
 from appliance.master.core import Master
+from appliance.master.parameters import holds_others, standing_at
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Kind, Life, Registration
 from appliance.policy.model import Address, Category, Decision, Request
@@ -136,8 +137,9 @@ class Revocation:
         if registration.kind is Kind.PARAMETER:
             decision = gate.may_be_node(Request(host, name, Category.COMMAND, "subscribeParam"))
             if decision.allowed and policy.has_section(Category.READ):
+                there, _ = standing_at(self._master.parameters.tree, registration.resource)
                 decision = policy.decide_parameter(
-                    Request(host, name, Category.READ, registration.resource), subtree=True
+                    Request(host, name, Category.READ, registration.resource), namespace=holds_others(there)
                 )
             return decision
         return gate.may_be_node(Request(host, name, _CATEGORIES[registration.kind], registration.resource))

@@ -19,7 +19,7 @@ from appliance.master.gate import Gate, HostLimits
 from appliance.master.graph import Graph
 from appliance.master.http import HttpRequest, Peer
 from appliance.master.liveness import Liveness, LivenessSettings
-from appliance.master.parameters import ParameterMirror
+from appliance.master.parameters import ParameterMirror, may_be_told
 from appliance.master.pipeline import Pipeline
 from appliance.master.reconcile import Reconciler
 from appliance.master.registration import withdraw_lost
@@ -271,6 +271,7 @@ class ControlParts:
             cast(Any, self.records),
             cast(Any, self.mediation),
             closed=lambda one: self.closed.append(one.key),
+            may_be_told=lambda one, key, value: may_be_told(self.master, one, key, value),
         )
         self.rosmaster = RosMaster(1, lost=lambda: None, limits=Limits(), hold=1.0)
         self.rosmaster._calls = cast(Any, self.hidden)
