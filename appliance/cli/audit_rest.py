@@ -45,9 +45,10 @@ class RestLog:
             params = {**_parameters(wanted), "limit": size, "order": order}
             if cursor is not None:
                 params["cursor"] = cursor
-            page = self._get("", params)
-            entries += map(_entry, page["records"])
-            cursor = page["cursor"]
+            with self._refusals():
+                page = self._get("", params)
+                entries += map(_entry, page["records"])
+                cursor = page["cursor"]
             if cursor is None or len(entries) >= limit:
                 return Page(entries, cursor)
 
@@ -56,11 +57,12 @@ class RestLog:
         if not _ID.fullmatch(record_id):
             return None
         try:
-            found = self._get(f"/{record_id}", {"neighbours": neighbours})
+            with self._refusals():
+                found = self._get(f"/{record_id}", {"neighbours": neighbours})
+                before, after = ([*map(_entry, found[name])] for name in ("before", "after"))
+                return Shown(_entry(found["record"]), before, after)
         except _NothingThereError:
             return None
-        before, after = ([*map(_entry, found[name])] for name in ("before", "after"))
-        return Shown(_entry(found["record"]), before, after)
 
     def export(self, wanted: Filter) -> Iterator[Entry]:
         """All records that match, the oldest first."""
@@ -101,17 +103,20 @@ class RestLog:
             raise FilterError(
                 "--key and --checkpoints are held against the log's file: verify it on its machine (--state)"
             )
-        return msgspec.convert(self._get("/verify", {}, _VERIFY_SECONDS), Verification)
+        with self._refusals():
+            return msgspec.convert(self._get("/verify", {}, _VERIFY_SECONDS), Verification)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
         """Signed checkpoints after a number, in order."""
-        found = self._get("/checkpoints", {"after": after})["checkpoints"]
-        return msgspec.convert(found, list[SignedCheckpoint])
+        with self._refusals():
+            found = self._get("/checkpoints", {"after": after})["checkpoints"]
+            return msgspec.convert(found, list[SignedCheckpoint])
 
     def last(self) -> int:
         """The sequence of the last record."""
-        found = self._get("", {"limit": 1})["records"]
-        return int(found[0]["sequence"]) if found else 0
+        with self._refusals():
+            found = self._get("", {"limit": 1})["records"]
+            return int(found[0]["sequence"]) if found else 0
 
     def _get(self, path: str, params: dict[str, Any], seconds: float = 60.0) -> dict[str, Any]:
         with self._refusals():
@@ -141,7 +146,7 @@ class RestLog:
             if isinstance(error, FilterError):
                 raise
             raise NotRunningError(
-                f"{self._client.url} is not the REST of an appliance: a line that is no record"
+                f"{self._client.url} is not the REST of an appliance: its answer is not as documented"
             ) from None
 
     def _records(self, lines: Iterator[str]) -> Iterator[Entry]:

@@ -185,6 +185,24 @@ def test_what_is_no_appliance_is_told(server: Server, status: int, body: bytes) 
     assert [path for _method, path, _token in server.seen] == ["/v1/status"]
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("search",), ("show", "18e9aa02efc40abb0e51"), ("export",), ("tail",), ("verify",), ("checkpoints",),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+@pytest.mark.parametrize("body", [b'{"a":1}', b'{"records":[1],"cursor":null,"record":1,"checkpoints":[{}]}'])
+def test_answers_that_are_not_as_documented_are_told(
+    server: Server, verb: tuple[str, ...], body: bytes
+) -> None:
+    """JSON of some other server where the audit log is asked for: exit status 2, and no defect of ours."""
+    server.body = body
+    found = run("audit", *verb, "--api", server.url)
+    assert found[0] == 2
+    assert "is not the REST of an appliance" in found[1]
+
+
 def test_a_proxy_and_netrc_are_not_used(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
