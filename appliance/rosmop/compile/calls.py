@@ -87,6 +87,8 @@ def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
 
 def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> SpecificationError:
     name = "::".join(parts)
+    if name in scope.names.misdeclared:
+        return SpecificationError(())
     if parts[-1] in _REFUSED:
         return SpecificationError.at(
             node.position, f"there is no function {shown(name)}: {_REFUSED[parts[-1]]}"

@@ -130,6 +130,7 @@ def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: s
             bound.append(_bind_one(scope, binding, parameters, kind))
         except SpecificationError as error:
             scope.shared.findings += error.findings
+            scope.misdeclared.add(binding.variable or "")
     named = {binding.variable for binding in trigger.pattern}
     for parameter in event.parameters:
         if parameter.name not in named:

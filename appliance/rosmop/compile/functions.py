@@ -26,6 +26,7 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
                 variable = _shared_variable(shared, names, declaration, declarator)
             except SpecificationError as error:
                 shared.findings += error.findings
+                names.misdeclared.add(declarator.name)
                 continue
             names.variables[declarator.name] = variable
             shared.measures[variable.code] = shared.codecs.measure(variable.type)
@@ -156,6 +157,7 @@ def declare_functions(shared: Shared, names: SpecificationNames, specification: 
             names.functions[node.name] = _signature(shared, names, node)
         except SpecificationError as error:
             shared.findings += error.findings
+            names.misdeclared.add(node.name)
     known = names.functions
     called = {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
     for name, function in known.items():

@@ -10,6 +10,7 @@ from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.types.messages import shown
 
+_DEFAULT = re.compile(r"[\[,]\s*default\s+[A-Za-z_]")
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
 
 
@@ -30,10 +31,15 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Findi
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Finding]:
-    """Warnings about events that no property names, if there are properties."""
+    """Warnings about events that no property names, if there are properties; `default` names all of them."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
+    if any(
+        code.property.logic in ("fsm", "tfsm") and _DEFAULT.search(code.property.formula)
+        for code in properties
+    ):
+        return []
     return [
         Finding(event.position, "warning", f"no property uses the event {shown(event.name)}")
         for event in specification.events

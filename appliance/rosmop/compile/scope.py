@@ -43,6 +43,8 @@ class SpecificationNames:
     context: str
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
+    misdeclared: set[str] = field(default_factory=set)
+    """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
 
@@ -120,6 +122,7 @@ class Scope:
         self.written: set[str] = set()
         self.calls: set[str] = set()
         self.recursive = False
+        self.misdeclared: set[str] = set()  # local names whose declarations are refused
         self._blocks: list[dict[str, Variable]] = [{}]
 
     # Names
@@ -128,8 +131,10 @@ class Scope:
     def block(self) -> Iterator[None]:
         """A block with names of its own."""
         self._blocks.append({})
-        yield
-        self._blocks.pop()
+        try:
+            yield
+        finally:
+            self._blocks.pop()
 
     def enter(self, loop: Loop) -> None:
         """A loop or switch begins here."""
@@ -172,7 +177,8 @@ class Scope:
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
         """The refusal of a name that nothing has."""
-        if self.shared.partial:
+        wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
+        if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())
         known = [name for block in self._blocks for name in block]
         known += [*self.names.variables, *self.names.functions]

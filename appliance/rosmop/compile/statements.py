@@ -39,6 +39,14 @@ def write(scope: Scope, node: tree.Statement) -> None:
 
 def _declaration(scope: Scope, node: tree.Statement) -> None:
     assert isinstance(node, tree.Declaration)  # so says the table at the end
+    try:
+        _declare(scope, node)
+    except SpecificationError:
+        scope.misdeclared |= {declarator.name for declarator in node.declarators}
+        raise
+
+
+def _declare(scope: Scope, node: tree.Declaration) -> None:
     if node.type.static:
         raise SpecificationError.at(
             node.position, "there are no static variables in functions; declare it before the events"

@@ -137,7 +137,7 @@ def shown(text: str) -> str:
 def describe(text: str, offset: int, accepted: Set[str]) -> str:
     """The message for text that cannot follow at `offset`, where a token of `accepted` could."""
     if offset >= len(text):
-        found, hint = "the end of the file", ""
+        piece, found, hint = "", "the end of the file", ""
     else:
         match = _FOUND.match(text, offset)
         piece = match[0] if match else text[offset]
@@ -145,7 +145,9 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
         hint = FORBIDDEN.get(piece, _HINTS.get(piece, ""))
     if text.startswith("/*", offset):
         return "this comment does not end; write `*/` behind it"
-    container = _CONTAINER.search(text, max(0, offset - 100), offset)
+    if piece == "[" and text[:offset].rstrip().endswith("]") and "SEMICOLON" in accepted:
+        hint = "there are no arrays of arrays; use a `std::vector` of vectors"
+    container = _CONTAINER.search(text, max(0, offset - 100), offset + 1)
     if container is not None:
         hint = f"there is no `{container[1]}`; use a `std::vector`"
     expected = _expected(accepted)

@@ -74,8 +74,10 @@ def _parse(text: str, file: str) -> Tree[Token]:
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
-    """The position of a character; that of the last thing in the text for its end."""
-    return Position(file, 1, 1).within(text, min(offset, len(text)))
+    """The position of a character; for the end of the text, the place behind the last thing in it."""
+    if offset >= len(text):
+        offset = len(text.rstrip())
+    return Position(file, 1, 1).within(text, offset)
 
 
 def _accepted(error: UnexpectedInput) -> set[str]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.rosmop.acting import act, load, message, refused_action
+from tests.unit.rosmop.acting import act, load, message, refused, refused_action
 
 
 def printed(body: str, *, before: str = "", data: int = 0) -> str:
@@ -409,3 +409,31 @@ def test_a_character_can_be_assigned_to_a_string() -> None:
     """As in C++: assigned, but not initialised; a number is refused."""
     assert printed('std::string s = "abc"; s = \'x\'; ROS_INFO("%s", s);') == "x"
     assert "write `std::to_string" in refused_action("std::string s; s = 65;")[0].text
+
+
+ONE_MISTAKE = [
+    ("foo n = 3; n++; x = n + 1; if (n) x = n;", "", "there is no type `foo`"),
+    ("int n = y, m = n; m++; n++;", "", "there is no variable `y`"),
+    ("foo a, b; a = b;", "", "there is no type `foo`"),
+    ("for (foo i = 0; i < 3; i++) x = i;", "", "there is no type `foo`"),
+    ("n++; x = n;", "foo n;", "there is no type `foo`"),
+    ("x = f(1) + f(2);", "foo f(int a) { return a; }", "there is no type `foo`"),
+    ("static int n = 3; n++;", "", "there are no static variables in functions"),
+    ("{ foo n; } int k = 1; k++;", "", "there is no type `foo`"),
+]
+
+
+@pytest.mark.parametrize(("body", "before", "text"), ONE_MISTAKE)
+def test_one_mistake_is_told_once(body: str, before: str, text: str) -> None:
+    """What has a wrong declaration is declared: its uses are no further mistakes."""
+    found = refused_action(body, before=before)
+    assert len(found) == 1
+    assert text in found[0].text
+
+
+def test_a_wrong_binding_is_told_once() -> None:
+    """Also where the parameter is used, and in what another specification knows of a wrong variable."""
+    text = "s() { event e(int x) /t std_msgs/Int32 '{dat:x}' when (x > 1) { x = 3; int y = x; } }"
+    assert [finding.text[:40] for finding in refused(text)] == ["std_msgs/Int32 has no field `dat`; did y"]
+    text = "a() { event e() /t std_msgs/Int32 '{}' { n++; } } b() { foo n; event e() /u std_msgs/Int32 '{}' { } }"
+    assert len(refused(text)) == 1

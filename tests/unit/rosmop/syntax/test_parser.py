@@ -208,6 +208,9 @@ REFUSALS = [
     ("// nothing", 1, 1, "there is no specification in this file"),
     ("a() {", 1, 6, "found the end of the file, expected a declaration, an `event`"),
     ("a() { int x }", 1, 13, "found `}`, expected"),
+    ("a() {\n int x;\n\n  \n", 2, 8, "found the end of the file, expected a declaration, an `event`"),
+    ("a() { std::map<int, int> m; }", 1, 15, "there is no `map`; use a `std::vector`"),
+    ("a() { double d[2][3]; }", 1, 18, "there are no arrays of arrays; use a `std::vector` of vectors"),
     ("a() { event x() /t std_msgs/String {} {} }", 1, 36, "found `{`, expected a quote `'`"),
     (
         "a() { event x() /t String '{}' { } }",
@@ -255,6 +258,7 @@ IN_ACTIONS = [
     ("x->y = 1;", 2, "found `->`, expected an expression; there are no pointers; write `.`"),
     ("if x { }", 4, "found `x`, expected `(`"),
     ("c ? &x : 0;", 5, "there are no addresses; pass the variable itself"),
+    ("double d[2][3];", 12, "there are no arrays of arrays; use a `std::vector` of vectors"),
     ("p = &x;", 5, "there are no addresses; pass the variable itself"),
     ("y = 3 4;", 7, "found `4`, expected `;` or `,` or an operator"),
     ('y = "abc;', 5, "a string ends on the line it begins on"),
