@@ -119,7 +119,10 @@ def _row(row: tuple[object, ...]) -> _Row:
 
 def _log_id(connection: sqlite3.Connection) -> str:
     """The id of the log; empty if the file does not have exactly one that is well formed."""
-    rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
+    try:
+        rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
+    except sqlite3.DatabaseError:
+        return ""  # no such table: told with the structure; what cannot be read at all fails there
     found = rows[0][0] if len(rows) == 1 else None
     return found if isinstance(found, str) and _LOG_ID.fullmatch(found) else ""
 
@@ -157,8 +160,11 @@ class _Verifier:
         if not self._log:
             self._structure("table log does not have the one id of a log: what it sealed cannot be told")
         removed = self._last_removal()
-        sequences = self._connection.execute("SELECT sequence FROM checkpoint")
-        self._sealed = {sequence: b"" for (sequence,) in sequences}
+        try:
+            sequences = self._connection.execute("SELECT sequence FROM checkpoint")
+            self._sealed = {sequence: b"" for (sequence,) in sequences}
+        except sqlite3.DatabaseError:
+            self._sealed = {}  # told where the checkpoints are checked
         if self._copies is not None:
             self._sealed |= dict.fromkeys(self._copies.sequences, b"")
         self._walk(removed)

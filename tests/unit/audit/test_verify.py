@@ -414,7 +414,7 @@ _REMOVED = (
 @pytest.mark.parametrize(
     "statements",
     [
-        ("DELETE FROM log",),
+        ("DELETE FROM log",), ("DROP TABLE log",), ("DROP TABLE record",), ("DROP TABLE checkpoint",),
         ("INSERT INTO log VALUES ('00000000000000000000000000000000', 1)",),
         ("UPDATE log SET id = CAST(x'ff' AS TEXT)",),
         ("UPDATE log SET id = '../../../etc/passwd'",),
