@@ -95,8 +95,10 @@ class Stating:
         (self._fresh.add if restarted else self._fresh.discard)(relay)
         if self._coming is not None and relay not in self._coming[1].losing:
             coming, plan = self._coming
-            return self._statement(coming, relay, _of(plan), plan.moved_files, restarted=restarted)
-        return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted)
+            return self._statement(
+                coming, relay, _of(plan), plan.moved_files, restarted=restarted, ahead=True
+            )
+        return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted, ahead=True)
 
     def relay_of(self, monitor: str) -> int:
         """The relay that has a monitor."""
@@ -235,6 +237,7 @@ class Stating:
         moved: frozenset[str] = frozenset(),
         *,
         restarted: bool = False,
+        ahead: bool = False,
     ) -> messages.SpecificationsStated:
         files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
         mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
@@ -247,6 +250,7 @@ class Stating:
             self._on_fault,
             tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
             next(self._numbers),
+            ahead,
         )
 
     # --- what the relays say ---

@@ -7,7 +7,8 @@ asks for.
 Invariants:
 - A connection that is served stands on a statement in the table; the withdrawal of that statement cuts it.
 - Without a link to control everything goes on as stated before; nothing new is granted.
-- What control states while the first specifications are being compiled is carried out when they are in force, in order.
+- What control states after the first specifications, or those that it begins with, is carried out when they are in
+  force, in order.
 """
 
 import os
@@ -333,7 +334,7 @@ class Engine:
         reason = flaw(fields, rest)
         if not reason:
             reason = missing(self._table, visitor.key, visitor.host, fields)
-            if reason and (patient or self._table.restating):
+            if reason and (patient or self._table.restating or self._middle.preparing):
                 visitor.wait(self._limits.grant_seconds, lambda: self._judge(visitor, patient=False))
                 self._waiting.setdefault(visitor.key, set()).add(visitor)
                 return

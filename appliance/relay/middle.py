@@ -62,8 +62,7 @@ class Middle:
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
         self.blocked = ""
-        self.preparing = False
-        """The first specifications are being compiled: nothing is carried yet, and nothing may be."""
+        self._awaited: SpecificationsStated | None = None
         self.spent = 0.0
         self.sight = object()
         self._timer: Timer | None = None
@@ -86,11 +85,13 @@ class Middle:
             if not message.files and (self._stated is None or self.blocked):
                 self._compiler.now(message)
                 return
-            self.preparing = self._stated is None and not self.blocked
+        if message.ahead or (self._stated is None and not self.blocked):
+            self._awaited = message
         self._compiler.later(message)
 
     def _compiled(self, message: SpecificationsStated, result: Result) -> None:
-        self.preparing = False
+        if message is self._awaited:
+            self._awaited = None
         self.look_again()
         if isinstance(result, list):
             self._refuse(message, result)
@@ -128,7 +129,7 @@ class Middle:
         if self.monitors is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
-            self.changed(None)
+        self.changed(None if self.monitors is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
@@ -152,6 +153,11 @@ class Middle:
         return _topics(held)
 
     # --- what is asked when something changes ---
+
+    @property
+    def preparing(self) -> bool:
+        """Whether specifications are compiled that must be in force before anything else is carried out."""
+        return self._awaited is not None
 
     def stands(self, topic: str) -> bool:
         """Whether messages of a topic go through here."""

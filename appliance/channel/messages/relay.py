@@ -215,7 +215,8 @@ class SpecificationsStated(Message):
     `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
     takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
     they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
-    answer has, too: the same revision may be stated again.
+    answer has, too: the same revision may be stated again. `ahead`: what is stated after it is carried out when it is
+    in force (or refused), so that nothing is placed where its monitors are not yet.
     """
 
     revision: int
@@ -226,6 +227,7 @@ class SpecificationsStated(Message):
     on_fault: Literal["drop", "pass"] = "drop"
     moved: tuple[str, ...] = ()
     statement: int = 0
+    ahead: bool = False
 
 
 class MonitorSwitched(Message):

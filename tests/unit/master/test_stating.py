@@ -117,10 +117,12 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 async def test_each_relay_is_told_its_own(world: World) -> None:
-    """And of a change, before anything comes into force."""
+    """And of a change, before anything comes into force. What a relay is told first goes ahead of all else."""
+    assert world.stating.statement(0).ahead
     assert [name for name, _ in world.stating.statement(0).files] == ["a.rv"]
     assert [name for name, _ in world.stating.statement(1).files] == ["b.rv"]
     assert await world.stating.take(revision(2, **world.files, c=spec("c", "/b"))) == []
+    assert not any(one.ahead for _, one in world.fleet.stated)
     assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
 
 

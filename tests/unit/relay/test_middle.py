@@ -223,6 +223,28 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
     assert world.engine._middle.wants("/late")
 
 
+@pytest.mark.parametrize("text", [GUARD.replace("/chatter", "/late"), "nonsense"])
+def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
+    world: Monitored, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    """It may have another revision than the relay, after a crash in the middle of a change; or one that is refused."""
+    world.load(GUARD)
+    compiled = threading.Event()
+    compile_now = Compiler._compile
+
+    def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
+        compiled.wait()
+        return compile_now(compiler, message)
+
+    monkeypatch.setattr(Compiler, "_compile", compile_late)
+    world.state(SpecificationsStated(2, [("0.rv", text)], {}, {}, True, ahead=True))
+    world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
+    assert ("k", "/late") not in world.engine._topics
+    compiled.set()
+    world.until(lambda: world.taken(SpecificationsTaken, 2) or world.taken(SpecificationsRefused, 2))
+    assert ("k", "/late") in world.engine._topics
+
+
 def test_bad_specifications_change_nothing(world: Monitored) -> None:
     """And control is told what is wrong, with its place."""
     world.load(GUARD)
