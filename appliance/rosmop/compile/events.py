@@ -57,7 +57,7 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
     scope.message_type = kind
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    body = _body(scope, event, trigger, bound, kind)
+    body = _body(scope, event, trigger, kind)
     lines, action_starts = _assemble(scope, event, bound, body)
     header = [(f"def {function}(m):", -1), *_globals(scope)]
     action_line = shared.module.next_line + len(header) + action_starts
@@ -199,7 +199,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 
 
 def _body(
-    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, bound: list[Bound], kind: str
+    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: str
 ) -> tuple[list[tuple[str, int]], list[tuple[str, int]]]:
     """The lines of `when` and of the action. They come first, because they say which fields are needed."""
     teller = scope.module.fresh("u")
@@ -212,7 +212,7 @@ def _body(
                 scope.lines.add(f"if not {condition(value_of(scope, when))}: return False")
             except SpecificationError as error:
                 scope.shared.findings += error.findings
-        if any(each.variable is not None and each.variable.assigned for each in bound):
+        if scope.changes:
             raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
     conditions, scope.lines = scope.lines, Lines()
     scope.lines.site = own.site

@@ -15,7 +15,7 @@ from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-from appliance.rosmop.types.messages import PRIMITIVES, UnknownNameError, shown
+from appliance.rosmop.types.messages import shown
 from appliance.rosmop.types.resolve import resolve
 
 _NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]+|[0-9.]+(?:[eE][+-]?[0-9]+)?)([uUlLfF]*)\Z")
@@ -131,7 +131,7 @@ def _name(scope: Scope, node: tree.Expression) -> Value:
         kind, constant = CONSTANTS[parts]
         return constant_value(node.position, kind, constant)
     if len(parts) == 3:
-        return _message_constant(scope, node)
+        return members.constant(scope, "/".join(parts[:2]), parts[2], node.position)
     if len(parts) == 1 and parts[0] in scope.names.functions:
         raise SpecificationError.at(node.position, f"{shown(parts[0])} is a function; write `{parts[0]}(…)`")
     name = "::".join(parts)
@@ -164,20 +164,6 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
     return Value(kinds.Record(scope.message_type), scope.read_message(), node.position)
-
-
-def _message_constant(scope: Scope, node: tree.Name) -> Value:
-    """`package::Type::NAME`."""
-    package, name, constant = node.parts
-    try:
-        found = scope.messages.constant(f"{package}/{name}", constant)
-    except UnknownNameError as error:
-        raise SpecificationError.at(node.position, str(error)) from None
-    value = found.value.encode("utf-8", "surrogateescape") if isinstance(found.value, str) else found.value
-    kind = PRIMITIVES[found.type]
-    if kind == kinds.FLOAT and not isinstance(value, bytes):
-        value = f32(value)
-    return constant_value(node.position, kind, value)
 
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:

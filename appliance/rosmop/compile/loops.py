@@ -142,18 +142,28 @@ def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
     scope.lines.add(f"{flag} = False")
     scope.lines.add(f"{start} = {{{table}}}.get({selected}, {default})")
     _enter(scope, node, Loop(True, continued=flag))
+    before = len(scope.lines.lines)
     scope.lines.add("while True:")
-    with scope.block(), scope.indented():
+    with scope.block() as names, scope.indented():
         for index, case in enumerate(node.cases):
             if case.statements:
                 scope.lines.add(f"if {start} <= {index}:")
                 _statements(scope, case.statements, write)
         scope.lines.add("break")
+    _write_zeros(scope, names, before)
     loop = scope.loops.pop()
     if loop.step is not None:
         scope.lines.add(f"if {flag}:")
         with scope.indented():
             write_continue(scope, node.position)
+
+
+def _write_zeros(scope: Scope, names: dict[str, Variable], before: int) -> None:
+    """Give the variables of a `switch` a value before it: a case may jump over the declaration."""
+    lines, scope.lines.lines = scope.lines.lines, []
+    for variable in names.values():
+        scope.lines.add(f"{variable.code} = {scope.codecs.zero(variable.type)}")
+    scope.lines.lines = [*lines[:before], *scope.lines.lines, *lines[before:]]
 
 
 def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[str, int]:

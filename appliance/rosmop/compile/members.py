@@ -3,13 +3,15 @@
 from collections.abc import Mapping
 
 from appliance.rosmop.compile import string_members, time_members, vector_members
+from appliance.rosmop.compile.conversion import constant_value
 from appliance.rosmop.compile.invocation import Invocation, Method
 from appliance.rosmop.compile.places import PartPlace, SlotPlace, Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
-from appliance.rosmop.types.messages import UnknownNameError, nearest, shown
+from appliance.rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
 
 FUNCTIONS = string_members.FUNCTIONS | vector_members.FUNCTIONS | time_members.FUNCTIONS
 
@@ -20,6 +22,8 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
         try:
             slot = scope.messages.slot(base.type.name, name)
         except UnknownNameError as error:
+            if name in {each.name for each in scope.messages.definition(base.type.name).constants}:
+                return constant(scope, base.type.name, name, position)
             raise SpecificationError.at(position, str(error)) from None
         place = SlotPlace(base, slot.index) if base.place is not None else None
         code = f"{base.code}[{slot.index}]"
@@ -33,6 +37,19 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
     if name in members:
         raise SpecificationError.at(position, f"`{name}` is a function; write `.{name}(…)`")
     raise SpecificationError.at(position, f"{base.type} has no member {shown(name)}{nearest(name, members)}")
+
+
+def constant(scope: Scope, message_type: str, name: str, position: Position) -> Value:
+    """`package::Type::NAME`, and `variable.NAME`."""
+    try:
+        found = scope.messages.constant(message_type, name)
+    except UnknownNameError as error:
+        raise SpecificationError.at(position, str(error)) from None
+    kind = PRIMITIVES[found.type]
+    value = found.value.encode("utf-8", "surrogateescape") if isinstance(found.value, str) else found.value
+    if kind == kinds.FLOAT and not isinstance(value, bytes):
+        value = f32(value)
+    return constant_value(position, kind, value)
 
 
 def call(invocation: Invocation) -> Value:

@@ -96,19 +96,17 @@ def _hint(left: Type, right: Type) -> str:
 
 def _comparison(operator: str, operands: Operands) -> Value:
     kind = kinds.common(operands.left.type, operands.right.type)
-    left = _compared(operands.left, operands.right, kind)
-    right = _compared(operands.right, operands.left, kind)
+    left, right = (_compared(value, kind) for value in (operands.left, operands.right))
     return operands.value(kinds.BOOL, f"({left} {operator} {right})")
 
 
-def _compared(value: Value, other: Value, kind: Type) -> str:
+def _compared(value: Value, kind: Type) -> str:
     """An operand of a comparison; Python compares integers and doubles with each other exactly where it is safe."""
     small = isinstance(value.type, kinds.Bool) or (
         isinstance(value.type, kinds.Integer) and value.type.bits <= 32
     )
     if isinstance(kind, kinds.Floating) and kind.bits == 64 and small:
         return value.code
-    del other
     return number(value.code, value.type, kind)
 
 

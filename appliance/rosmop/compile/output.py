@@ -166,7 +166,7 @@ class Stream:
         if value is not None:
             self._precision = number(value.code, value.type, kinds.INT)
             return True
-        return name in ("flush", "boolalpha", "noboolalpha") and name == "flush"
+        return name == "flush"
 
     def piece(self, value: Value) -> str:
         """Code for the bytes of one value."""

@@ -120,7 +120,7 @@ class Scope:
         self.below: set[str] = set()  # shared variables whose declarations are still to come
         self.loops: list[Loop] = []
         self.written: set[str] = set()
-        self.calls: set[str] = set()
+        self.changes = False  # something was assigned
         self.recursive = False
         self.misdeclared: set[str] = set()  # local names whose declarations are refused
         self._blocks: list[dict[str, Variable]] = [{}]
@@ -128,11 +128,12 @@ class Scope:
     # Names
 
     @contextmanager
-    def block(self) -> Iterator[None]:
+    def block(self) -> Iterator[dict[str, Variable]]:
         """A block with names of its own."""
-        self._blocks.append({})
+        names: dict[str, Variable] = {}
+        self._blocks.append(names)
         try:
-            yield
+            yield names
         finally:
             self._blocks.pop()
 

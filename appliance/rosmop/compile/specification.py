@@ -33,9 +33,7 @@ from appliance.rosmop.types.messages import Messages, nearest, shown
 _T = TypeVar("_T")
 
 MODIFIERS = frozenset({"hold"})
-IGNORED_MODIFIERS = frozenset(
-    {"unsynchronized", "decentralized", "perthread", "suffix", "full-binding", "creation"}
-)
+IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
 """Modifiers of MOP that say how a monitor is generated, and mean nothing here."""
 
 

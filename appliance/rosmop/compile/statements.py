@@ -51,10 +51,6 @@ def _declare(scope: Scope, node: tree.Declaration) -> None:
         raise SpecificationError.at(
             node.position, "there are no static variables in functions; declare it before the events"
         )
-    if node.type.reference:
-        raise SpecificationError.at(
-            node.position, "references are for parameters and range-for; use a variable"
-        )
     for declarator in node.declarators:
         kind, code = initial(scope, node.type, declarator)
         if scope.codecs.width(kind) > LARGE:
@@ -134,6 +130,12 @@ def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple
         text = converted(scope, declarator.value, kinds.STRING)
         if size is None:
             return kinds.CHARACTERS, f"({text} + b'\\0')"
+        if isinstance(declarator.value, tree.Text) and len(declarator.value.value) >= size:
+            length = len(declarator.value.value)
+            raise SpecificationError.at(
+                declarator.value.position,
+                f"a text of {length} characters and its zero need `{declarator.name}[{length + 1}]`",
+            )
         return kinds.CHARACTERS, f"e_filled({scope.context}, {zeros}, {text}, {scope.lines.site})"
     if size is None:
         assert isinstance(declarator.value, tree.Elements)  # _array_size has looked

@@ -77,7 +77,7 @@ def store_lines(scope: Scope, target: Value, code: str) -> list[str]:
 def mark(scope: Scope, target: Value) -> str | None:
     """The flag to set when (a part of) this place changes, None if nobody asks."""
     variable = root(target)
-    del scope
+    scope.changes = True
     if variable is None:
         return None
     variable.assigned = variable.used = True

@@ -141,10 +141,6 @@ def positive_difference(left: float, right: float) -> float:
     return left - right if left > right else 0.0
 
 
-def _exponential(function: Callable[[float], float]) -> Callable[[float], float]:
-    return _total(function)
-
-
 def _hyperbolic_sine(value: float) -> float:
     try:
         return math.sinh(value)
@@ -165,9 +161,9 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "sinh": (1, _hyperbolic_sine),
     "cosh": (1, _total(math.cosh)),
     "tanh": (1, math.tanh),
-    "exp": (1, _exponential(math.exp)),
+    "exp": (1, _total(math.exp)),
     "exp2": (1, lambda value: power(2.0, value)),
-    "expm1": (1, _exponential(math.expm1)),
+    "expm1": (1, _total(math.expm1)),
     "log": (1, _log(math.log)),
     "log2": (1, _log(math.log2)),
     "log10": (1, _log(math.log10)),

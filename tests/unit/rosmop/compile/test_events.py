@@ -477,3 +477,24 @@ def test_an_unknown_type_is_answered_with_the_nearest() -> None:
     [finding] = refused(event("std_msgs/Strin", "", "", ""))
     assert "did you mean `std_msgs/String`?" in finding.text
     assert "--msg DIR" in finding.text
+
+
+@pytest.mark.parametrize("when", ["n++ > 0", "(n = 1) > 0", "v[0]++ > 0", "(m.data = 1) == 1"])
+def test_a_condition_changes_nothing(when: str) -> None:
+    """`when` only looks, at parameters and at shared variables."""
+    before = "int n; std::vector<int> v; std_msgs::Int32 m;"
+    text = f"s() {{ {before} event e() /t std_msgs/Int32 '{{}}' when ({when}) {{ }} }}"
+    assert refused(text)[0].text == "`when` only looks; assign in the action"
+
+
+def test_a_constant_of_a_message_may_be_named_through_a_variable() -> None:
+    """As in C++."""
+    text = event(
+        "rosgraph_msgs/Log",
+        "int n",
+        "level:n",
+        'rosgraph_msgs::Log d; ROS_INFO("%d", d.WARN == rosgraph_msgs::Log::WARN); switch (n) { case d.ERROR: return; }',
+    )
+    assert log_of(text, message("rosgraph_msgs/Log")) == "1"
+    assert process(text, message("rosgraph_msgs/Log", level=8)).result == "dropped"
+    assert "needs a variable" in refused(text.replace("switch", "d.WARN = 3; switch"))[0].text

@@ -437,3 +437,17 @@ def test_a_wrong_binding_is_told_once() -> None:
     assert [finding.text[:40] for finding in refused(text)] == ["std_msgs/Int32 has no field `dat`; did y"]
     text = "a() { event e() /t std_msgs/Int32 '{}' { n++; } } b() { foo n; event e() /u std_msgs/Int32 '{}' { } }"
     assert len(refused(text)) == 1
+
+
+def test_a_variable_of_a_switch_is_zero_where_its_declaration_is_jumped_over() -> None:
+    """In C++ it has no value there; here it has one."""
+    body = 'switch (x) { case 0: int y; y = 5; case 1: y++; ROS_INFO("%d", y); }'
+    assert [printed(body, data=data) for data in (0, 1)] == ["6", "1"]
+
+
+def test_a_text_that_its_array_cannot_hold_is_refused() -> None:
+    """With its zero, as in C++."""
+    text = "a text of 3 characters and its zero need `c[4]`"
+    assert refused_action('char c[3] = "abc";')[0].text == text
+    assert refused_action("", before='char c[3] = "abc";')[0].text == text
+    assert printed('char c[4] = "abc"; ROS_INFO("%s", c);') == "abc"
