@@ -10,6 +10,7 @@ from appliance.rosmop.types.kinds import Type
 
 FUNCTIONS = {
     "c_f32": numbers.f32,
+    "c_f32_integer": numbers.f32_of_integer,
     "c_truncate": numbers.truncate,
     "c_terminated": texts.terminated,
     "c_float": float,
@@ -89,7 +90,8 @@ def number(code: str, source: Type, target: Type) -> str:
         return _to_integer(code, source, target)
     assert isinstance(target, kinds.Floating)  # numbers are one of the three
     if target.bits == 32:
-        return f"c_f32({code})"
+        large = isinstance(source, kinds.Integer) and source.bits == 64
+        return f"c_f32_integer({code})" if large else f"c_f32({code})"
     return code if isinstance(source, kinds.Floating) else f"c_float({code})"
 
 

@@ -19,6 +19,7 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
     "h_abs": abs,
     "h_min": min,
     "h_max": max,
+    "h_signbit": numbers.signbit,
     "h_isnan": math.isnan,
     "h_isinf": math.isinf,
     "h_isfinite": math.isfinite,
@@ -92,6 +93,34 @@ def _math(name: str, count: int) -> Function:
     return function
 
 
+def _math_of_floats(name: str, count: int) -> Function:
+    """`sqrtf` and its like."""
+    function = _math(name, count)
+
+    def of_floats(call: Arguments) -> Value:
+        call.values = [
+            Value(kinds.FLOAT, number(value.code, value.type, kinds.FLOAT), value.position, pure=value.pure)
+            if kinds.is_number(value.type)
+            else value
+            for value in call.values
+        ]
+        value = function(call)
+        return call.value(kinds.FLOAT, value.code if value.type == kinds.FLOAT else f"c_f32({value.code})")
+
+    return of_floats
+
+
+def _rounded(name: str) -> Function:
+    """`lround` and its like."""
+    function = _math(name, 1)
+
+    def to_integer(call: Arguments) -> Value:
+        value = function(call)
+        return call.value(kinds.LONG, number(value.code, value.type, kinds.LONG))
+
+    return to_integer
+
+
 def _absolute(call: Arguments) -> Value:
     call.count(1)
     require_number(call.values[0], "`abs`")
@@ -154,7 +183,7 @@ def _parser(kind: kinds.Integer) -> Function:
 def _parse_floating(kind: kinds.Floating) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
-        code = f"h_parse_floating({call.text(0)}, {call.site})"
+        code = f"h_parse_floating({call.text(0)}, {kind.bits}, {call.site})"
         return call.value(kind, code if kind.bits == 64 else f"c_f32({code})")
 
     return function
@@ -241,6 +270,10 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
         "llabs": _absolute,
         "min": _extreme("min"),
         "max": _extreme("max"),
+        **{f"{name}f": _math_of_floats(name, count) for name, (count, _) in numbers.MATH.items()},
+        **{f"{long}round": _rounded("round") for long in ("l", "ll")},
+        **{f"{long}rint": _rounded("rint") for long in ("l", "ll")},
+        "signbit": _question("signbit"),
         "isnan": _question("isnan"),
         "isinf": _question("isinf"),
         "isfinite": _question("isfinite"),
@@ -265,6 +298,16 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
     }
 )
 
+_LIMITED: Mapping[str, kinds.Integer] = MappingProxyType(
+    {
+        "SCHAR": kinds.INT8, "UCHAR": kinds.UINT8, "CHAR": kinds.CHAR, "SHRT": kinds.INT16, "USHRT": kinds.UINT16,
+        "INT": kinds.INT, "UINT": kinds.UINT, "LONG": kinds.LONG, "ULONG": kinds.ULONG, "LLONG": kinds.LONG,
+        "ULLONG": kinds.ULONG, "INT8": kinds.INT8, "UINT8": kinds.UINT8, "INT16": kinds.INT16, "UINT16": kinds.UINT16,
+        "INT32": kinds.INT, "UINT32": kinds.UINT, "INT64": kinds.LONG, "UINT64": kinds.ULONG, "SIZE": kinds.ULONG,
+    }
+)  # fmt: skip
+"""The types whose limits have names, such as `INT_MAX`."""
+
 CONSTANTS: Mapping[tuple[str, ...], tuple[kinds.Type, bool | int | float]] = MappingProxyType(
     {
         ("true",): (kinds.BOOL, True),
@@ -275,14 +318,23 @@ CONSTANTS: Mapping[tuple[str, ...], tuple[kinds.Type, bool | int | float]] = Map
         ("M_1_PI",): (kinds.DOUBLE, 1 / math.pi),
         ("M_E",): (kinds.DOUBLE, math.e),
         ("M_SQRT2",): (kinds.DOUBLE, math.sqrt(2)),
+        ("M_SQRT1_2",): (kinds.DOUBLE, math.sqrt(0.5)),
+        ("M_2_PI",): (kinds.DOUBLE, 2 / math.pi),
+        ("M_2_SQRTPI",): (kinds.DOUBLE, 2 / math.sqrt(math.pi)),
+        ("M_LN2",): (kinds.DOUBLE, math.log(2)),
+        ("M_LN10",): (kinds.DOUBLE, math.log(10)),
+        ("M_LOG2E",): (kinds.DOUBLE, 1.4426950408889634),
+        ("M_LOG10E",): (kinds.DOUBLE, 0.4342944819032518),
+        **{
+            (f"{name}_{end}",): (kind if kind.bits >= 32 else kinds.INT, getattr(kind, value))
+            for name, kind in _LIMITED.items()
+            for end, value in (("MIN", "least"), ("MAX", "most"))
+            if kind.signed or end == "MAX"
+        },
+        ("FLT_MIN",): (kinds.FLOAT, 1.1754943508222875e-38),
         ("INFINITY",): (kinds.FLOAT, math.inf),
         ("HUGE_VAL",): (kinds.DOUBLE, math.inf),
         ("NAN",): (kinds.FLOAT, math.nan),
-        ("INT_MAX",): (kinds.INT, kinds.INT.most),
-        ("INT_MIN",): (kinds.INT, kinds.INT.least),
-        ("UINT_MAX",): (kinds.UINT, kinds.UINT.most),
-        ("LONG_MAX",): (kinds.LONG, kinds.LONG.most),
-        ("LONG_MIN",): (kinds.LONG, kinds.LONG.least),
         ("DBL_MAX",): (kinds.DOUBLE, 1.7976931348623157e308),
         ("DBL_MIN",): (kinds.DOUBLE, 2.2250738585072014e-308),
         ("DBL_EPSILON",): (kinds.DOUBLE, 2.220446049250313e-16),

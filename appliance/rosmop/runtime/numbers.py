@@ -3,10 +3,12 @@
 import math
 import struct
 from collections.abc import Callable
+from fractions import Fraction
 
 from appliance.rosmop.runtime.context import FaultError
 
 _F32 = struct.Struct("<f")
+_EXACT = 1 << 53
 _F32_LIMIT = 3.4028235677973366e38  # from here on the nearest float is infinite
 
 
@@ -16,6 +18,18 @@ def f32(value: float) -> float:
         result: float = _F32.unpack(_F32.pack(value))[0]
         return result
     return math.copysign(math.inf, value) if value == value else float(value)  # noqa: PLR0124  not NaN
+
+
+def f32_of_integer(value: int) -> float:
+    """The nearest 32-bit float. A double holds integers up to 2 to the 53rd; of a larger one the low bits are first
+    gathered into one, so that it is rounded only once.
+    """
+    if -_EXACT <= value <= _EXACT:
+        return f32(value)
+    size = abs(value)
+    low = size.bit_length() - 40
+    gathered = (size >> low | (size & (1 << low) - 1 != 0)) << low
+    return f32(gathered if value > 0 else -gathered)
 
 
 def truncate(value: float, least: int, most: int) -> int:
@@ -124,6 +138,30 @@ def trunc(value: float) -> float:
     return math.copysign(float(math.trunc(value)), value) if math.isfinite(value) else value
 
 
+def fma(left: float, right: float, added: float) -> float:
+    """C's `fma`: rounded once."""
+    if not (math.isfinite(left) and math.isfinite(right)):
+        return left * right + added
+    if not math.isfinite(added):
+        return added
+    exact = Fraction(left) * Fraction(right) + Fraction(added)
+    if not exact:
+        return left * right + added
+    try:
+        return float(exact)
+    except OverflowError:
+        return math.inf if exact > 0 else -math.inf
+
+
+def signbit(value: float) -> bool:
+    """C's `signbit`: of -0.0, too."""
+    return math.copysign(1.0, value) < 0
+
+
+def _inverse_hyperbolic_tangent(value: float) -> float:
+    return math.copysign(math.inf, value) if abs(value) == 1 else _total(math.atanh)(value)
+
+
 def fmin(left: float, right: float) -> float:
     """C's `fmin`: a number wins over NaN."""
     return right if left != left or right < left else left  # noqa: PLR0124  NaN
@@ -161,6 +199,10 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "sinh": (1, _hyperbolic_sine),
     "cosh": (1, _total(math.cosh)),
     "tanh": (1, math.tanh),
+    "asinh": (1, math.asinh),
+    "acosh": (1, _total(math.acosh)),
+    "atanh": (1, _inverse_hyperbolic_tangent),
+    "fma": (3, fma),
     "exp": (1, _total(math.exp)),
     "exp2": (1, lambda value: power(2.0, value)),
     "expm1": (1, _total(math.expm1)),

@@ -1,8 +1,10 @@
 """Strings: bytes, as in C++. They never change; a change of one character makes a new string."""
 
+import math
 import re
 
 from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, FaultError
+from appliance.rosmop.runtime.numbers import f32
 
 NOT_FOUND = (1 << 64) - 1
 """`std::string::npos`."""
@@ -189,17 +191,23 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
     value = int(b"".join(found.groups()), base)
+    if not least and -most <= value < 0:
+        return value + most + 1  # C++ wraps a negative number where an unsigned one is wanted
     if not least <= value <= most:
         raise FaultError(site, f"the number does not fit; it must be from {least} to {most}")
     return value
 
 
-def parse_floating(text: bytes, site: int) -> float:
-    """`std::stod`; a fault where C++ throws."""
+def parse_floating(text: bytes, bits: int, site: int) -> float:
+    """`std::stod`, `std::stof`; a fault where C++ throws."""
     found = _FLOATING.match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
-    return float(found[1])
+    value = float(found[1]) if bits == 64 else f32(float(found[1]))
+    digits = re.split(rb"[eE]", found[1])[0]
+    if digits[-1:] in b"0123456789." and (math.isinf(value) or (not value and digits.strip(b"+-0."))):
+        raise FaultError(site, f"the number does not fit into {'a double' if bits == 64 else 'a float'}")
+    return value
 
 
 def lenient_integer(text: bytes) -> int:

@@ -307,3 +307,46 @@ def test_one_check_finds_all_errors_of_an_action() -> None:
     """A wrong statement does not hide the next one."""
     findings = refused_action("y = 1;\nz = 2;\nif (x) { q = 3; }\nx = 5;")
     assert [finding.position.line for finding in findings] == [3, 4, 5]
+
+
+LIBRARY = [
+    ("%.9g", "fabsf(-1.5)", "1.5"),
+    ("%.9g", "sqrtf(2)", "1.41421354"),
+    ("%.9g", "std::sqrt(2.0f)", "1.41421354"),
+    ("%.9g", "powf(0.1, 2)", "0.0100000007"),
+    ("%d", "fabsf(0.1) == 0.1f", "1"),
+    ("%ld", "lround(2.5)", "3"),
+    ("%ld", "lround(-2.5)", "-3"),
+    ("%ld", "std::llround(1e300)", "9223372036854775807"),
+    ("%ld", "lrint(2.5)", "2"),
+    ("%.6g", "asinh(1) + acosh(2) + atanh(0.5)", "2.74764"),
+    ("%.17g", "fma(0.1, 10, -1)", "5.5511151231257827e-17"),
+    ("%d", "signbit(-0.0) + signbit(1.0) + std::signbit(-3)", "2"),
+    ("%lu", "ULONG_MAX", "18446744073709551615"),
+    ("%ld", "INT64_MAX", "9223372036854775807"),
+    ("%d", "UINT8_MAX + INT8_MIN + SHRT_MAX + CHAR_MAX", "33021"),
+    ("%.6g", "M_LN2 + M_LN10 + M_LOG2E + M_2_PI", "5.07505"),
+    ("%g", "FLT_MIN", "1.17549e-38"),
+    ("%lu", 'std::stoul("-1")', "18446744073709551615"),
+    ("%lu", 'std::stoul("18446744073709551615")', "18446744073709551615"),
+    ("%s", 'std::stoul("-18446744073709551616")', "fault"),
+    ("%s", 'std::stoi("-2147483649")', "fault"),
+    ("%f", 'std::stod("1e400")', "fault: the number does not fit"),
+    ("%f", 'std::stod("-1e400")', "fault: the number does not fit"),
+    ("%f", 'std::stod("1e-400")', "fault: the number does not fit"),
+    ("%f", 'std::stof("1e39")', "fault: the number does not fit"),
+    ("%f", 'std::stod("inf")', "inf"),
+    ("%g", 'std::stof("1e38")', "1e+38"),
+    ("%g", 'std::stod("0e-400")', "0"),
+    ("%.9g", "(float) 9007199791611905L", "9.00720033e+15"),
+    ("%.9g", "(float) (x + 9007199791611905L)", "9.00720033e+15"),
+    ("%.9g", "(float) (x - 9007199791611905L)", "-9.00720033e+15"),
+    ("%.9g", "(float) (x + 18446744073709551615ul)", "1.84467441e+19"),
+]
+
+
+@pytest.mark.parametrize(("conversion", "expression", "value"), LIBRARY)
+def test_the_library(conversion: str, expression: str, value: str) -> None:
+    """Functions and constants of <math.h>, <climits>, <cstdint>, <cfloat> and <string> are C++'s; what throws faults."""
+    conversion = "%d" if value == "fault" else conversion
+    assert shown(expression, conversion=conversion).startswith(value)

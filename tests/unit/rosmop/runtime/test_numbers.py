@@ -1,8 +1,10 @@
 """Numbers of the runtime: compared with `struct`, with C's library, and with exact arithmetic."""
 
 import ctypes
+import itertools
 import math
 import struct
+from fractions import Fraction
 
 import pytest
 from hypothesis import given
@@ -21,6 +23,18 @@ def test_a_float_is_what_c_makes_of_a_double(value: float) -> None:
     assert struct.pack("d", result) == struct.pack("d", expected) or (
         math.isnan(result) and math.isnan(expected)
     )
+
+
+@given(st.integers(-(2**63), 2**64 - 1))
+def test_an_integer_becomes_the_nearest_float(value: int) -> None:
+    """It is rounded once, not to a double first."""
+    result = numbers.f32_of_integer(value)
+    assert numbers.f32(result) == result
+    step = max(2.0 ** (abs(value).bit_length() - 24), 1.0)
+    distance = abs(Fraction(result) - value)
+    assert distance <= Fraction(step) / 2
+    if distance == Fraction(step) / 2:
+        assert result / step % 2 == 0
 
 
 @given(st.integers(), st.sampled_from([8, 16, 32, 64]), st.booleans())
@@ -66,7 +80,7 @@ def test_a_function_of_math_is_that_of_the_c_library(name: str) -> None:
         math.nan,
     )
     for left in values:
-        for arguments in [(left,)] if count == 1 else [(left, right) for right in values]:
+        for arguments in [(left, *others) for others in itertools.product(values, repeat=count - 1)]:
             mine, expected = function(*arguments), theirs(*arguments)
             same = math.isclose(mine, expected, rel_tol=1e-13, abs_tol=1e-300) or (
                 math.isnan(mine) and math.isnan(expected)
