@@ -144,7 +144,9 @@ def _draw(properties: list[CompiledProperty], dot: Path | None, svg: Path | None
             continue
         picture = draw(properties)
         if picture is None:
-            raise usage_error("there is no property whose monitor is a finite automaton, so nothing to draw")
+            text = "no property's monitor is a finite automaton: there is nothing to draw"
+            typer.echo(f"rosrv monitor: {text}, and {path} is not written", err=True)
+            continue
         try:
             path.write_text(picture, encoding="utf-8")
         except OSError as error:

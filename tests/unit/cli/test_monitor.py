@@ -178,8 +178,17 @@ def test_automata_as_pictures(tmp_path: Path) -> None:
     drawn = svg.read_text()
     assert drawn.startswith("<svg ")
     assert "tick" in drawn
+
+
+def test_what_has_no_automaton_is_right_all_the_same(tmp_path: Path) -> None:
+    """The exit status is about the specification; that there is nothing to draw is said, and no file written."""
     raw = write(tmp_path, "raw.rv", "a() { event e() /t std_msgs/Empty '{}' { } }")
-    assert invoke("check", raw, "--svg", svg).exit_code == 2
+    for option in ("--svg", "--dot"):
+        result = invoke("check", raw, option, tmp_path / "a.picture")
+        assert result.exit_code == 0
+        assert "nothing to draw" in result.stderr
+        assert not (tmp_path / "a.picture").exists()
+    assert invoke("check", write(tmp_path, "bad.rv", BAD), "--dot", tmp_path / "a.picture").exit_code == 1
 
 
 # run

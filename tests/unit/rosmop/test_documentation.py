@@ -52,8 +52,9 @@ def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> N
 
 
 def test_every_function_of_the_library_is_on_the_page() -> None:
-    """Also those that come from several headers."""
+    """Also those that come from several headers; those on `float` are one rule."""
     words = set(re.findall(r"\w+", PAGE))
+    words |= {f"{name}f" for name in MATH} if "(also as `sqrtf`, …)" in PAGE else set()
     assert (
         set(LIBRARY) - words - {"labs", "llabs", "stoll", "stoull", "atol", "strcmp", "strlen", "nearbyint"}
         == set()
