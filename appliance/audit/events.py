@@ -57,7 +57,7 @@ EVENTS: dict[str, str] = {
     "malformed": "A peer sent what is no request, or a publisher what is no header; it was refused: see `reason`.",
     "connection opened": "A subscriber or service client is connected through the relay.",
     "connection closed": "A connection through the relay ended.",
-    "connection refused": "Somebody connected without a grant or with a wrong header, or a publisher refused the relay.",
+    "connection refused": "Somebody connected without a grant or with a wrong header, or a publisher refused us.",
     "limit exceeded": "A peer sent more, larger or faster than the limits allow.",
     "probe failed": "The hidden ROS Master could be reached from outside; nodes are not served meanwhile.",
     "probe passed": "The ROS Master is hidden (again).",
