@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host
+from appliance.network.lab import Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.requirements import needs
@@ -76,6 +76,33 @@ def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that
     appliance.rosrv("policy", "rollback")
     after = listener.mark()
     listener.wait_for(event="received", publisher="/voice", since=after)
+
+
+@pytest.mark.parametrize("client", ["rospy", "roscpp"])
+def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
+    lab: Lab, robot: Host, tmp_path: Path, client: Client
+) -> None:
+    """It is lost, the policy changes, it goes on: nothing of the topic goes through it until a rollback."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    config = tmp_path / "appliance.yaml"
+    config.write_text("liveness: {interval: 0.5, silent: 2}\n")
+    with (
+        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance,
+        RosSession(appliance.master_uri, tmp_path, robot) as ros,
+    ):
+        listener = ros.listener("rospy", "/chatter")
+        voice = ros.talker(client, "/chatter", name="voice")
+        listener.wait_for(event="received")
+        voice.popen.send_signal(signal.SIGSTOP)
+        wait_until(lambda: appliance.audit("--event", "node lost", caller_id="/voice"))
+        appliance.reload(NO_CHATTER)
+        assert appliance.audit("--event", "revoked", caller_id="/voice", resource="/chatter")
+        voice.popen.send_signal(signal.SIGCONT)
+        wait_until(lambda: appliance.audit("--event", "node returned", caller_id="/voice"))
+        assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0]
+        appliance.rosrv("policy", "rollback")
+        after = listener.mark()
+        listener.wait_for(event="received", publisher="/voice", since=after)
 
 
 def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
