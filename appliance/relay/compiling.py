@@ -48,8 +48,8 @@ class Compiler:
 
     @property
     def busy(self) -> bool:
-        """Whether something is being compiled."""
-        return self._thread is not None
+        """Whether something is being compiled, or waits for it."""
+        return self._thread is not None or bool(self._waiting)
 
     def close(self) -> None:
         """Wait for the one that is being compiled; its result is nobody's."""
@@ -79,7 +79,7 @@ class Compiler:
         os.close(self._wake)
         self._thread = None
         self._done(self._waiting.popleft(), self._result)
-        if self._waiting:
+        if self._waiting and self._thread is None:  # `done` may have brought others, and begun
             self._begin()
 
     def _compile(self, message: SpecificationsStated) -> Result:

@@ -223,6 +223,21 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
     assert world.engine._middle.wants("/late")
 
 
+def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_order(world: Monitored) -> None:
+    """What waited for the first may be others, and the same again."""
+    other = GUARD.replace("/chatter", "/other")
+    for revision, text in enumerate((GUARD, other, GUARD, "nonsense", other, other), 1):
+        world.control.send(SpecificationsStated(revision, [("0.rv", text)], {}, {}, True, statement=revision))
+    world.link.catch_up()
+    world.until(lambda: any(getattr(one, "revision", 0) == 6 for one in world.told))
+    answers = [one for one in world.told if isinstance(one, SpecificationsTaken | SpecificationsRefused)]
+    assert [one.statement for one in answers] == [1, 2, 3, 4, 5, 6]
+    assert isinstance(answers[3], SpecificationsRefused)
+    assert world.engine._middle.wants("/other")
+    assert not world.engine._middle.wants("/chatter")
+    assert isinstance(world.load(GUARD, revision=7), SpecificationsTaken)
+
+
 @pytest.mark.parametrize("text", [GUARD.replace("/chatter", "/late"), "nonsense"])
 def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
     world: Monitored, monkeypatch: pytest.MonkeyPatch, text: str
