@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
 
-from appliance.master.http import Peer
+from appliance.master.http import Peer, plain_address
 from appliance.policy.model import Address
 
 _log = structlog.get_logger()
@@ -19,13 +19,19 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 class Addresses:
-    """`advertised` are (network, address) pairs; `route_to(host)` asks for a translated address, if that can be."""
+    """`advertised` are (network, address) pairs; `route_to(host)` asks for a translated address, if that can be.
+
+    `listen` is the address that RVMaster, the faces and the relay listen on.
+    """
 
     def __init__(
         self,
         advertised: Sequence[tuple[Network, Address]],
         route_to: Callable[[str], Awaitable[str | None]] | None,
+        listen: str,
     ) -> None:
+        address = plain_address(listen)
+        self._listen = None if address.is_unspecified else str(address)
         self._advertised = advertised
         self._route_to = route_to
         self._routes: dict[Address, str | None] = {}
@@ -35,7 +41,8 @@ class Addresses:
         for network, address in self._advertised:
             if peer.host in network:
                 return str(address)
-        return self._routes.get(peer.host) or peer.local
+        # The appliance's own nodes come to a listener of their own, on loopback, where nothing else may be.
+        return self._routes.get(peer.host) or self._listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
         """Find out how this peer reaches us, once; to be awaited before `told_to`."""

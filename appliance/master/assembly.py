@@ -199,6 +199,7 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
     addresses = Addresses(
         [(one.network, one.address) for one in settings.advertise],
         base.lifeline.route_to if settings.isolation == "netns" else None,
+        base.sockets[RVMASTER].getsockname()[0],
     )
     delivery = Delivery(
         timeout=settings.limits.node_call_seconds,

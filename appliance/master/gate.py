@@ -13,7 +13,7 @@ from typing import cast
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Call, Caller, Identity, Touch
 from appliance.master.parameters import Tree, holds_others, standing_at
-from appliance.master.registry import Incarnation, Life, Registry
+from appliance.master.registry import Incarnation, Kind, Life, Registry
 from appliance.policy import Policy
 from appliance.policy.model import Category, Decision, Request
 from appliance.ros.xmlrpc import Value
@@ -53,7 +53,7 @@ class Gate:
         self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
     ) -> Decision | Contest:
         """Whether `caller` may make this call with these canonical arguments, while `tree` are the parameters."""
-        if caller.own:
+        if caller.own or self._is_own_subscriber(caller, call, arguments):
             return Decision(True, None, "the appliance's own node")
         decision = self._by_policy(caller, call, arguments, tree)
         if not decision.allowed:
@@ -146,8 +146,7 @@ class Gate:
         holder = self._registry.holder(caller.caller_id)
         if holder is None:
             return decision
-        # The appliance's own nodes call RVMaster on a listener of their own, but others' outer faces as everybody does.
-        if holder.own and (caller.target is None or holder.host != caller.peer.host):
+        if holder.own:  # without isolation the robot's nodes have its address
             return _no(f"the name {holder.name} belongs to the appliance")
         if holder.host == caller.peer.host:
             return decision
@@ -156,6 +155,16 @@ class Gate:
                 return decision
             return Contest(holder, decision)
         return _no(f"{caller.caller_id} is held by {holder.host}; {caller.peer.host} cannot speak for it")
+
+    def _is_own_subscriber(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> bool:
+        """Whether a node of the appliance asks another node, at its outer face, for a topic that it subscribed to.
+
+        RVMaster has a listener for the appliance's own nodes, the faces have not.
+        """
+        if caller.target is None or call.category is not Category.SUBSCRIBE or not caller.peer.here:
+            return False
+        holder = self._registry.holder(caller.caller_id)
+        return holder is not None and holder.own and (Kind.SUBSCRIPTION, arguments[0]) in holder.registrations
 
     # --- limits ---
 

@@ -72,6 +72,11 @@ class Peer:
     text: str
     local: str
 
+    @property
+    def here(self) -> bool:
+        """Whether the peer is on this machine."""
+        return self.host.is_loopback or self.text == self.local
+
 
 @dataclass(frozen=True, slots=True)
 class HttpRequest:

@@ -166,6 +166,12 @@ def test_name_of_the_appliances_own_node(field: Field) -> None:
     field.denied(answer, "the name /rosout belongs to the appliance")
 
 
+def test_what_nodes_log_is_collected(field: Field) -> None:
+    """The rosout aggregator hears every node, though the policy names neither it nor this machine."""
+    for name in ("voice", "ear"):
+        field.recorded(f"is connected to /rosout of /{name}", event="connection opened", caller_id="/rosout")
+
+
 @pytest.mark.parametrize("method", ["getPid", "getName", "getUri", "getMasterUri", "getBusInfo", "getBusStats",
                                     "getSubscriptions", "getPublications"])  # fmt: skip
 def test_speaking_for_a_node_to_a_node(field: Field, method: str) -> None:

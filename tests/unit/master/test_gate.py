@@ -165,14 +165,27 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
-    """The rosout aggregator subscribes at other nodes' outer faces; from another machine nobody does in its name."""
-    policy = compile_policy("[Nodes]\ndefault = *\n[Subscribers]\ndefault = *\n", file="test.ini")
-    here = Gate(lambda: policy, held("/rosout", "127.0.0.1", own=True), HostLimits())
+    """The rosout aggregator subscribes at other nodes' outer faces, whatever the policy says of this machine.
+
+    From another machine nobody does in its name; and on this one nobody asks in its name for anything else.
+    """
+    policy = compile_policy(
+        f"[Nodes]\ndefault = {OPERATOR}\n[Subscribers]\ndefault = {OPERATOR}\n", file="p.ini"
+    )
+    registry = held("/rosout", "127.0.0.1", own=True)
+    aggregator = registry.holder("/rosout")
+    assert aggregator is not None
+    registry.register(aggregator, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
+    here = Gate(lambda: policy, registry, HostLimits())
     uri = parse_node_uri(API)
     other = Incarnation("other", "/voice", ipaddress.ip_address(OPERATOR), uri, API, OPERATOR, 19003, 19004)
-    for host, allowed in (("127.0.0.1", True), (OPERATOR, False)):
-        peer = Peer(ipaddress.ip_address(host), host, "127.0.0.1")
-        caller = Caller(peer, "/rosout", 0, target=other)
-        decision = here.decide(caller, NODE_CALLS["requestTopic"], ("/rosout", [["TCPROS"]]), {})
+    for host, local, topic, allowed in (
+        ("127.0.0.1", "127.0.0.1", "/rosout", True),
+        ("10.0.0.1", "10.0.0.1", "/rosout", True),
+        ("127.0.0.1", "127.0.0.1", "/chatter", False),
+        (OPERATOR, "10.0.0.1", "/rosout", False),
+    ):
+        caller = Caller(Peer(ipaddress.ip_address(host), host, local), "/rosout", 0, target=other)
+        decision = here.decide(caller, NODE_CALLS["requestTopic"], (topic, [["TCPROS"]]), {})
         assert isinstance(decision, Decision)
         assert decision.allowed is allowed
