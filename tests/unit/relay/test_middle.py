@@ -236,6 +236,8 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
     assert world.engine._middle.wants("/other")
     assert not world.engine._middle.wants("/chatter")
     assert isinstance(world.load(GUARD, revision=7), SpecificationsTaken)
+    for _ in range(20):  # nothing is left that the loop is woken for
+        world.loop.turn(0.01)
 
 
 @pytest.mark.parametrize("text", [GUARD.replace("/chatter", "/late"), "nonsense"])
