@@ -146,8 +146,10 @@ class Scope:
     def around(self, loop: Loop) -> Iterator[None]:
         """Names are those that the loop sees."""
         inner, self._blocks = self._blocks, loop.blocks
-        yield
-        self._blocks = inner
+        try:
+            yield
+        finally:
+            self._blocks = inner
 
     def declare(self, variable: Variable) -> None:
         """A name of the innermost block."""
@@ -204,15 +206,19 @@ class Scope:
         """Lines written inside belong to this node."""
         before = self.lines.site
         self.lines.site = self.site(node)
-        yield
-        self.lines.site = before
+        try:
+            yield
+        finally:
+            self.lines.site = before
 
     @contextmanager
     def indented(self) -> Iterator[None]:
         """Lines written inside are one step deeper."""
         self.lines.depth += 1
-        yield
-        self.lines.depth -= 1
+        try:
+            yield
+        finally:
+            self.lines.depth -= 1
 
     def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object]]]:
         seen: set[str] = set()

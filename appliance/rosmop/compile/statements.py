@@ -27,11 +27,13 @@ LARGE = 4096
 
 def write(scope: Scope, node: tree.Statement) -> None:
     """Write the lines of a statement."""
+    around = len(scope.loops)
     try:
         with scope.at(node):
             _KINDS[type(node)](scope, node)
     except SpecificationError as error:
         scope.shared.findings += error.findings
+        del scope.loops[around:]
 
 
 # Declarations

