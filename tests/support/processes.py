@@ -122,6 +122,12 @@ class Process:
         line = self.wait_for(lambda event: text in event.get("text", ""), timeout=timeout, since=since)
         return str(line["text"])
 
+    def wait_for_error(self, text: str, *, timeout: float = LIMIT) -> None:
+        """Wait until a line that contains `text` is on its standard error."""
+        with self._changed:
+            there = self._changed.wait_for(lambda: any(text in line for line in self.errors), timeout)
+        assert there, f"it did not say {text!r} within {timeout:.0f} s\n{self.story()}"
+
     def wait_for_count(self, count: int, *, timeout: float = LIMIT, **fields: Any) -> list[Event]:
         """The first `count` events that have these fields."""
         position = 0
@@ -225,7 +231,9 @@ class Process:
     def _read_errors(self) -> None:
         assert self.popen.stderr is not None
         for line in self.popen.stderr:
-            self.errors.append(line.rstrip("\n"))
+            with self._changed:
+                self.errors.append(line.rstrip("\n"))
+                self._changed.notify_all()
 
 
 def _event(line: str) -> Event:

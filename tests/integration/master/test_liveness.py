@@ -1,12 +1,17 @@
 """Tests of which nodes the appliance takes for gone."""
 
 import os
+import signal
 import xmlrpc.client
 from pathlib import Path
 
+import pytest
+
 from appliance.network.lab import Host, Lab
 from tests.support.appliance import ROSRV, Appliance
+from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process, ThisMachine
+from tests.support.requirements import needs
 
 MONITORS = Path(__file__).parents[3] / "monitors"
 NOBODY = "http://10.77.0.10:1/"
@@ -36,3 +41,29 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
         finally:
             tail.stop()
         assert [record["caller_id"] for record in appliance.audit("--event", "node lost")] == ["/brief"]
+
+
+@pytest.mark.parametrize("client", ["rospy", "roscpp"])
+def test_a_subscriber_that_stood_still_for_a_moment_hears_of_who_came(
+    lab: Lab, robot: Host, tmp_path: Path, client: Client
+) -> None:
+    """Every try to tell it of a new publisher failed, and it was never lost: it is told when it goes on."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    config = tmp_path / "appliance.yaml"
+    config.write_text("limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n")
+    with (
+        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance,
+        RosSession(appliance.master_uri, tmp_path, robot) as ros,
+    ):
+        listener = ros.listener(client, "/chatter")
+        ros.talker("rospy", "/chatter", name="first")
+        listener.wait_for(event="received", publisher="/first")
+        listener.popen.send_signal(signal.SIGSTOP)
+        try:
+            ros.talker("rospy", "/chatter", name="second")
+            assert appliance.process is not None
+            appliance.process.wait_for_error("a node could not be told")
+        finally:
+            listener.popen.send_signal(signal.SIGCONT)
+        listener.wait_for(event="received", publisher="/second")
+        assert appliance.audit("--event", "node lost") == []
