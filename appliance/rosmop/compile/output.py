@@ -58,11 +58,13 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> str:
                 template.position,
                 f"`{found[0].decode('utf-8', 'replace')}` has no argument; for a percent sign write `%%`",
             )
-        piece, code = _conversion(scope, found, waiting.pop(0), template.position)
+        value = waiting.pop(0)
+        piece, code = _conversion(scope, found, value, template.position)
         pieces.append(piece)
         codes.append(code)
-        size += _longest(found)
-        strings = strings or piece[-1:] == b"s"
+        known = isinstance(value.constant, bytes)
+        size += _longest(found) + (len(code) if known else 0)
+        strings = strings or (piece[-1:] == b"s" and not known)
     if waiting:
         raise SpecificationError.at(
             waiting[0].position, "this argument has no conversion in the format, such as `%f` or `%s`"
