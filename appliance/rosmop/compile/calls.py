@@ -115,6 +115,7 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
             node.position,
             f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
         )
+    scope.calls.add(function.name)
     codes, targets = [], []
     for argument, parameter in zip(node.arguments, function.parameters, strict=True):
         value = value_of(scope, argument)

@@ -212,7 +212,7 @@ def _body(
                 scope.lines.add(f"if not {condition(value_of(scope, when))}: return False")
             except SpecificationError as error:
                 scope.shared.findings += error.findings
-        if scope.changes:
+        if scope.changes_anything():
             raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
     conditions, scope.lines = scope.lines, Lines()
     scope.lines.site = own.site

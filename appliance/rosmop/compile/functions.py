@@ -181,7 +181,8 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
             shared.module.fresh("v"),
             parameter.position,
             constant=parameter.type.constant and parameter.type.reference,
-            copied=kind == kinds.CHARACTERS and not parameter.type.reference,
+            copied=(kind == kinds.CHARACTERS and not parameter.type.reference)
+            or parameter.type.name == ("[]",),
         )
         parameters.append(variable)
         if parameter.type.reference and not parameter.type.constant:
@@ -243,6 +244,7 @@ def compile_function(shared: Shared, names: SpecificationNames, function: Helper
         zero = "None" if isinstance(function.result, kinds.Void) else scope.codecs.zero(function.result)
         handed = "".join(f", {variable.code}" for variable in function.references)
         scope.lines.add(f"return ({zero}{handed})" if handed else f"return {zero}")
+    function.changes, function.calls = scope.changes_shared, frozenset(scope.calls)
     parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
     _add(scope, f"def {function.code}({', '.join(parameters)}):")
 

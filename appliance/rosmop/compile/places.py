@@ -25,7 +25,7 @@ class Variable:
     flag: str | None = None
     alias: "Value | None" = None
     copied: bool = False
-    """A `char *` that holds a copy of another's characters, where C++'s would point to them."""
+    """A `char *` or `T name[]` that holds a copy of another's elements, where C++'s would point to them."""
     used: bool = False
     assigned: bool = False
 

@@ -33,6 +33,9 @@ class HelperFunction:
     node: tree.Function
     recursive: bool = False
     names: frozenset[str] = frozenset()
+    changes: bool = False
+    """It assigns a shared variable."""
+    calls: frozenset[str] = frozenset()
 
 
 @dataclass(eq=False)
@@ -121,6 +124,8 @@ class Scope:
         self.loops: list[Loop] = []
         self.written: set[str] = set()
         self.changes = False  # something was assigned
+        self.changes_shared = False  # a shared variable was
+        self.calls: set[str] = set()  # the helper functions that are called
         self.recursive = False
         self.misdeclared: set[str] = set()  # local names whose declarations are refused
         self._blocks: list[dict[str, Variable]] = [{}]
@@ -177,6 +182,17 @@ class Scope:
             raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
         own = self.names.variables.get(name)
         return own or self.shared.foreign(self.names, name, position)
+
+    def changes_anything(self) -> bool:
+        """Whether what was written so far assigns something, itself or in a function that it calls."""
+        waiting, seen = list(self.calls), set(self.calls)
+        while waiting:
+            function = self.names.functions[waiting.pop()]
+            if function.changes:
+                return True
+            waiting += function.calls - seen
+            seen |= function.calls
+        return self.changes
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
         """The refusal of a name that nothing has."""

@@ -37,13 +37,13 @@ def require_place(target: Value, what: str) -> Place:
 
 
 def require_original(target: Value) -> None:
-    """Refuse to write into a `char *` that is a copy: in C++ that would change what it was copied from."""
+    """Refuse to write into a `char *` or `T name[]` that is a copy: C++ would change what it was copied from."""
     variable = root(target)
     if variable is not None and variable.copied:
         raise SpecificationError.at(
             target.position,
             f"`{variable.name}` is a copy here, and its original would not change; use a `std::string`"
-            " (as a parameter: `std::string&`)",
+            " or `std::vector` (as a parameter: a reference to one)",
         )
 
 
@@ -80,6 +80,9 @@ def mark(scope: Scope, target: Value) -> str | None:
     scope.changes = True
     if variable is None:
         return None
+    scope.changes_shared = scope.changes_shared or variable.shared
+    if not isinstance(target.place, VariablePlace) or target.place.variable.alias is not None:
+        require_original(target)
     variable.assigned = variable.used = True
     return variable.flag
 
@@ -101,8 +104,6 @@ def _store_part(scope: Scope, place: Place, code: str) -> str:
     """Strings and times do not change in place: the whole is stored anew."""
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner = require_place(place.base, "an assignment")
-    if isinstance(place.base.type, kinds.Characters):
-        require_original(place.base)
     if not place.base.pure:
         raise SpecificationError.at(
             place.base.position, "too much in one step; put the index into a variable first"

@@ -137,7 +137,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def array_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
         kind, name = children
-        array = tree.TypeName(kind.position, ("std", "vector"), element=kind)
+        array = tree.TypeName(kind.position, ("[]",), element=kind)
         return tree.Parameter(self.at(meta), array, str(name))
 
     array_parameter_behind = array_parameter

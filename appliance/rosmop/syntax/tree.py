@@ -21,7 +21,7 @@ class Node:
 
 @dataclass(frozen=True)
 class TypeName(Node):
-    """A type as written: `name` is ("unsigned", "int"), ("std", "string"), ("std", "vector"), ("auto",), …
+    """A type as written: `name` is ("unsigned", "int"), ("std", "string"), ("std", "vector"), ("[]",), ("auto",), …
 
     `element` is that of a vector or of an array `T[]`. `pointer` stands for `char *`, `reference` for `&`.
     """

@@ -479,12 +479,16 @@ def test_an_unknown_type_is_answered_with_the_nearest() -> None:
     assert "--msg DIR" in finding.text
 
 
-@pytest.mark.parametrize("when", ["n++ > 0", "(n = 1) > 0", "v[0]++ > 0", "(m.data = 1) == 1"])
+@pytest.mark.parametrize(
+    "when", ["n++ > 0", "(n = 1) > 0", "v[0]++ > 0", "(m.data = 1) == 1", "f()", "g()", "h(n)"]
+)
 def test_a_condition_changes_nothing(when: str) -> None:
     """`when` only looks, at parameters and at shared variables."""
-    before = "int n; std::vector<int> v; std_msgs::Int32 m;"
+    before = """int n; std::vector<int> v; std_msgs::Int32 m; bool g() { return f() && n; }
+        bool f() { v.push_back(1); return true; } bool h(int& a) { return true; } bool i() { int a = n; return a++; }"""
     text = f"s() {{ {before} event e() /t std_msgs/Int32 '{{}}' when ({when}) {{ }} }}"
     assert refused(text)[0].text == "`when` only looks; assign in the action"
+    assert process(text.replace(f"({when})", "(i() || true)"), message("std_msgs/Int32")).events == ("s.e",)
 
 
 def test_a_constant_of_a_message_may_be_named_through_a_variable() -> None:

@@ -270,6 +270,9 @@ ALIASES = [
     ("void f(char * c) { c[0]++; }", "", "`c` is a copy"),
     ("", 'char c[5]; char * d = c; sprintf(d, "x");', "`d` is a copy"),
     ("", "char c[5]; char * d; d = c; d[1] = 'x';", "`d` is a copy"),
+    ("void f(int a[]) { a[0] = 1; }", "", "`a` is a copy"),
+    ("void f(int[] a) { a[0]++; }", "", "`a` is a copy"),
+    ("void f(int a[]) { for (int& e : a) e = 1; }", "", "`a` is a copy"),
     ("char c[5]; char * d; init() { d = c; }", 'strcat(d, "x");', "`d` is a copy"),
 ]
 
@@ -287,6 +290,12 @@ NO_ALIASES = [
     ("int n; void f(int& n) { n = 4; }", 'f(n); ROS_INFO("%d", n);', "4"),
     ("int n; void f(int a) { n = a + 1; }", 'f(n); ROS_INFO("%d", n);', "1"),
     ('void f(char *& c) { strcpy(c, "x"); }', 'char * c = new char[3]; f(c); ROS_INFO("%s", c);', "x"),
+    ("int f(int a[]) { return a[0]; }", 'int q[2]; q[0] = 3; ROS_INFO("%d", f(q));', "3"),
+    (
+        "int f(std::vector<int> a) { a[0]++; return a[0]; }",
+        'std::vector<int> q{3}; ROS_INFO("%d", f(q));',
+        "4",
+    ),
     ("int f(char * c) { c = new char[3]; return strlen(c); }", 'char c[2]; ROS_INFO("%d", f(c));', "0"),
     ("", "char c[5]; char * d = new char[5]; d[0] = 'y'; strcpy(c, d); ROS_INFO(\"%s\", c);", "y"),
 ]
