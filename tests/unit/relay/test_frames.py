@@ -60,7 +60,9 @@ def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int
     """Nothing is lost, repeated or torn, and each batch says where its last frame begins."""
     data = b"".join(frame(size, index) for index, size in enumerate(lengths))
     one, budget = receiver()
-    batches = feed(one, data, [*cuts, max(cuts[-1], len(data) // 2000)])  # millions of single bytes add nothing
+    batches = feed(
+        one, data, [*cuts, max(cuts[-1], len(data) // 2000)]
+    )  # millions of single bytes add nothing
     assert b"".join(view for view, _messages, _last in batches) == data
     assert sum(messages for _view, messages, _last in batches) == len(lengths)
     for view, _messages, last in batches:
