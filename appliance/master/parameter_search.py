@@ -59,9 +59,8 @@ def _next_readable(master: "Master", key: str, places: dict[str, Decision], hidd
     levels = len([part for part in key.split("/") if part])
     names = list(places)
     for name in names[names.index(hidden) + 1 :]:
-        first = "/".join(
-            name.split("/")[: -levels + 1 or None]
-        )  # it is enough that the key's first part is there
+        # It is enough that the key's first part is there.
+        first = "/".join(name.split("/")[: -levels + 1 or None])
         if places[name].allowed and standing_at(master.parameters.tree, first)[0] is not None:
             return name
     return None

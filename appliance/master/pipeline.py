@@ -281,9 +281,8 @@ class Pipeline:
             return [0, denial_text(decision, record), call.denial]
         answer = await self._perform(call, caller, arguments)
         lasts = call.identity is Identity.NODE or call.category is Category.CALL
-        if (
-            lasts and self._master.policy() is not policy
-        ):  # it has waited: what it left may be allowed no longer
+        if lasts and self._master.policy() is not policy:
+            # It has waited: what it left may be allowed no longer.
             self._master.redecide_for(caller.peer.host, caller.caller_id)
         return answer
 

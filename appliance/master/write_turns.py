@@ -32,9 +32,8 @@ class WriteTurn:
 
     def __init__(self, turns: "dict[WriteTurn, None]", keys: tuple[str, ...]) -> None:
         self._turns = turns
-        self._keys = (
-            keys  # each with a slash at its end: a key is above another if it is how the other begins
-        )
+        # Each with a slash at its end: a key is above another if it is how the other begins.
+        self._keys = keys
         self._done: asyncio.Event | None = None  # made for who waits for this one
 
     async def __aenter__(self) -> None:
