@@ -82,7 +82,7 @@ class Peer:
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self.sock = sock
-        self.data = b""
+        self.data = bytearray()
         self.ended = False
 
     def send(self, data: bytes) -> None:
@@ -104,9 +104,9 @@ class Peer:
     def header(self) -> dict[str, str] | None:
         """The header in what has come, taken off when it is whole."""
         parser = HeaderParser()
-        fields = parser.feed(self.data)
+        fields = parser.feed(bytes(self.data))
         if fields is not None:
-            self.data = parser.rest
+            self.data = bytearray(parser.rest)
         return fields
 
     def reset(self) -> None:
@@ -224,7 +224,7 @@ class World:
 
         self.until(whole)
         assert peer.data == data
-        peer.data = b""
+        peer.data.clear()
 
     def ends(self, peer: Peer) -> bytes:
         """The peer's connection is closed by the relay; what came before."""
@@ -234,7 +234,7 @@ class World:
             return peer.ended
 
         self.until(ended)
-        return peer.data
+        return bytes(peer.data)
 
     def upstream(self, header: dict[str, str] = HEADER) -> Peer:
         """Answer the relay's question for the publisher, and its header."""

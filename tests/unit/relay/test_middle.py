@@ -59,7 +59,7 @@ def string(text: str) -> bytes:
 def data_of(peer: Peer) -> bytes:
     """Everything the peer has been sent."""
     peer.read()
-    return peer.data
+    return bytes(peer.data)
 
 
 class Monitored(World):
