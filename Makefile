@@ -25,7 +25,8 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(BIN)/mypy
 	$(BIN)/mypy tests benchmarks
 	$(BIN)/lint-imports
-	$(PYTEST) tests/unit -n 2 --quiet
+	@# Four at a time on two cores: many wait for something.
+	$(PYTEST) tests/unit -n 4 --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
 	@# Two at a time. What fails while the machine is busy with another test is tried once more, alone, and both are shown.

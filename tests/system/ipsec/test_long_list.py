@@ -12,7 +12,7 @@ from appliance.ipsec.authority import Authority
 from appliance.network.lab import Lab
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
-from tests.support.tunnel_site import OCU, TunnelSite
+from tests.support.tunnel_site import LONG, OCU, TunnelSite
 from tests.support.tunnels import JoinedHost, need_strongswan
 
 _FIRST = 1 << 70  # serial numbers are as long as the authority makes them
@@ -30,9 +30,12 @@ def test_tunnels_stand_with_thousands_of_revoked_certificates(tmp_path: Path) ->
         site.appliance.start()
         mark = site.mark
         with site.join(before):
-            refused = site.recorded(mark, event="tunnel refused")
+            refused = site.trail.wait_for(  # it may ask before the appliance's charon has its configuration
+                lambda event: event.get("event") == "tunnel refused" and "revoked" in event["reason"],
+                since=mark,
+                timeout=LONG,
+            )
             assert refused["host"] == OCU
-            assert "revoked" in refused["reason"]
         with site.joined(present) as joined:
             assert site.state() == "up"
             takes_such_a_list_itself(joined, tmp_path)
