@@ -27,5 +27,6 @@ async def find_endpoint(
         raise HostRefusedError(
             f"at which address the host reaches the appliance cannot be told: {found.reason}; give it:"
             " --appliance ADDRESS (REST: `endpoint`), or for all hosts `ipsec: {endpoint: ADDRESS}` in appliance.yaml"
+            " (compose: ROSRV_ENDPOINT=ADDRESS in .env)"
         )
     return {"endpoint": found.address, "reason": found.reason}
