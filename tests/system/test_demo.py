@@ -78,7 +78,7 @@ def test_the_console_of_the_demo_is_reached_from_this_machine() -> None:
         demo.wait_for_text("A LandShark of unmodified", timeout=LIMIT)
         said = demo.story()
         port = re.search(r"https://127\.0\.0\.1:(\d+)/", said)
-        token = re.search(r"rosrv_\w+", said)
+        token = re.search(r"rosrv_[\w-]+", said)
         assert port and token, said
         unverified = ssl._create_unverified_context()  # noqa: S323  its certificate is in the folder of the demo
         wanted = f"https://127.0.0.1:{port[1]}/v1/status"
