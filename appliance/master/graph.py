@@ -166,9 +166,8 @@ class Graph:
             elif registration.kind is Kind.SUBSCRIPTION:
                 self._tell_one(incarnation, registration.resource, always=True)
         for kind, topic in incarnation.shelf:
-            if (
-                kind is Kind.SUBSCRIPTION
-            ):  # taken while it was away, or before and it may not have heard of it
+            # Taken while it was away, or before and it may not have heard of it.
+            if kind is Kind.SUBSCRIPTION:
                 self._empty(incarnation, topic)
         self._recorder.happened(
             "node returned",

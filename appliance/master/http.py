@@ -31,12 +31,10 @@ from appliance.ros.xmlrpc import build_fault
 
 _log = structlog.get_logger()
 
-FIELD_FRAMING = len(
-    ": \r\n"
-)  # of a header field: a head of many short ones is as long as the bytes it came in
-_REQUEST_BYTES = (
-    400  # about what a request takes beside its body and its path: small ones may come by the thousand
-)
+# A head of many short fields is as long as the bytes it came in.
+_FIELD_FRAMING = len(": \r\n")
+# About what a request takes beside its body and its path: small ones may come by the thousand.
+_REQUEST_BYTES = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +317,7 @@ class _Connection(asyncio.Protocol):
         self._count_head(len(url))
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        self._count_head(len(name) + len(value) + FIELD_FRAMING)
+        self._count_head(len(name) + len(value) + _FIELD_FRAMING)
         if self._closing:
             return
         lowered = name.lower()

@@ -161,16 +161,7 @@ class Pipeline:
         why = (
             f"the answers to a multicall have more than {limit} bytes; {count} more parts are not carried out"
         )
-        record = self._master.recorder.happened(
-            "limit exceeded",
-            why,
-            severity=Severity.WARNING,
-            decision="deny",
-            host=caller.peer.text,
-            category=Category.COMMAND.value,
-            resource=_MULTICALL,
-        )
-        return [{"faultCode": _LIMIT_FAULT, "faultString": f"{why} [{record}]"}] * count
+        return [self._multicall_fault(caller, _LIMIT_FAULT, "limit exceeded", why)] * count
 
     async def _answer_run(self, calls: Mapping[str, Call], caller: Caller, run: list[Value]) -> list[Value]:
         """Each part is decided and recorded by itself; those that may be carried out are carried out in order."""
@@ -213,8 +204,12 @@ class Pipeline:
         return [await self._answer(calls, caller, *call)]
 
     def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:
+        return self._multicall_fault(caller, _PARSE_FAULT, "malformed", why)
+
+    def _multicall_fault(self, caller: Caller, code: int, event: str, why: str) -> dict[str, Value]:
+        """A fault in the place of a part's answer, recorded as this event."""
         record = self._master.recorder.happened(
-            "malformed",
+            event,
             why,
             severity=Severity.WARNING,
             decision="deny",
@@ -222,7 +217,7 @@ class Pipeline:
             category=Category.COMMAND.value,
             resource=_MULTICALL,
         )
-        return {"faultCode": _PARSE_FAULT, "faultString": f"{why} [{record}]"}
+        return {"faultCode": code, "faultString": f"{why} [{record}]"}
 
     async def _answer(
         self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]

@@ -6,7 +6,7 @@ were told and answer as a test has them answer. Nothing is sent over a network.
 
 import asyncio
 import ipaddress
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from appliance.master.allocation import SERVICE
 from appliance.master.arguments import ApiUri
@@ -23,7 +23,7 @@ from appliance.master.parameters import ParameterMirror, may_be_told
 from appliance.master.pipeline import Pipeline
 from appliance.master.reconcile import Reconciler
 from appliance.master.registration import withdraw_lost
-from appliance.master.registry import Incarnation, Kind, Registration, Registry, new_key
+from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.revocation import Revocation
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import compile_policy
@@ -308,6 +308,18 @@ class ControlParts:
         )
         cast(Any, liveness).client = self.clients.client
         return liveness
+
+    @classmethod
+    async def begun(cls) -> Self:
+        """Control after its first round."""
+        world = cls()
+        await world.round()
+        return world
+
+    @property
+    def lives(self) -> list[Life]:
+        """Where each incarnation stands."""
+        return [one.life for one in self.registry.all()]
 
     def node(self, name: str, number: int = 1) -> Incarnation:
         """A node on the robot that has registered nothing yet; `number` tells its lives apart."""

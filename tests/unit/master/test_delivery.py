@@ -15,12 +15,6 @@ pytestmark = pytest.mark.anyio
 LONG = [f"http://10.0.0.1:{19001 + number}/" for number in range(500)]
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 class Node:
     """The node that is called: it answers once `answers` is set, and fails while `fails`."""
 

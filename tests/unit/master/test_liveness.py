@@ -12,27 +12,9 @@ from tests.support.control_parts import OPEN, POLICY, ControlParts
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
-async def parts() -> ControlParts:
-    """Control after its first round."""
-    world = ControlParts()
-    await world.round()
-    return world
-
-
-def lives(world: ControlParts) -> list[Life]:
-    """Where each incarnation stands."""
-    return [one.life for one in world.registry.all()]
-
-
 async def test_a_service_has_one_provider_when_the_first_returns() -> None:
     """Another offered the service while its provider was away: it stays his, and no round swaps the two."""
-    world = await parts()
+    world = await ControlParts.begun()
     first, second = world.node("/a", 1), world.node("/b", 2)
     await world.register(first, Kind.SERVICE, "/s", "4101")
     await world.register(first, Kind.PUBLICATION, "/plain")
@@ -41,7 +23,7 @@ async def test_a_service_has_one_provider_when_the_first_returns() -> None:
     await world.register(second, Kind.SERVICE, "/s", "4102")
     world.clients.silent = set()
     await world.look(first)
-    assert lives(world) == [Life.LIVE, Life.LIVE]
+    assert world.lives == [Life.LIVE, Life.LIVE]
     assert [one.name for one in world.registry.registered(Kind.SERVICE, "/s")] == ["/b"]
     assert first.resources(Kind.PUBLICATION) == ["/plain"]
     for _ in range(3):
@@ -51,7 +33,7 @@ async def test_a_service_has_one_provider_when_the_first_returns() -> None:
 
 async def test_a_service_that_nobody_took_comes_back() -> None:
     """Without another provider a returned node has its service again."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/a")
     await world.register(node, Kind.SERVICE, "/s", "4101")
     world.clients.silent = {"/a"}
@@ -74,7 +56,7 @@ async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None
     world.clients.silent = {"/ear"}
     world.liveness.missed(ear, NodeCall("publisherUpdate", ("/t", [])))
     await world.settle()
-    assert (lives(world), world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
+    assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
     world.clients.silent = set()
     await world.look(ear)
     await world.look(ear)
@@ -83,7 +65,7 @@ async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None
 
 async def test_a_node_that_answers_and_takes_no_list_is_not_told_without_end() -> None:
     """It is told again once per look at it, not each time it fails."""
-    world = await parts()
+    world = await ControlParts.begun()
     ear = world.node("/ear", 1)
     await world.register(ear, Kind.SUBSCRIPTION, "/t")
     for _ in range(5):
@@ -94,7 +76,7 @@ async def test_a_node_that_answers_and_takes_no_list_is_not_told_without_end() -
 
 async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
     """The list of a topic that the policy took has nobody in it, also when it is told again."""
-    world = await parts()
+    world = await ControlParts.begun()
     ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
     await world.register(ear, Kind.SUBSCRIPTION, "/secret")
     await world.register(mouth, Kind.PUBLICATION, "/secret")
@@ -108,7 +90,7 @@ async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
 async def test_a_node_whose_every_registration_was_taken_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is away while it has nothing: like any other node it is kept, and gets back what is granted again."""
     monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)
-    world = await parts()
+    world = await ControlParts.begun()
     node, idle = world.node("/n", 1), world.node("/idle", 2)
     await world.register(node, Kind.PUBLICATION, "/secret")
     world.reload(POLICY.format("/secret=\n", ""))
@@ -120,14 +102,14 @@ async def test_a_node_whose_every_registration_was_taken_is_kept(monkeypatch: py
     world.reload(OPEN)
     world.clients.silent = set()
     await world.look(node)
-    assert lives(world) == [Life.LIVE]
+    assert world.lives == [Life.LIVE]
     assert world.hidden.has(Kind.PUBLICATION, "/secret") == ["/n"]
 
 
 @pytest.mark.parametrize("away", [False, True], ids=["there", "away"])
 async def test_who_had_a_name_before_gets_nothing_back(away: bool) -> None:
     """Everything was taken from a node, and another life has its name now: a rollback is for that one."""
-    world = await parts()
+    world = await ControlParts.begun()
     first, second = world.node("/n", 1), world.node("/n", 2)
     await world.register(first, Kind.PUBLICATION, "/secret")
     world.reload(POLICY.format("/secret=\n", ""))
@@ -147,7 +129,7 @@ async def test_who_had_a_name_before_gets_nothing_back(away: bool) -> None:
 
 async def test_a_node_that_returns_leaves_the_name_to_one_that_everything_was_taken_from() -> None:
     """Who holds a name by what the policy took from it is still who has the name, when all is granted again."""
-    world = await parts()
+    world = await ControlParts.begun()
     first, second = world.node("/n", 1), world.node("/n", 2)
     await world.register(first, Kind.PUBLICATION, "/plain")
     world.clients.silent = {"/n"}
@@ -165,7 +147,7 @@ async def test_a_node_that_returns_leaves_the_name_to_one_that_everything_was_ta
 
 async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
     """The answer comes in the moment in which ROSMaster is told that the node is lost: nothing of it is left out."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     for topic in ("/a", "/b", "/c"):
         await world.register(node, Kind.PUBLICATION, topic)
@@ -181,7 +163,7 @@ async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
 
 async def test_a_call_of_a_node_that_is_lost_meanwhile_brings_all_of_it_back() -> None:
     """The relays carry what it had, subscribers are told, and ROSMaster has it after the next round."""
-    world = await parts()
+    world = await ControlParts.begun()
     node, ear = world.node("/n", 1), world.node("/ear", 2)
     await world.register(ear, Kind.SUBSCRIPTION, "/a")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -197,7 +179,7 @@ async def test_a_call_of_a_node_that_is_lost_meanwhile_brings_all_of_it_back() -
 
 async def test_a_node_that_returns_while_the_master_is_new_is_told_by_the_rebuild() -> None:
     """Its call goes on: what it had comes with everything else, and the call itself waits at the door."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
     world.clients.silent = {"/n"}

@@ -75,12 +75,6 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
-@pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Desk]:
     """A folder with one specification."""
     desk = Desk(tmp_path)

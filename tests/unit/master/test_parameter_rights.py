@@ -13,12 +13,6 @@ EXACT = OPEN + "[Parameters]\nread /arm = 10.0.0.5\nread /arm/free = 10.0.0.5\nr
 WHOLE = OPEN + "[Parameters]\nread /arm/** = 10.0.0.5\nread default = 10.0.0.9\n"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 async def subscribed(policy: str, value: Value = 7) -> tuple[ControlParts, Any]:
     """Control with a node that subscribed to the parameter /arm, under this policy."""
     world = ControlParts()

@@ -21,12 +21,6 @@ pytestmark = pytest.mark.anyio
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 def fail(reason: str) -> None:
     """The store could not write."""
     raise AssertionError(reason)

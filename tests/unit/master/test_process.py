@@ -18,12 +18,6 @@ pytestmark = pytest.mark.anyio
 URI = "http://10.0.0.5:4000/"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 def fail(reason: str) -> None:
     """The store could not write."""
     raise AssertionError(reason)

@@ -10,12 +10,6 @@ pytestmark = pytest.mark.anyio
 NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
 async def test_what_the_policy_took_is_not_adopted(kind: Kind) -> None:
     """A round that comes before ROSMaster was told of the revocation takes the registration from it, not back."""

@@ -13,22 +13,9 @@ URI = "http://10.0.0.5:4001/"
 SERVICE_URI = "rosrpc://10.0.0.5:4101"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
-async def parts() -> ControlParts:
-    """Control after its first round."""
-    world = ControlParts()
-    await world.round()
-    return world
-
-
 async def test_a_registration_that_waited_over_a_reload_is_decided_again() -> None:
     """Decided under the old policy and carried out under the new one: what that does not allow is taken back."""
-    world = await parts()
+    world = await ControlParts.begun()
     world.rosmaster.shut()
     call = asyncio.ensure_future(world.ask("registerPublisher", "/n", "/secret", "std_msgs/String", URI))
     while ("allow", "/secret") not in world.records.events:
@@ -44,7 +31,7 @@ async def test_a_registration_that_waited_over_a_reload_is_decided_again() -> No
 
 async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> None:
     """The port is told, and nobody gets in by it."""
-    world = await parts()
+    world = await ControlParts.begun()
     await world.ask("registerService", "/n", "/s", SERVICE_URI, URI)
     world.rosmaster.shut()
     call = asyncio.ensure_future(world.ask("lookupService", "/client", "/s"))
@@ -68,7 +55,7 @@ async def test_what_a_node_gives_up_is_not_given_back(
     register: str, unregister: str, kind: Kind, detail: list[str]
 ) -> None:
     """A node gives up what the policy has taken: it is denied, and a rollback does not bring a ghost back."""
-    world = await parts()
+    world = await ControlParts.begun()
     await world.ask(register, "/n", "/secret", *detail)
     await world.ask(register, "/n", "/plain", *detail)
     world.reload(NO_SECRET + "[Services]\n/secret=\ndefault=*\n")
@@ -90,7 +77,7 @@ async def test_what_a_node_gives_up_is_not_given_back(
 
 async def test_a_parameter_that_a_node_gives_up_is_not_given_back() -> None:
     """The same for a subscription to a parameter."""
-    world = await parts()
+    world = await ControlParts.begun()
     await world.ask("subscribeParam", "/n", URI, "/secret")
     world.reload(OPEN + "[Parameters]\nread default=*\nread /secret=\n")
     node = world.registry.all()[0]

@@ -22,12 +22,6 @@ pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 class Nothing:
     """Takes every call and does nothing: journal, store, recorder, delivery."""
 

@@ -12,38 +12,20 @@ pytestmark = pytest.mark.anyio
 NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
-async def parts() -> ControlParts:
-    """Control after its first round."""
-    world = ControlParts()
-    await world.round()
-    return world
-
-
-def lives(world: ControlParts) -> list[Life]:
-    """Where each incarnation stands."""
-    return [one.life for one in world.registry.all()]
-
-
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
 async def test_a_node_that_is_away_keeps_nothing_the_policy_took(kind: Kind) -> None:
     """A node that stops answering over a reload comes back without what the new policy does not allow."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, kind, "/secret")
     await world.register(node, kind, "/plain")
     world.clients.silent = {"/n"}
     await world.look(node)
-    assert lives(world) == [Life.SHADOW]
+    assert world.lives == [Life.SHADOW]
     assert world.reload(NO_SECRET) == 1
     world.clients.silent = set()
     await world.look(node)
-    assert lives(world) == [Life.LIVE]
+    assert world.lives == [Life.LIVE]
     assert node.resources(kind) == ["/plain"]
     assert (world.hidden.has(kind, "/secret"), world.hidden.has(kind, "/plain")) == ([], ["/n"])
     emptied: tuple[str, str, tuple[Value, ...]] = ("/n", "publisherUpdate", ("/secret", []))
@@ -52,7 +34,7 @@ async def test_a_node_that_is_away_keeps_nothing_the_policy_took(kind: Kind) -> 
 
 async def test_a_node_that_is_away_gets_back_what_is_granted_again() -> None:
     """Taken and granted again while the node was away: it has it when it returns."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/secret")
     await world.register(node, Kind.PUBLICATION, "/plain")
@@ -69,7 +51,7 @@ async def test_a_node_that_is_away_gets_back_what_is_granted_again() -> None:
 
 async def test_a_revoked_host_keeps_nothing_of_nodes_that_are_away() -> None:
     """Expelling a host takes what its silent nodes have, too."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/plain")
     world.clients.silent = {"/n"}
@@ -80,7 +62,7 @@ async def test_a_revoked_host_keeps_nothing_of_nodes_that_are_away() -> None:
 
 async def test_given_and_taken_again_at_once_is_taken() -> None:
     """Of two quick reloads the last one counts, in the registry and at ROSMaster."""
-    world = await parts()
+    world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/secret")
     world.reload(NO_SECRET)
@@ -99,7 +81,7 @@ async def test_given_and_taken_again_at_once_is_taken() -> None:
 
 async def test_nothing_is_given_back_to_a_life_that_is_over() -> None:
     """A node that was started anew while its earlier life's registration is put back keeps its name."""
-    world = await parts()
+    world = await ControlParts.begun()
     first, second = world.node("/n", 1), world.node("/n", 2)
     await world.register(first, Kind.PUBLICATION, "/secret")
     await world.register(first, Kind.PUBLICATION, "/plain")
@@ -108,7 +90,7 @@ async def test_nothing_is_given_back_to_a_life_that_is_over() -> None:
     world.reload(OPEN)
     await world.register(second, Kind.PUBLICATION, "/plain")
     await world.settle()
-    assert lives(world) == [Life.REPLACED, Life.LIVE]
+    assert world.lives == [Life.REPLACED, Life.LIVE]
     assert world.registry.holder("/n") is second
     assert second.resources(Kind.PUBLICATION) == ["/plain"]
     assert world.hidden.has(Kind.PUBLICATION, "/secret") == []
@@ -117,7 +99,7 @@ async def test_nothing_is_given_back_to_a_life_that_is_over() -> None:
 
 async def test_a_service_that_another_offers_meanwhile_stays_his() -> None:
     """A provider whose offer is granted again does not take the service from the one that came after it."""
-    world = await parts()
+    world = await ControlParts.begun()
     first, second = world.node("/a", 1), world.node("/b", 2)
     await world.register(first, Kind.SERVICE, "/s", "4101")
     world.reload(OPEN + "[Services]\n")
@@ -137,7 +119,7 @@ async def test_a_service_that_another_offers_meanwhile_stays_his() -> None:
 
 async def test_only_what_one_caller_has_is_decided_again() -> None:
     """After a call that was decided under an earlier policy: his registrations and grants, nobody else's."""
-    world = await parts()
+    world = await ControlParts.begun()
     node, other = world.node("/n", 1), world.node("/m", 2)
     for one in (node, other):
         await world.register(one, Kind.PUBLICATION, "/secret")

@@ -17,12 +17,6 @@ from appliance.master.stating import Revision, Stating
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 def spec(name: str, *topics: str) -> str:
     """A specification with an event on each topic."""
     events = "".join(

@@ -14,12 +14,6 @@ from appliance.store.tokens import is_secret, parse_token
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The loop that control runs on."""
-    return "asyncio"
-
-
 class Lives:
     """The lives of control on one state."""
 
