@@ -60,9 +60,8 @@ class Stating:
         self._coming: tuple[Revision, Plan] | None = None  # being tried
         self._answers: dict[int, asyncio.Future[list[str]]] = {}  # of those that gave something up
         self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}  # by relay and statement
-        self._numbers = itertools.count(
-            time.monotonic_ns()
-        )  # relays may outlive control: no number comes again
+        # Relays may outlive control: no number comes again.
+        self._numbers = itertools.count(time.monotonic_ns())
         self._refusals: dict[int, list[str]] = {}
         self._began: set[str] = set()  # by what is being changed
         self._held: dict[int, set[str]] = {}

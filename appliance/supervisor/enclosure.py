@@ -336,9 +336,8 @@ class InNamespace(Contained):
 
     def route_to(self, host: str) -> str | None:
         """The host's address by which the peer reaches it; a peer in a tunnel reaches the appliance itself."""
-        address = ipaddress.ip_address(
-            host
-        )  # control says what it was told; only an address goes on from here
+        # Control says what it was told; only an address goes on from here.
+        address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
             return None
         return self._isolation.host_address_for(host)
