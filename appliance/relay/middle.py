@@ -145,11 +145,11 @@ class Middle:
     def resume(self, name: str) -> frozenset[str]:
         """Let the topics of a monitor that holds them go on; they."""
         self.look_again()
-        held = (
-            [one for one in self.monitors.monitors if one.name == name and one.held] if self.monitors else []
-        )
+        if self.monitors is None:
+            return frozenset()
+        held = [one for one in self.monitors.monitors if one.name == name and one.held]
         for monitor in held:
-            monitor.held = False
+            self.monitors.resume(monitor.name)
         return _topics(held)
 
     # --- what is asked when something changes ---
