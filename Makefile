@@ -6,9 +6,9 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := appliance tests examples benchmarks
+CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system bench clean
+.PHONY: help setup demo check test test-system package bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -23,7 +23,7 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/mypy
-	$(BIN)/mypy tests benchmarks
+	$(BIN)/mypy tests benchmarks distribution
 	$(BIN)/lint-imports
 	@# Four at a time on two cores: many wait for something.
 	$(PYTEST) tests/unit -n 4 --quiet
@@ -37,6 +37,10 @@ test-system: ## the whole product: demo, namespaces, tunnels, containers, a virt
 	@scripts/setup --system
 	$(PYTEST) tests/system --quiet --durations=15 || \
 		{ echo "== once more: what failed"; $(PYTEST) tests/system --quiet --last-failed --last-failed-no-failures none; }
+
+package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
+	@scripts/setup --package
+	$(BIN)/python -m distribution.deb amd64 arm64
 
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done

@@ -143,7 +143,8 @@ class Limits(_Section):
     string_bytes: Size = Field(default=ByteSize(8 << 20), description="one string")
     multicall_parts: Count = Field(default=100_000, description="calls in one system.multicall")
     parameter_bytes: Size = Field(
-        default=ByteSize(64 << 20), description="all parameters together, as they are sent"
+        default=ByteSize(64 << 20),
+        description="all parameters together, as they are sent; one host may set half of them",
     )
     header_bytes: Size = Field(default=ByteSize(64 << 10), description="request line and headers")
     header_seconds: Seconds = Field(default=10, description="until request line and headers must be there")
@@ -218,6 +219,10 @@ class Audit(_Section):
     retention_bytes: Annotated[ByteSize, Field(ge=1 << 20)] | None = Field(
         default=None, description="beyond this size the oldest records are removed"
     )
+    reserve_bytes: Annotated[ByteSize, Field(ge=1 << 20)] = Field(
+        default=ByteSize(64 << 20),
+        description="of the disk: below it who causes many records is slowed more, so that the others are recorded",
+    )
     syslog: Syslog = Syslog()
 
 
@@ -239,7 +244,10 @@ class Relay(_Section):
     message_bytes: Size = Field(default=ByteSize(256 << 20), ge=1 << 20, description="one message")
     queue_messages: Count = Field(default=1000, description="messages waiting for one subscriber")
     queue_bytes: Size = Field(default=ByteSize(64 << 20), description="bytes waiting for one subscriber")
-    memory_bytes: Size = Field(default=ByteSize(1 << 30), description="all that waits in the process")
+    memory_bytes: Size = Field(
+        default=ByteSize(1 << 30),
+        description="of one relay: half for unfinished messages, a quarter each for queues and latched ones",
+    )
 
 
 class Firewall(_Section):
@@ -366,6 +374,10 @@ class Settings(_Section):
         description="HOST:PORT of REST, or off; unless it is given here, another free port when this one is taken",
     )
     api_tls: bool = Field(default=True, description="off: clear text, on a loopback address only")
+    api_require_proof: bool = Field(
+        default=False,
+        description="on: changes over REST are made for signed requests only (docs/rest.md), never for a bare token",
+    )
     api_networks: list[IPvAnyNetwork] = Field(
         default=[], description="who may connect to REST besides this machine (the firewall's rule)"
     )

@@ -49,6 +49,18 @@ METRICS = (
         "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
     ),
     Metric(
+        "rosrv_relay_limited_total",
+        "counter",
+        ("resource", "part"),
+        "messages that limits of the policy dropped: of a publisher, a subscriber, a topic",
+    ),
+    Metric(
+        "rosrv_relay_memory_bytes",
+        "gauge",
+        ("what",),
+        "bytes that hosts hold in the relays: frames (unfinished), queues, latched, headers",
+    ),
+    Metric(
         "rosrv_relay_delay_seconds",
         "histogram",
         ("resource",),
@@ -97,7 +109,7 @@ METRICS = (
         "rosrv_audit_degraded",
         "gauge",
         (),
-        "1 while checkpoints, the full-text index or retention are behind",
+        "1 while checkpoints, the full-text index or retention are behind, or its disk is nearly full",
     ),
     Metric("rosrv_syslog_up", "gauge", (), "1 while the audit log is forwarded; absent when it is not to be"),
     Metric(

@@ -15,13 +15,20 @@ import hashlib
 import hmac
 import secrets
 import time
+from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from appliance.api.problems import ProblemError
-from appliance.api.rates import Buckets
-from appliance.channel.messages import TokenKept
+from appliance.api.rates import Buckets, peer_key
+from appliance.channel.messages import Asked, TokenKept
+from appliance.config import is_loopback
+from appliance.shares.pool import Standing
+from appliance.store.order_proof import reading_hash, reading_id
 from appliance.store.tokens import is_secret, parse_token
+
+_KNOWN_SECONDS = 900.0
+_MOST_KNOWN = 1024
 
 
 class Role(enum.IntEnum):
@@ -34,12 +41,17 @@ class Role(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Bearer:
-    """The holder of a token; `expires` is seconds since the epoch."""
+    """The holder of a token; `expires` is seconds since the epoch.
+
+    `shown` is what came with the request, the token or its reading key; `asked` the request itself, if it is no look.
+    """
 
     id: str
     name: str
     role: Role
     expires: float
+    shown: str
+    asked: Asked | None = None
 
 
 class Doorkeeper:
@@ -53,6 +65,13 @@ class Doorkeeper:
         self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
         self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
+        self._shown: OrderedDict[str, float] = OrderedDict()  # which peers showed a good token, and when
+
+    def standing(self, peer: str) -> Standing:
+        """A peer that showed a good token lately is known, and so is this machine; every other is a stranger."""
+        shown = self._shown.get(peer)
+        lately = shown is not None and time.monotonic() - shown < _KNOWN_SECONDS
+        return Standing.REGISTERED if lately or is_loopback(peer) else Standing.STRANGER
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
         """Only these may be used from now on."""
@@ -64,19 +83,21 @@ class Doorkeeper:
         return bearer.id in self._tokens and time.time() < bearer.expires
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """The holder of the token in an `Authorization` header. Raises `ProblemError` (401, 429)."""
+        """The holder of the token, or reading key, in an `Authorization` header. Raises `ProblemError` (401, 429)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
         scheme, _space, text = authorization.partition(" ")
-        parsed = parse_token(text.strip()) if scheme.lower() == "bearer" else None
-        kept = self._tokens.get(parsed[0]) if parsed is not None else None
-        if (
-            kept is not None
-            and parsed is not None
-            and await self._matches(text.strip(), parsed[1], kept, host)
+        text = text.strip() if scheme.lower() == "bearer" else ""
+        parsed = parse_token(text)
+        kept = self._tokens.get(parsed[0] if parsed is not None else reading_id(text) or "")
+        if kept is not None and (
+            hmac.compare_digest(reading_hash(text), kept.reading)
+            if parsed is None
+            else await self._matches(text, parsed[1], kept, host)
         ):
             if time.time() < kept.expires:
-                return Bearer(kept.id, kept.name, Role[kept.role.upper()], kept.expires)
+                self._remember(peer_key(host))
+                return Bearer(kept.id, kept.name, Role[kept.role.upper()], kept.expires, text)
             raise self._refusal("the token has expired: ask for another one (rosrv token add)")
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)
@@ -95,6 +116,12 @@ class Doorkeeper:
         if kept.id in self._tokens:
             self._recognised[digest] = kept.id
         return True
+
+    def _remember(self, peer: str) -> None:
+        self._shown[peer] = time.monotonic()
+        self._shown.move_to_end(peer)
+        if len(self._shown) > _MOST_KNOWN:
+            self._shown.popitem(last=False)
 
     def _refusal(self, detail: str) -> ProblemError:
         return ProblemError(

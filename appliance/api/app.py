@@ -75,8 +75,8 @@ def build_app(services: Services) -> FastAPI:
     ):
         app.include_router(part.routes(services))
     app.include_router(live.routes(services, services.history))
-    for page in (whoami, console):
-        app.include_router(page.routes())
+    app.include_router(whoami.routes(services))
+    app.include_router(console.routes())
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from fastapi import APIRouter, Depends, Header, Path, Query
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
@@ -21,19 +21,22 @@ from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer
 from appliance.api.services import Services
+from appliance.api.streams import Held, Streams, peer_of
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.database import LogUnreadableError
+from appliance.audit.evidence import Chain, evidence, evidence_line
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import Entry, as_json, as_object
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.schema import json_schema
-from appliance.audit.search import Follower, export, search, show
+from appliance.audit.search import Follower, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verify import verify
+from appliance.shares.table import REST_EXPORTS, REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
-_SEARCHES, _EXPORTS = 4, 2
+_SEARCHES = 4
 _PATIENCE_SECONDS = 5.0
 _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
@@ -85,7 +88,10 @@ class LogElsewhere(BaseModel):
 
 
 class LogCheckpoint(BaseModel):
-    """A signed checkpoint; `time` is nanoseconds since the epoch, hashes, signature and key are hexadecimal."""
+    """A signed checkpoint; `time` is nanoseconds since the epoch, hashes, signature and key are hexadecimal.
+
+    `removed`: up to which record the log's beginning is removed; checkpoints of before they said so have none.
+    """
 
     model_config = ConfigDict(extra="forbid")
     log: str
@@ -96,6 +102,7 @@ class LogCheckpoint(BaseModel):
     previous: str
     signature: str
     key: str
+    removed: int | None = None
 
 
 class LogCheckpoints(BaseModel):
@@ -122,6 +129,7 @@ class Verified(BaseModel):
     key: str | None
     findings: list[LogFinding]
     elsewhere: LogElsewhere | None
+    removal: str
 
 
 def _wanted(
@@ -143,6 +151,9 @@ def _wanted(
     ] = None,
     deny: Annotated[bool, Query(description="only what was denied: the same as decision=deny")] = False,
     topic: Annotated[str | None, Query(max_length=256, description="another word for resource")] = None,
+    looks: Annotated[
+        bool, Query(description="0: leave out REST calls that were allowed and only looked")
+    ] = True,
 ) -> Filter:
     now = time.time_ns()
     if resource is not None and topic is not None:
@@ -160,6 +171,7 @@ def _wanted(
             severity=severity,
             rule=rule,
             text=text,
+            without_looks=not looks,
         )
     except (MomentError, OverflowError, ValueError) as error:
         raise ProblemError(422, "bad-input", str(error)) from error
@@ -175,8 +187,8 @@ class Desk:
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
         self.searches = asyncio.Semaphore(_SEARCHES)
-        self.exports = asyncio.Semaphore(_EXPORTS)
-        self.streams = asyncio.Semaphore(services.settings.api_limits.streams)
+        self.exports = Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
+        self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
         self.verification = asyncio.Semaphore(1)
 
     async def read(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
@@ -227,20 +239,21 @@ def routes(services: Services) -> APIRouter:
         "/stream", operation_id="follow_audit", responses=_text("text/event-stream", "Events `record`.")
     )
     async def follow_audit(
+        request: Request,
         bearer: Viewer,
         wanted: Wanted,
         after: Annotated[int | None, Query(ge=0, le=10**18, description="begin after this sequence")] = None,
         last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", pattern="^[0-9]{1,18}$")] = None,
-    ) -> EventSourceResponse:
+    ) -> Response:
         """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
 
         Ends when the token does. A browser that reconnects goes on where it was.
         """
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(Follower, desk.path, wanted, start)
-        if desk.streams.locked():
-            raise ProblemError(503, "busy", "too many clients follow the audit log", retry_after=10)
-        return EventSourceResponse(_follow(services, desk, follower, bearer), ping=_PING_SECONDS)
+        give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
+        following = _follow(services, desk, follower, bearer)
+        return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     @router.get("/verify", operation_id="verify_audit", response_model=Verified, dependencies=[OPERATOR])
     async def verify_audit() -> JSONResponse:
@@ -265,15 +278,17 @@ def routes(services: Services) -> APIRouter:
     @router.get(
         "/export",
         operation_id="export_audit",
-        dependencies=[VIEWER],
         responses=_text("application/x-ndjson", "A record a line."),
     )
-    async def export_audit(wanted: Wanted) -> StreamingResponse:
-        """All records that match, oldest first, one JSON object a line."""
-        entries = await desk.read(lambda: _begun(export(desk.path, wanted)))
-        if desk.exports.locked():
-            raise ProblemError(503, "busy", "too many exports at once", retry_after=10)
-        return StreamingResponse(_lines(entries, desk.exports), media_type="application/x-ndjson")
+    async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
+        """All records that match, oldest first, one JSON object a line.
+
+        Each has in `chain` its place in the hash chain, as far as a signed checkpoint: `rosrv audit verify --export`
+        proves it on any machine, with the appliance's public key.
+        """
+        entries = await desk.read(lambda: _begun(evidence(desk.path, wanted)))
+        give_back = desk.exports.take(bearer, peer_of(request), "exports")
+        return Held(StreamingResponse(_lines(entries), media_type="application/x-ndjson"), give_back)
 
     @router.get(
         "/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN, dependencies=[VIEWER]
@@ -306,40 +321,38 @@ def _text(media_type: str, description: str) -> dict[int | str, dict[str, Any]]:
 async def _follow(
     services: Services, desk: Desk, follower: Follower, bearer: Bearer
 ) -> AsyncIterator[ServerSentEvent]:
-    async with desk.streams:
-        while not services.stopping.is_set():
-            if not services.doorkeeper.still_good(bearer):
-                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
-                return
-            entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
-            for entry in entries:
-                yield ServerSentEvent(event="record", id=str(entry.sequence), data=as_json(entry))
-            if not entries:
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+    while not services.stopping.is_set():
+        if not services.doorkeeper.still_good(bearer):
+            yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+            return
+        entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
+        for entry in entries:
+            yield ServerSentEvent(event="record", id=str(entry.sequence), data=as_json(entry))
+        if not entries:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
 
 
-def _begun(entries: Iterator[Entry]) -> Iterator[Entry]:
+def _begun(entries: Iterator[_T]) -> Iterator[_T]:
     """The same entries, the first of them read: what is wrong with a search is known before the answer begins."""
     first = next(entries, None)
     return iter(()) if first is None else _chain(first, entries)
 
 
-def _chain(first: Entry, rest: Iterator[Entry]) -> Iterator[Entry]:
+def _chain(first: _T, rest: Iterator[_T]) -> Iterator[_T]:
     yield first
     yield from rest
 
 
-async def _lines(entries: Iterator[Entry], turns: asyncio.Semaphore) -> AsyncIterator[str]:
-    async with turns:
-        while piece := await asyncio.to_thread(_piece, entries):
-            yield piece
+async def _lines(entries: Iterator[tuple[Entry, Chain]]) -> AsyncIterator[str]:
+    while piece := await asyncio.to_thread(_piece, entries):
+        yield piece
 
 
-def _piece(entries: Iterator[Entry]) -> str:
+def _piece(entries: Iterator[tuple[Entry, Chain]]) -> str:
     lines = []
-    for entry in entries:
-        lines.append(as_json(entry) + "\n")
+    for entry, chain in entries:
+        lines.append(evidence_line(entry, chain) + "\n")
         if len(lines) == _STREAM_PAGE:
             break
     return "".join(lines)

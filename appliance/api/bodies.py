@@ -10,9 +10,18 @@ from appliance.api.problems import BadInput, ProblemError
 
 _Model = TypeVar("_Model", bound=BaseModel)
 DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
+_NO = frozenset({b"", b"0", b"false", b"off", b"no", b"f", b"n"})
 WRONG_TYPE: dict[int | str, dict[str, Any]] = {
     415: {"description": "The body is neither text/plain nor JSON."}
 }
+
+
+def is_dry(query: bytes) -> bool:
+    """Whether a request is a dry run, by its query."""
+    found = [
+        value for name, _eq, value in (one.partition(b"=") for one in query.split(b"&")) if name == b"dry_run"
+    ]
+    return bool(found) and found[-1].lower() not in _NO
 
 
 def text_or(model: type[BaseModel]) -> dict[str, Any]:

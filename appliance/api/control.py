@@ -16,8 +16,9 @@ from typing import Any
 
 import structlog
 
+from appliance.api.access import Bearer
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import AdminAnswer, AdminRequest, RestChange
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 
 _log = structlog.get_logger()
@@ -28,6 +29,12 @@ ANSWER_SECONDS = 15.0
 
 class ControlAwayError(Exception):
     """Control cannot be asked now; the text says why, for whoever called."""
+
+
+def _made(number: int, request: AdminRequest, bearer: Bearer | None) -> messages.RequestMade:
+    shown = bearer.shown if bearer is not None else ""
+    asked = bearer.asked if bearer is not None and isinstance(request, RestChange) else None
+    return messages.RequestMade(number, request, shown, asked)  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
 
 
 class ControlLink:
@@ -75,8 +82,10 @@ class ControlLink:
             ):  # the link ends, and the next is told
                 self._channel.send(messages.RestServed(self._pin))
 
-    async def ask(self, request: AdminRequest, who: str, seconds: float = ANSWER_SECONDS) -> AdminAnswer:
-        """Control's answer to a request on behalf of the token `who`. Raises `ControlAwayError`."""
+    async def ask(
+        self, request: AdminRequest, bearer: Bearer | None, seconds: float = ANSWER_SECONDS
+    ) -> AdminAnswer:
+        """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`."""
         if self._channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
         if len(self._open) >= _MOST_OPEN:
@@ -86,7 +95,7 @@ class ControlLink:
         answer: asyncio.Future[AdminAnswer] = asyncio.get_running_loop().create_future()
         self._open[number] = answer
         try:
-            self._channel.send(messages.RequestMade(number, who, request))  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
+            self._channel.send(_made(number, request, bearer))
             async with asyncio.timeout(seconds):
                 return await answer
         except TimeoutError:

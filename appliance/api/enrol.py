@@ -36,7 +36,6 @@ from appliance.ipsec.kit import archive, members
 
 _ALL = "all"
 _ALL_PER_MINUTE = 60
-_ITSELF = "the host itself"
 _ARCHIVE = {"application/gzip": {"schema": {"type": "string", "format": "binary"}}}
 _Responses = dict[int | str, dict[str, Any]]
 _KIT: _Responses = {
@@ -154,7 +153,7 @@ class _Patience:
 
 
 async def _ask(services: Services, order: AdminRequest) -> dict[str, Any]:
-    answer = await services.control.ask(order, _ITSELF, SLOW_SECONDS)
+    answer = await services.control.ask(order, None, SLOW_SECONDS)
     if not answer.ok and answer.trouble == "forbidden":
         raise ProblemError(403, "not-recognised", answer.error)
     return answered(answer)

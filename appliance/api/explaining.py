@@ -72,11 +72,14 @@ def _explained(found: Explanation) -> Explained:
         decision=word_of(decision),
         rule=_rule(decision.rule) if decision.rule else None,
         reason=decision.reason,
+        told=found.told,
         through=list(found.through),
+        limit=found.limit,
         lost=[
             LostRule(rule=_rule(one.rule), would="allow" if one.grants else "deny", why=one.why)
             for one in found.lost
         ],
         node=_explained(found.node) if found.node is not None else None,
+        command=_explained(found.command) if found.command is not None else None,
         allowed=found.allowed,
     )

@@ -18,17 +18,21 @@ import ipaddress
 import re
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 
 import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from appliance.api.access import Bearer, Doorkeeper
+from appliance.api.bodies import is_dry
 from appliance.api.console import is_console
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect
 from appliance.api.rates import Buckets
+from appliance.channel.messages import Asked
 from appliance.config import ApiLimits
+from appliance.store.order_proof import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
@@ -38,6 +42,7 @@ PUBLIC = frozenset({
 })  # fmt: skip
 BEARER = "rosrv.bearer"  # the key of a request's scope that has who asks
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
+_LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
 _NOBODYS_BODY = 1024  # bytes of a body that somebody without a token may send
 _REQUEST_BODY = 24 << 10  # of a host that brings a signing request
@@ -119,7 +124,10 @@ class Gate:
         limit = int(self._limits.body_bytes) if bearer is not None else _NOBODYS_BODY
         if renewal or path == "/v1/enrol":
             limit = _REQUEST_BODY
-        return bearer, await _read(headers, receive, limit)
+        body = await _read(headers, receive, limit)
+        if bearer is not None and scope["method"] not in _LOOKS:
+            bearer = replace(bearer, asked=_asked(scope, headers, body))
+        return bearer, body
 
     def _check_tunnel(self, host: str, path: str, *, renewal: bool) -> None:
         address = ipaddress.ip_address(host)
@@ -143,6 +151,20 @@ class Gate:
                 "wrong-host",
                 "the appliance is not called by this name: use its address, or add the name to api_names",
             )
+
+
+def _asked(scope: Scope, headers: Headers, body: bytes) -> Asked:
+    """The request as control holds it against its proof."""
+    query = scope["query_string"].decode("latin-1")
+    return Asked(
+        host=scope["client"][0],
+        method=scope["method"],
+        target=scope["raw_path"].decode("latin-1") + (f"?{query}" if query else ""),
+        if_match=headers.get("if-match", ""),
+        content_type=headers.get("content-type", ""),
+        proof=headers.get(HEADER, ""),
+        body=body,
+    )
 
 
 class _Answer:
@@ -187,6 +209,7 @@ class _Answer:
             path=self._scope["path"],
             status=status,
             reason=self._scope.get(REASON, ""),
+            dry=is_dry(self._scope["query_string"]),
             duration_us=(time.monotonic_ns() - self._started) // 1000,
         )
 

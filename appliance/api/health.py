@@ -36,6 +36,8 @@ class Process(_Model):
     pid: int
     since: str
     restarts: int
+    walls: str = Field(description="what limits its calls of the kernel, its files and ports")
+    lacks: list[str] = Field(description="what this machine's kernel lacks of them")
 
 
 class PolicyState(_Model):

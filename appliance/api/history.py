@@ -123,7 +123,7 @@ class History:
 
 async def measures_of(control: ControlLink) -> dict[str, Any]:
     """Control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
-    answer = await control.ask(MetricsWanted(), "history")
+    answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error)
     return answer.body

@@ -6,7 +6,6 @@ not change it.
 """
 
 import asyncio
-import time
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -177,8 +176,7 @@ def _add_changes(router: APIRouter, desk: "_Desk") -> None:
         name: OneHost, told: PortsTold, bearer: Operator, response: Response, if_match: IfMatch = None
     ) -> PortsSeen:
         """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
-        checked = time.time() if told.checked is None else told.checked
-        order = HostPorts(name, told.state, told.open, checked, _expected(if_match))
+        order = HostPorts(name, told.state, told.open, told.checked, _expected(if_match))
         body = await desk.tagged(order, bearer, response)
         return PortsSeen.model_validate(body["ports"])
 
@@ -205,7 +203,7 @@ class _Desk:
 
     async def slowly(self, order: Any, bearer: Bearer) -> dict[str, Any]:
         """Control's answer to what waits for charon or the signer."""
-        return answered(await self.control.ask(order, bearer.name, SLOW_SECONDS))
+        return answered(await self.control.ask(order, bearer, SLOW_SECONDS))
 
     async def place(self, wishes: Wishes, bearer: Bearer) -> "_Placed":
         """The wishes with the address of the appliance, which it finds where nobody said it."""

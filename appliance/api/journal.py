@@ -26,14 +26,23 @@ class Journal:
         self.calls: Counter[tuple[str, str]] = Counter()  # by method and status, for the metrics
 
     def answered(
-        self, *, host: str, who: str, method: str, path: str, status: int, reason: str, duration_us: int
+        self,
+        *,
+        host: str,
+        who: str,
+        method: str,
+        path: str,
+        status: int,
+        reason: str,
+        duration_us: int,
+        dry: bool = False,
     ) -> None:
         """One answer was given."""
         # What a client wrote may hold what is no text (JSON's \ud800); control could not be told it.
         path, reason = _text(path), _text(reason)
         self.calls[method if method in _METHODS else "other", str(status)] += 1
         if who and method not in _READS:
-            self._tell(RestCalled(host, who, method, path, status, reason, duration_us))
+            self._tell(RestCalled(host, who, method, path, status, reason, duration_us, dry=dry))
             return
         kind = (host, who, method, path, status, reason)
         if kind in self._repeated:

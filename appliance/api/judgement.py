@@ -20,12 +20,12 @@ from appliance.policy import (
     compile_policy,
     diff,
     explain,
-    needs_node_rule,
     run_cases,
 )
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.hosts import Network, canonical_address
 from appliance.policy.model import Address, Decision
+from appliance.policy.rights import needs_node
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def explanation(
         )
     except BadWordError as error:
         raise ProblemError(422, "bad-input", str(error)) from error
-    if needs_node_rule(request) and not node:
+    if needs_node(request) and not node:
         raise ProblemError(422, "bad-input", "this makes a node part of the graph: say its name (node)")
     return explain(policy, request)
 

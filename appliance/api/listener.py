@@ -2,7 +2,7 @@
 
 Invariants:
 
-1. At most `connections` are open, and `connections_per_host` of one peer; one more is closed at once.
+1. A connection has a place among the arrivals before anything is made for it, TLS included; else it is closed at once.
 2. A connection whose TLS handshake, or whose next request's headers, take longer than `header_seconds` is closed;
    so is one whose headers are longer than `_HEAD_BYTES` (uvicorn would keep all of them).
 3. Whoever sends anything after an answer has as long to begin, and to end the headers of, the next request: neither
@@ -11,67 +11,60 @@ Invariants:
 """
 
 import asyncio
+import errno
 import socket
 import ssl
-from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
+import structlog
 from starlette.types import ASGIApp
 from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
-from appliance.api.rates import peer_key
+from appliance.api.arrivals import Arrival, Arrivals
 from appliance.config import ApiLimits
+from appliance.shares.descriptors import connections_within
+from appliance.shares.pool import Standing
+from appliance.shares.table import REST_CONNECTIONS
 
+_log = structlog.get_logger()
+_GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
+_PAUSE = 0.2  # when the process has no descriptor left
+_BACKLOG = 256
 _KEEP_ALIVE_SECONDS = 30
 _HEAD_BYTES = 64 << 10
 _MOST_PIPELINED = 16
 _END_SECONDS = 1.0
 
 
-class Visitors:
-    """Counts the connections of each peer."""
-
-    def __init__(self, limits: ApiLimits) -> None:
-        self._limits = limits
-        self._of: Counter[str] = Counter()
-
-    def come(self, host: str) -> bool:
-        """Whether one more connection of this peer is served."""
-        key = peer_key(host)
-        if self._of.total() >= self._limits.connections or self._of[key] >= self._limits.connections_per_host:
-            return False
-        self._of[key] += 1
-        return True
-
-    def go(self, host: str) -> None:
-        """A connection that was served has ended."""
-        key = peer_key(host)
-        self._of[key] -= 1
-        if not self._of[key]:
-            del self._of[key]
-
-
 class GuardedProtocol(HttpToolsProtocol):
     """One connection."""
 
-    def __init__(self, config: Config, state: ServerState, visitors: Visitors, header_seconds: float) -> None:
+    def __init__(
+        self,
+        config: Config,
+        state: ServerState,
+        arrivals: Arrivals,
+        arrival: Arrival,
+        header_seconds: float,
+    ) -> None:
         super().__init__(config, state, {})
-        self._visitors = visitors
+        self._arrivals = arrivals
+        self._arrival = arrival
         self._header_seconds = header_seconds
-        self._visitor: str | None = None
+        self._open = False
         self._deadline: asyncio.TimerHandle | None = None
         self._head = 0  # bytes that came since headers are expected
         self._leftover = False  # what came after an answer has not begun a request yet
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
-        """Serve a new connection, unless there are too many."""
-        peer = transport.get_extra_info("peername")
-        if peer is None or not self._visitors.come(peer[0]):
+        """Serve a new connection."""
+        if transport.get_extra_info("peername") is None:  # gone already
             transport.abort()
             return
-        self._visitor = peer[0]
+        self._open = True
         # asyncio does it for sockets that were made with the protocol's number only; else an answer's body waits 40 ms.
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         super().connection_made(transport)
@@ -79,16 +72,16 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Count the connection out."""
-        if self._visitor is None:
+        self._arrivals.go(self._arrival)
+        if not self._open:
             return
-        self._visitors.go(self._visitor)
-        self._visitor = None
+        self._open = False
         self._headers_are_there()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Parse what came."""
-        if self._visitor is None:
+        if not self._open:
             return
         if self._deadline is not None and not self._leftover:
             self._head += len(data)
@@ -112,7 +105,14 @@ class GuardedProtocol(HttpToolsProtocol):
         if len(self.pipeline) >= _MOST_PIPELINED:
             raise ValueError("too many requests wait")
         self._headers_are_there()
+        self._arrivals.served(self._arrival)
         super().on_headers_complete()
+
+    def on_response_complete(self) -> None:
+        """An answer is sent."""
+        super().on_response_complete()
+        if self._open and not self.pipeline:
+            self._arrivals.waits(self._arrival)
 
     def _expect_headers(self) -> None:
         if self._deadline is None:
@@ -127,9 +127,9 @@ class GuardedProtocol(HttpToolsProtocol):
 
 
 class Listener:
-    """Serves `app` on a listening socket."""
+    """Serves `app` on a listening socket. `standing(peer)` says whether a peer has shown a good token lately."""
 
-    def __init__(self, app: ASGIApp, limits: ApiLimits) -> None:
+    def __init__(self, app: ASGIApp, limits: ApiLimits, standing: Callable[[str], Standing]) -> None:
         self._limits = limits
         self._config = Config(
             app,
@@ -145,32 +145,72 @@ class Listener:
         )
         self._config.load()
         self._state = ServerState()
-        self._visitors = Visitors(limits)
-        self._server: asyncio.Server | None = None
+        bounds = REST_CONNECTIONS.bounds.sized(
+            connections_within(limits.connections), limits.connections_per_host
+        )
+        self.arrivals = Arrivals(bounds, standing)
+        self._opening: set[asyncio.Task[None]] = set()
+        self._accepting: asyncio.Task[None] | None = None
 
     async def start(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
         """Begin to accept."""
-        more: dict[str, Any] = {}
-        if context is not None:
-            more = {
-                "ssl_handshake_timeout": self._limits.header_seconds,
-                "ssl_shutdown_timeout": _END_SECONDS,
-            }
-        self._server = await asyncio.get_running_loop().create_server(
-            lambda: GuardedProtocol(self._config, self._state, self._visitors, self._limits.header_seconds),
-            sock=sock,
-            ssl=context,
-            backlog=256,
-            **more,
-        )
+        sock.setblocking(False)
+        sock.listen(_BACKLOG)
+        self._accepting = asyncio.get_running_loop().create_task(self._accept(sock, context))
 
     async def stop(self) -> None:
         """Stop accepting, let what is being answered finish for a second, close the rest."""
-        if self._server is not None:
-            self._server.close()
+        tasks = [*self._opening, *filter(None, [self._accepting])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         for connection in list(self._state.connections):
             connection.shutdown()
         if self._state.tasks:
             await asyncio.wait(list(self._state.tasks), timeout=_END_SECONDS)
         for connection in list(self._state.connections):
             connection.transport.abort()
+
+    async def _accept(self, listening: socket.socket, context: ssl.SSLContext | None) -> None:
+        loop = asyncio.get_running_loop()
+        with listening:
+            while True:
+                try:
+                    sock, address = await loop.sock_accept(listening)
+                except OSError as error:
+                    if error.errno not in _GONE:
+                        _log.error("REST cannot accept a connection", reason=str(error))
+                        await asyncio.sleep(_PAUSE)
+                    continue
+                arrival = self.arrivals.come(sock, address[0])
+                if arrival is None:
+                    sock.close()
+                    continue
+                task = loop.create_task(self._open(arrival, context))
+                self._opening.add(task)
+                task.add_done_callback(self._opening.discard)
+
+    async def _open(self, arrival: Arrival, context: ssl.SSLContext | None) -> None:
+        """Hand the connection to its protocol, after the handshake if there is one."""
+        timeouts: dict[str, Any] = {}
+        if context is not None:
+            timeouts = {
+                "ssl_handshake_timeout": self._limits.header_seconds,
+                "ssl_shutdown_timeout": _END_SECONDS,
+            }
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: GuardedProtocol(
+                    self._config, self._state, self.arrivals, arrival, self._limits.header_seconds
+                ),
+                arrival.socket,
+                ssl=context,
+                **timeouts,
+            )
+        except OSError:  # it is gone, or what it says is no TLS
+            self.arrivals.go(arrival)
+            arrival.socket.close()
+        except BaseException:
+            self.arrivals.go(arrival)
+            arrival.cut()
+            raise

@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
@@ -20,7 +20,9 @@ from appliance.api.history import BUSY_SECONDS, History, Sample, Seen
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.services import Services
+from appliance.api.streams import Held, Streams, peer_of
 from appliance.channel.admin import GraphWanted
+from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
 _SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next
@@ -51,7 +53,7 @@ class Hour(BaseModel):
 def routes(services: Services, history: History) -> APIRouter:
     """The routes."""
     router = APIRouter(prefix="/v1", tags=["status"])
-    streams = asyncio.Semaphore(services.settings.api_limits.streams)
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(
@@ -62,45 +64,45 @@ def routes(services: Services, history: History) -> APIRouter:
 
     @router.get("/live", operation_id="live_state", responses=_TEXT)
     async def live(
+        request: Request,
         bearer: Viewer,
         graph: Annotated[bool, Query(description="the graph too, as `/v1/graph` has it")] = False,
-    ) -> EventSourceResponse:
+    ) -> Response:
         """Status, open alarms and a sample every two seconds (server-sent events).
 
         `now`: `{status, alarms, sample}`; `graph`: as `/v1/graph`; `away`: `{reason}` while RVMaster does not answer.
         Ends when the token does.
         """
-        if streams.locked():
-            raise ProblemError(503, "busy", "too many clients follow already", retry_after=10)
-        return EventSourceResponse(_follow(services, history, streams, bearer, graph), ping=_PING_SECONDS)
+        give_back = streams.take(bearer, peer_of(request), "clients follow")
+        following = _follow(services, history, bearer, graph)
+        return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     return router
 
 
 async def _follow(
-    services: Services, history: History, streams: asyncio.Semaphore, bearer: Bearer, graph: bool
+    services: Services, history: History, bearer: Bearer, graph: bool
 ) -> AsyncIterator[ServerSentEvent]:
     number = max(0, history.seen.number - 1)  # what was seen last is told at once
     graph_due = 0.0
-    async with streams:
-        with history.following():
-            while not services.stopping.is_set():
-                if not services.doorkeeper.still_good(bearer):
-                    yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
-                    return
-                try:
-                    async with asyncio.timeout(BUSY_SECONDS * 2):
-                        seen = await history.after(number)
-                except TimeoutError:
-                    continue  # control takes its time; look whether the token is still good
-                number = seen.number
-                yield _told(seen)
-                if graph and seen.away is None and time.monotonic() >= graph_due:
-                    began = time.monotonic()
-                    drawn = await _graph(services, bearer)
-                    graph_due = time.monotonic() + (time.monotonic() - began) * _SHARE
-                    if drawn is not None:
-                        yield drawn
+    with history.following():
+        while not services.stopping.is_set():
+            if not services.doorkeeper.still_good(bearer):
+                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+                return
+            try:
+                async with asyncio.timeout(BUSY_SECONDS * 2):
+                    seen = await history.after(number)
+            except TimeoutError:
+                continue  # control takes its time; look whether the token is still good
+            number = seen.number
+            yield _told(seen)
+            if graph and seen.away is None and time.monotonic() >= graph_due:
+                began = time.monotonic()
+                drawn = await _graph(services, bearer)
+                graph_due = time.monotonic() + (time.monotonic() - began) * _SHARE
+                if drawn is not None:
+                    yield drawn
 
 
 def _told(seen: Seen) -> ServerSentEvent:

@@ -108,6 +108,8 @@ def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
         "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_relay_limited_total": [((name, part), count) for name, part, count in body["limited"]],
+        "rosrv_relay_memory_bytes": [((what,), size) for what, size in body["memory"].items()],
         "rosrv_relay_delay_seconds": [
             ((name,), (row[:-1], row[-1])) for name, row in body["delayed"].items()
         ],

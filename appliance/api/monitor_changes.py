@@ -32,12 +32,14 @@ from appliance.channel.admin import (
     MonitorLoad,
     MonitorReload,
     MonitorRemove,
+    MonitorReplace,
     MonitorResume,
     MonitorsWanted,
     MonitorSwitch,
 )
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
+Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
 _CHANGES: dict[int | str, dict[str, Any]] = {
     **TAGGED,
     412: {
@@ -97,14 +99,23 @@ def _add_texts(router: APIRouter, changing: "_Changing") -> None:
         content_type = request.headers.get("content-type", "")
         new = read_body(content_type, await request.body(), NewText, "the specification")
         expected = _expected(if_match, dry_run=dry_run)
+        if not dry_run:
+            replacing = MonitorReplace(name, new.text, new.definitions, new.note, expected)
+            return await changing.replace(replacing, bearer, response)
         file = await changing.file_of(name, bearer)
         order = MonitorLoad({file: new.text}, new.definitions, new.note, expected)
-        return await changing.load(order, bearer, response, dry_run=dry_run)
+        return await changing.load(order, bearer, response, dry_run=True)
 
     @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
-    async def reload_monitors(bearer: Operator, response: Response, if_match: IfMatch = None) -> Replaced:
-        """Take what the folder has now in the place of what is in force."""
-        return await changing.replace(MonitorReload(_expected(if_match)), bearer, response)
+    async def reload_monitors(
+        bearer: Operator, response: Response, if_match: IfMatch = None, prune: Prune = False
+    ) -> Replaced:
+        """Take what the folder has now; what was loaded from elsewhere stays, unless an admin says `prune`."""
+        if prune and bearer.role < Role.ADMIN:
+            raise ProblemError(
+                403, "not-for-this-role", "removing what was loaded from elsewhere is for admins"
+            )
+        return await changing.replace(MonitorReload(_expected(if_match), prune), bearer, response)
 
     @router.delete("/{name}", operation_id="remove_monitor", responses=_CHANGES | UNKNOWN)
     async def remove_monitor(
@@ -197,7 +208,7 @@ class _Changing:
 
 
 async def _order(control: ControlLink, order: MonitorChange, bearer: Bearer) -> dict[str, Any]:
-    answer = await control.ask(order, bearer.name, _COMPILE_SECONDS)
+    answer = await control.ask(order, bearer, _COMPILE_SECONDS)
     if not answer.ok and answer.trouble == "refused":
         raise refusal(answer.error, answer.findings)
     if not answer.ok and answer.trouble == "conflict":

@@ -165,6 +165,10 @@ class Replaced(Model):
         default=[],
         description="all monitors that are in their initial state by this change, new ones among them",
     )
+    kept: list[str] = Field(
+        default=[],
+        description="files that a reload left in force although the folder does not have them: loaded from elsewhere",
+    )
 
 
 class Switch(Model):

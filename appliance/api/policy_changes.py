@@ -4,6 +4,7 @@ Loading is for admins, the rest for operators. Every change needs `If-Match` wit
 """
 
 import asyncio
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -12,7 +13,7 @@ from appliance.api.access import Bearer, Role
 from appliance.api.bodies import WRONG_TYPE, DryRun, read_body, text_or
 from appliance.api.judgement import Judgement, judge, word_of
 from appliance.api.policy import TAGGED
-from appliance.api.policy_models import Change, Confirmed, Loaded, PolicyText, Report, Rollback
+from appliance.api.policy_models import Change, Confirmed, Ended, Loaded, PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_revision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Operator, ask
@@ -26,6 +27,7 @@ from appliance.channel.admin import (
     PolicyWanted,
     RegistrationsWanted,
 )
+from appliance.policy.diff import endings
 
 _CHANGES: dict[int | str, dict[str, Any]] = {
     **TAGGED,
@@ -120,13 +122,28 @@ class _Changing:
                 f"revision {current['revision']} is in force, not {order.expected}",
             )
         live = (await ask(self._control, RegistrationsWanted(), bearer))["registrations"]
-        async with self._services.judging:
-            judgement = await asyncio.to_thread(judge, order.text, current, live)
+        try:
+            async with self._services.judging:
+                judgement = await asyncio.to_thread(judge, order.text, current, live)
+        except ProblemError as refusal:
+            if dry_run:
+                raise
+            return await self._load_refused(order, bearer, response, refusal)
         if not dry_run:
             return _report(judgement, await self.order(order, bearer, response), loaded=True)
         response.headers["ETag"] = etag(current["revision"])
         nothing = {"replaced": None, "revoked": None, "confirm_by": None}
         return _report(judgement, {"revision": current["revision"], **nothing}, loaded=False)
+
+    async def _load_refused(
+        self, order: PolicyLoad, bearer: Bearer, response: Response, refusal: ProblemError
+    ) -> Report:
+        """Have control refuse, and record, what was judged wrong here; its word counts, the places are from here."""
+        try:
+            body = await self.order(order, bearer, response)
+        except ProblemError as said:
+            raise refusal if said.kind == "refused" else said from None
+        return _report(Judgement([], []), body, loaded=True)
 
 
 def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Report:
@@ -150,4 +167,5 @@ def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Rep
         confirm_by=known["confirm_by"],
         warnings=judgement.warnings,
         changes=changes,
+        ends=[Ended.model_validate(asdict(one)) for one in endings(judgement.changes)],
     )

@@ -67,6 +67,16 @@ class Change(Model):
     reason: str = Field(description="of the new policy")
 
 
+class Ended(Model):
+    """Something live that the policy ends."""
+
+    host: str
+    caller_id: str = Field(description="empty: a client that gave no name")
+    what: Literal["publication", "subscription", "service", "call", "parameter"]
+    resource: str = Field(description="empty: all of this kind that the node has")
+    reason: str
+
+
 class Report(Model):
     """What a new policy does; `loaded` is false after a dry run, and what only a load can tell is then null."""
 
@@ -77,6 +87,7 @@ class Report(Model):
     confirm_by: float | None
     warnings: list[Finding]
     changes: list[Change]
+    ends: list[Ended] = Field(description="of `changes`, what is live and ends by it")
 
 
 class Loaded(Model):
@@ -129,9 +140,14 @@ class Explained(Model):
     decision: Literal["allow", "deny", "would deny"]
     rule: RuleText | None
     reason: str
+    told: str | None = Field(description="what the host is told of a denial ([Options] tell); null: allowed")
     through: list[str] = Field(description="the words of the rule that mean the host")
+    limit: str = Field(
+        description="how much of what is allowed may pass, and by which line of [Limits]; or empty"
+    )
     lost: list[LostRule]
-    node: "Explained | None"
+    node: "Explained | None" = Field(description="the name that it gives, where a node is needed")
+    command: "Explained | None" = Field(description="the command `lookupService`, for a call of a service")
     allowed: bool = Field(description="the answer to the whole call")
 
 

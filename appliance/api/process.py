@@ -78,7 +78,7 @@ class _Api:
             tunnels=self._settings.ipsec.pool,
             networks=self._settings.api_networks,
         )
-        listener = Listener(gate, self._settings.api_limits)
+        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.standing)
         await self._given.wait()
         if self._socket is None:
             return

@@ -52,7 +52,7 @@ _PROBLEMS = {
 
 async def ask(control: ControlLink, request: AdminRequest, bearer: Bearer) -> dict[str, Any]:
     """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
-    return answered(await control.ask(request, bearer.name))
+    return answered(await control.ask(request, bearer))
 
 
 def answered(answer: AdminAnswer) -> dict[str, Any]:

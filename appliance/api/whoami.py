@@ -1,11 +1,13 @@
-"""`/v1/whoami`: what the token in hand may do, so that a page can say so before something is refused."""
+"""`/v1/whoami`, `/v1/challenge`: what the token in hand may do, and what its next order is signed under."""
 
 from typing import Literal
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
-from appliance.api.roles import Viewer
+from appliance.api.roles import Viewer, ask
+from appliance.api.services import Services
+from appliance.channel.admin import ChallengeWanted
 
 
 class Holder(BaseModel):
@@ -19,8 +21,16 @@ class Holder(BaseModel):
     expires: float
 
 
-def routes() -> APIRouter:
-    """The route."""
+class Challenge(BaseModel):
+    """What the next order is signed under."""
+
+    model_config = ConfigDict(extra="forbid")
+    challenge: str
+    seconds: float = Field(description="so long it is good, for one order")
+
+
+def routes(services: Services) -> APIRouter:
+    """The routes."""
     router = APIRouter(prefix="/v1", tags=["status"])
 
     @router.get("/whoami", operation_id="whoami")
@@ -29,5 +39,10 @@ def routes() -> APIRouter:
         return Holder.model_validate(
             {"name": bearer.name, "role": bearer.role.name.lower(), "expires": bearer.expires}
         )
+
+    @router.get("/challenge", operation_id="challenge")
+    async def challenge(bearer: Viewer) -> Challenge:
+        """A challenge: an order that changes something is signed under one, and each is good once."""
+        return Challenge.model_validate(await ask(services.control, ChallengeWanted(), bearer))
 
     return router

@@ -13,34 +13,43 @@ from typing import NamedTuple
 
 import appliance
 from appliance.audit.events import EVENTS
+from appliance.audit.kinds import ABOUT
 from appliance.audit.record import Severity
 
 _FIELDS = frozenset(
-    {"severity", "host", "caller_id", "category", "resource", "rule", "decision", "more", "reason"}
+    {"severity", "host", "caller_id", "category", "resource", "rule", "decision", "more", "reads", "reason"}
 )
+_FOLDED = (
+    "count", "of", "scope", "recorded_id", "first_id", "last_id", "first_time", "last_time", *ABOUT,
+    "callers", "resources", "calls", "hosts", "reasons", "recovered",
+)  # fmt: skip
 _LOGS_OWN = {
     "log begun": ("log", "earlier_log_missing"),
     "log failed": ("since", "until"),
     "records lost": ("count", "first_time", "last_time"),
     "checkpoint": ("number", "sequence", "hash"),
     "signature refused": ("number",),
+    "disk nearly full": ("left",),
+    "disk has room": ("left",),
     "records removed": (
         "first_sequence", "last_sequence", "last_hash", "first_time", "last_time", "last_checkpoint",
-        "last_checkpoint_hash", "count",
+        "last_checkpoint_hash", "count", "kept", "limit", "signature", "key",
     ),
 }  # fmt: skip
-_MONITOR = ("monitor", "happened", "before", "after", "before_fields", "after_fields", "size", "count")
+_MONITOR = (
+    "monitor", "happened", "number", "seq", "stamp", "before", "after", "before_fields", "after_fields", "size",
+    "count",
+)  # fmt: skip
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
-    "decision": ("call", "key", "node", "subgraph"),
-    "denials folded": (
-        "count", "of", "scope", "recorded_id", "first_id", "last_id", "first_time", "last_time", "call", "key", "node",
-        "callers", "resources", "calls", "hosts", "recovered",
-    ),
+    "decision": ("call", "key", "node", "subgraph", "parts", "stranger"),
+    "denials folded": _FOLDED,
+    "repetitions folded": _FOLDED,
     **dict.fromkeys(
-        ("monitor verdict", "message dropped", "monitor fault", "monitor log", "monitor published"),
+        ("monitor verdict", "message dropped", "monitor fault", "monitor log"),
         _MONITOR,
     ),
+    "monitor published": (*_MONITOR, "because_of"),
     "message changed": (*_MONITOR, "changed_by"),
 }  # fmt: skip
 

@@ -22,10 +22,14 @@ _TYPES = (int, int, bytes, bytes | None, bytes | None)
 
 
 class Remembered(msgspec.Struct, frozen=True):
-    """What the signer remembers of a log: the hashes of the checkpoints it signed, from number `first` on."""
+    """What the signer remembers of a log: the hashes of the checkpoints it signed, from number `first` on.
+
+    `removed`: up to which record it approved removals; None where it was never asked.
+    """
 
     first: int
     hashes: bytes
+    removed: int | None = None
 
     @property
     def last(self) -> int:
@@ -44,7 +48,9 @@ def read_remembered(directory: Path, log: str) -> Remembered | None:
     if not path.exists():
         return None
     data = path.read_bytes()
-    return Remembered(int.from_bytes(data[:_HEADER], "big"), data[_HEADER:])
+    removed = directory / f"{log}.removed"
+    approved = int.from_bytes(removed.read_bytes(), "big") if removed.exists() else None
+    return Remembered(int.from_bytes(data[:_HEADER], "big"), data[_HEADER:], approved)
 
 
 class CheckpointAudit:
@@ -58,7 +64,8 @@ class CheckpointAudit:
         self.signed = 0
         self.signed_through = 0
         self.last_number = 0
-        self.hashes: dict[int, str] = {}
+        self.removed: list[int] = []
+        """What checkpoints say of how much is removed."""
         self._signed_seen = False
         self._on_their_way: list[int] = []
 
@@ -80,7 +87,6 @@ class CheckpointAudit:
             self.count += 1
             yield from self._check_row(row, previous, chain, last_sequence)
             previous = checkpoint_hash(row[2])
-            self.hashes[number] = previous
         if len(self._on_their_way) > ASKED_AT_ONCE:
             yield from self._signatures_removed()
         if self._remembered is not None and self._remembered.last > number:
@@ -103,6 +109,7 @@ class CheckpointAudit:
         last_sequence: int,
     ) -> Iterator[Finding]:
         number, _sequence, text, signature, public_key = row
+        self.removed += _removed(text)
         wrong = self._disagreement(row, previous, chain, last_sequence)
         remembered = self._remembered.hash(number) if self._remembered else None
         if wrong is not None:
@@ -153,6 +160,15 @@ class CheckpointAudit:
             message = "it does not follow from the checkpoint before it"
             return _finding(Kind.CHECKPOINT_CHANGED, number, number, message)
         return _held_against_chain(checkpoint, chain, last_sequence)
+
+
+def _removed(text: bytes) -> list[int]:
+    """What a checkpoint says of how much is removed; nothing if it does not, or is none."""
+    try:
+        removed = parse_checkpoint(text).removed
+    except ValueError:
+        return []
+    return [] if removed is None else [removed]
 
 
 def _held_against_chain(

@@ -98,6 +98,7 @@ def plain_record(record: Record) -> Record:
         caller_id=_optional(record.caller_id), category=_optional(record.category),
         resource=_optional(record.resource), rule=rule, revision=_integer(record.revision),
         reason=_text(record.reason), duration_us=_integer(record.duration_us), detail=detail,
+        stranger=record.stranger, folds=record.folds,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ signatures throughout. He cannot change what another machine was given before. S
 2. A log agrees with a copy when its chain has, at the copy's sequence, the hash that the copy names.
 3. A copy whose signature does not fit proves nothing and is told; copies of other logs are counted, and if there are
    no others, the log that is here took the place of the one they are of.
+4. Copies that are all of what is removed from the log prove nothing of what is left, and that is told.
 """
 
 import json
@@ -33,10 +34,11 @@ class CopiesUnreadableError(Exception):
     """The file with checkpoints kept elsewhere is missing, or has none; the message says which."""
 
 
-class SignedCheckpoint(msgspec.Struct, frozen=True):
+class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
     """A checkpoint with its signature, as it leaves the machine; hashes, signature and key in hexadecimal.
 
-    `time` is nanoseconds since the epoch. The names are those of the JSON and of the syslog message.
+    `time` is nanoseconds since the epoch; `removed` says up to which record the log's beginning is removed, where the
+    checkpoint says so. The names are those of the JSON and of the syslog message.
     """
 
     log: str
@@ -47,10 +49,18 @@ class SignedCheckpoint(msgspec.Struct, frozen=True):
     previous: str
     signature: str
     key: str
+    removed: int | None = None
+
+    @classmethod
+    def of(cls, text: bytes, signature: bytes, key: bytes) -> "SignedCheckpoint":
+        """The checkpoint with this text. Raises `ValueError` if it is none."""
+        return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
     def text(self) -> bytes:
         """What was signed."""
-        return Checkpoint(self.log, self.number, self.sequence, self.hash, self.time, self.previous).text()
+        return Checkpoint(
+            self.log, self.number, self.sequence, self.hash, self.time, self.previous, self.removed
+        ).text()
 
     def as_json(self) -> str:
         """One line of NDJSON, without the newline."""
@@ -69,10 +79,7 @@ def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[Sig
     try:
         with closing(open_for_reading(log)) as connection:
             rows = connection.execute(query, (after, limit)).fetchall()
-        return [
-            SignedCheckpoint(*parse_checkpoint(text), signature.hex(), key.hex())
-            for text, signature, key in rows
-        ]
+        return [SignedCheckpoint.of(*row) for row in rows]
     except (sqlite3.Error, ValueError) as error:
         raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
@@ -128,6 +135,8 @@ class CopiesAudit:
         self._copies = sorted({one for one in copies if one.log == log}, key=lambda one: one.number)
         self.sequences = {one.sequence for one in self._copies}
         self._agreeing: list[SignedCheckpoint] = []
+        self.removed: list[int] = []
+        """What copies say of how much is removed."""
 
     def result(self) -> Elsewhere:
         """What the copies prove."""
@@ -152,13 +161,26 @@ class CopiesAudit:
                 f"the checkpoints kept elsewhere are of log {names}; this one, {self._log}, took its place"
             )
             yield Finding(Kind.LOG_REPLACED, 0, 0, message)
+        found = list(self._compare(chain, removed, last, stored))
+        yield from found
+        if self._copies and not self._agreeing and not found:
+            message = (
+                f"of {len(self._copies)} checkpoints kept elsewhere none is of what is left of the log, which begins"
+                f" after record {removed}: they prove nothing of it"
+            )
+            yield Finding(Kind.PROVES_NOTHING, 0, removed, message)
+
+    def _compare(
+        self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
+    ) -> Iterator[Finding]:
         proven = removed
         for copy in self._copies:
             wrong = self._wrong_signature(copy)
             if wrong is not None:
                 yield wrong
                 continue
-            if copy.sequence <= removed:
+            self.removed += [] if copy.removed is None else [copy.removed]
+            if copy.sequence < removed:
                 continue
             if copy.sequence > last:
                 message = (

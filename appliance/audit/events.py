@@ -48,6 +48,7 @@ EVENTS: dict[str, str] = {
     "monitor published": "A monitor published a message.",
     "publication refused": "A publisher or service has another definition than the specifications; it is not carried.",
     "rest call": "A REST call was answered; `detail` has who (the token's name), method and status.",
+    "order refused": "RVMaster refused what was asked over REST: no token, role or proof; `detail.verb` says what.",
     "token added": "An access token for REST was made; `detail` has its name, role, id and end.",
     "token revoked": "An access token for REST was ended before its time.",
     "process started": "A process of the appliance started.",
@@ -59,10 +60,14 @@ EVENTS: dict[str, str] = {
     "connection closed": "A connection through the relay ended.",
     "connection refused": "Somebody connected without a grant or with a wrong header, or a publisher refused us.",
     "limit exceeded": "A peer sent more, larger or faster than the limits allow.",
+    "rate limited": "Messages beyond a limit of the policy ([Limits]) were dropped; `rule` has the limit,"
+    " `detail.count` how many they were.",
     "probe failed": "The hidden ROS Master could be reached from outside; nodes are not served meanwhile.",
     "probe passed": "The ROS Master is hidden (again).",
     "reconciled": "The reconcile loop found and mended a difference between wanted and seen.",
     "denials folded": "Repetitions of a denial recorded before; `detail` has how many, first and last.",
+    "repetitions folded": "Repetitions of a read that was allowed, recorded before, and whatever else a host beyond its"
+    " share repeats; `detail` has how many, first and last.",
     "log begun": "The first record of a new log; `detail.earlier_log_missing`: there was one before.",
     "records removed": "Retention removed old records; `detail` has which, why, and their last hash.",
     "records lost": "The queue was full while the log could not be written; `detail` has how many.",
@@ -71,5 +76,7 @@ EVENTS: dict[str, str] = {
     "forwarding failed": "The receiver of the forwarded log could not be reached for ten seconds; records wait here.",
     "forwarding resumed": "The receiver of the forwarded log has it again.",
     "forwarding gap": "Retention removed records before they could be forwarded; `detail` has how many.",
+    "disk nearly full": "Only the reserve of the log's disk is left (`audit.reserve_bytes`): `reason` says what to do.",
+    "disk has room": "There is more than the reserve on the log's disk again.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }

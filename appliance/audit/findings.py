@@ -23,6 +23,8 @@ class Kind(enum.StrEnum):
     NO_KEY = "no key"
     REWRITTEN = "rewritten"
     LOG_REPLACED = "log replaced"
+    REMOVAL_UNFOUNDED = "removal unfounded"
+    PROVES_NOTHING = "proves nothing"
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -53,7 +55,9 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     `first` and `last` are the sequences of the first and last record; `records` how many there are; `removed`
     how many retention removed before them; `signed_through` is the sequence up to which the chain is
     proven by a signature, `unsealed` how many records come after it; `key` the public key it was held
-    against; `elsewhere` what another machine's checkpoints prove, when they were given.
+    against; `elsewhere` what another machine's checkpoints prove, when they were given. `removal` says what vouches for
+    the removal: "" (nothing was removed), "signed", or "unsigned": by a version of before removals were signed, so that
+    nothing proves that they followed from the settings.
     """
 
     ok: bool
@@ -69,3 +73,4 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     key: str | None
     findings: list[Finding]
     elsewhere: Elsewhere | None = None
+    removal: str = ""

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.record import Record, Severity
-from appliance.audit.retention import Retention
+from appliance.audit.removing import Remover
 from appliance.audit.signatures import Signatures
 from appliance.audit.writer import ChainWriter
 
@@ -26,9 +26,6 @@ _TEXT_BACKLOG = 20_000
 _TEXT_STEP = 256
 _LARGEST_SLICE = 2048
 _IDLE_SECONDS = 1.0
-_REMOVED_AT_ONCE = 512
-_RETENTION_SECONDS = 5.0
-_AGE_SECONDS = 3600.0
 _HOUSE_SECONDS = 10.0
 _ASK_AGAIN_SECONDS = 30.0
 
@@ -53,8 +50,6 @@ class _Moments:
     """When each was done last, or is due; monotonic seconds."""
 
     house: float = 0.0
-    retained: float = 0.0
-    aged: float = 0.0
     asked: float = 0.0
     sealed: float = field(default_factory=time.monotonic)
 
@@ -66,8 +61,8 @@ class Housekeeping:
         self,
         path: Path,
         signatures: Signatures,
-        retention: Retention,
         checkpoints: Checkpoints,
+        remover: Remover,
         *,
         clock: Callable[[], int],
         make: MakeRecord,
@@ -75,7 +70,7 @@ class Housekeeping:
     ) -> None:
         self._path = path
         self._signatures = signatures
-        self._retention = retention
+        self.remover = remover
         self._checkpoints = checkpoints
         self._clock = clock
         self._make = make
@@ -83,7 +78,12 @@ class Housekeeping:
         self._at = _Moments()
         self.writer: ChainWriter | None = None
         self.unsealed = 0  # records after the last checkpoint
-        self.degraded: str | None = None
+        self._failing: str | None = None
+
+    @property
+    def degraded(self) -> str | None:
+        """Why something is behind; None when nothing is."""
+        return self._failing or self.remover.unremoved
 
     def opened(self, writer: ChainWriter) -> None:
         """The database is open."""
@@ -98,16 +98,16 @@ class Housekeeping:
         try:
             action()
         except WRITE_ERRORS as error:
-            self.degraded = f"{self._path}: {error}"
+            self._failing = f"{self._path}: {error}"
             self._at.house = time.monotonic() + _HOUSE_SECONDS
         else:
-            self.degraded = None
+            self._failing = None
 
     def next_due(self, now: float) -> float | None:
         """In how many seconds something is due; None while nothing is tried."""
         if now < self._at.house:
             return None
-        due = self._at.retained - now
+        due = self.remover.due - now
         return min(due, self._at.sealed + self._checkpoints.seconds - now) if self.unsealed else due
 
     # --- between two batches of records -----------------------------------------------------------------------
@@ -125,7 +125,7 @@ class Housekeeping:
             quiet = time.monotonic() - quiet_since >= _IDLE_SECONDS / 2
             if quiet or self.writer.text_lag >= _TEXT_STEP:
                 self.attempt(lambda: self._index(busy))
-        if self.writer is not None and time.monotonic() >= self._at.retained:
+        if self.writer is not None and time.monotonic() >= self.remover.due:
             self.attempt(self._retain)
 
     # --- checkpoints ------------------------------------------------------------------------------------------
@@ -146,6 +146,7 @@ class Housekeeping:
         detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
         writer.append([self._make("checkpoint", Severity.DEBUG, "", detail)])
         self.unsealed = 0
+        self.remover.sealed()
         if self._at.sealed - self._at.asked > _ASK_AGAIN_SECONDS:
             # An answer may have been lost on the way; asking twice for the same is harmless.
             self.ask_signatures()
@@ -182,21 +183,10 @@ class Housekeeping:
 
     def _retain(self) -> None:
         """Remove one step of old records if they must go; the next step follows at once."""
-        writer, now = self.writer, time.monotonic()
-        self._at.retained = now + _RETENTION_SECONDS
-        if writer is None:
-            return
-        before = None
-        reason = self._retention.excess(writer.size())
-        if reason is None and self._retention.days is not None and now >= self._at.aged:
-            before = self._retention.oldest_kept(self._clock())
-            reason = f"older than {self._retention.days} days"
-        signed = self._signatures.has_signer
-        gone = None if reason is None else writer.removable(_REMOVED_AT_ONCE, signed=signed, before=before)
-        if gone is None:
-            self._at.aged = now + _AGE_SECONDS if before is not None else self._at.aged
-            return
-        detail = gone._asdict() | {"count": gone.last_sequence - gone.first_sequence + 1}
-        writer.remove(gone, self._make("records removed", Severity.NOTICE, reason or "", detail))
-        self.unsealed += 1
-        self._at.retained = 0.0
+        if self.writer is not None and self.remover.step(self.writer):
+            self.unsealed += 1
+
+    def removal_approved(self, number: int, text: bytes, signature: bytes, key: bytes) -> None:
+        """The signer signed a removal."""
+        if self.writer is not None and self.remover.approved(self.writer, number, text, signature, key):
+            self.unsealed += 1

@@ -25,17 +25,23 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import structlog
 
+from appliance.audit.budget import Budget
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.folding import Folder, FoldSettings, Key, summary
+from appliance.audit.folding import Folder, FoldSettings
 from appliance.audit.holders import holders
 from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
+from appliance.audit.kinds import Key, summary
 from appliance.audit.lost import Lost
 from appliance.audit.record import Record, Severity
+from appliance.audit.removing import Remover
 from appliance.audit.retention import Retention
-from appliance.audit.signatures import Signatures, Signer
+from appliance.audit.room import Room
+from appliance.audit.signatures import RemovalSigner, Signatures, Signer
 from appliance.audit.waiting import Barrier, Settled, Waiter, answer
 from appliance.audit.writer import ChainWriter
+from appliance.shares.pool import Standing
+from appliance.shares.table import AUDIT_RESERVE
 
 Durability = Literal["strict", "batched"]
 _GATHER_SECONDS = 0.02
@@ -64,6 +70,18 @@ class _Refusal(NamedTuple):
     reason: str
 
 
+class _RemovalApproved(NamedTuple):
+    number: int
+    text: bytes
+    signature: bytes
+    public_key: bytes
+
+
+class _RemovalRefused(NamedTuple):
+    number: int
+    reason: str
+
+
 class _AskSignatures(NamedTuple):
     pass
 
@@ -74,7 +92,9 @@ class AuditLog:
     `durability` says when writing starts: `strict` at once (group commit), `batched` after 20 ms; both
     fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is first,
     and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed` or
-    `refused`. `held_by(processes)` is told, on that thread too, which processes keep the log locked.
+    `refused`. `removals(number, checkpoint, newest)` asks for the signature over a removal, in the same way; the answer
+    is `removal_approved` or `removal_refused`. `held_by(processes)` is told, on that thread too, which processes keep
+    the log locked. `budget` says what hosts owe for their records; below `reserve` bytes on the disk that is less.
     """
 
     def __init__(
@@ -86,7 +106,10 @@ class AuditLog:
         checkpoint_seconds: float = 60.0,
         fold: FoldSettings | None = None,
         signer: Signer | None = None,
+        removals: RemovalSigner | None = None,
         retention: Retention | None = None,
+        budget: Budget | None = None,
+        reserve: int = AUDIT_RESERVE.bounds.whole,
         queue_limit: int = 100_000,
         held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  nobody asks
         clock: Callable[[], int] = time.time_ns,
@@ -97,6 +120,8 @@ class AuditLog:
         self._clock = clock
         self._queue_limit = queue_limit
         self._held_by = held_by
+        self.budget = budget or Budget(lambda _host: Standing.NAMED)
+        self._room = Room(path, reserve, self.budget.room)
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
         self._queue: deque[Any] = deque()
@@ -104,8 +129,14 @@ class AuditLog:
         self._house = Housekeeping(
             path,
             self._signatures,
-            retention or Retention(),
             Checkpoints(checkpoint_every, checkpoint_seconds),
+            Remover(
+                retention or Retention(),
+                self._signatures,
+                removals,
+                clock=clock,
+                report=lambda reason, detail: self._own("records removed", Severity.NOTICE, reason, detail),
+            ),
             clock=clock,
             make=self._own,
             hold=self._held.append,
@@ -138,8 +169,9 @@ class AuditLog:
         """Take a record into the log. Its `detail` must not be changed afterwards."""
         if len(self._queue) + len(self._held) >= self._queue_limit:
             self._lost.add(record)
-        else:
-            self._put(record)
+            return
+        self.budget.charge(record)
+        self._put(record)
 
     def flushed(self, settled: Settled) -> None:
         """Call `settled(None)` when all that was recorded so far is on disk, else `settled(reason)`.
@@ -165,8 +197,8 @@ class AuditLog:
 
     @property
     def degraded(self) -> str | None:
-        """Why checkpoints, the full-text index or retention are behind; None when they are not."""
-        return self._house.degraded
+        """Why checkpoints, the full-text index or retention are behind, or room is scarce; None when all is well."""
+        return self._house.degraded or self._room.scarce
 
     @property
     def lag(self) -> Lag:
@@ -181,6 +213,14 @@ class AuditLog:
     def refused(self, number: int, reason: str) -> None:
         """The signer refused a checkpoint: recorded as an alarm."""
         self._put(_Refusal(number, reason))
+
+    def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
+        """The signer signed the removal of the records up to a checkpoint."""
+        self._put(_RemovalApproved(number, text, signature, public_key))
+
+    def removal_refused(self, number: int, reason: str) -> None:
+        """The signer does not sign a removal; it is asked again later."""
+        self._put(_RemovalRefused(number, reason))
 
     def request_signatures(self) -> None:
         """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
@@ -249,7 +289,10 @@ class AuditLog:
         while True:
             more = self._drain()
             now = time.monotonic()
-            self._held.extend(self._folder.expire(now))
+            for due in self._folder.expire(now):
+                self._held.append(due)
+                self.budget.summarised(due)
+            self._look_for_room()
             written = self._attempt(self._write)
             self._answer_barriers()
             self._house.after_batch(written=written)
@@ -291,16 +334,32 @@ class AuditLog:
                 return False
             item = queue.popleft()
             if isinstance(item, Record):
-                self._held.extend(offer(item, now))
+                written = list(offer(item, now))
+                self._held.extend(written)
+                if not written or written[-1] is not item:
+                    self.budget.folded(item)
             elif isinstance(item, _Signature):
                 self._house.attempt(partial(self._house.keep_signature, *item))
             elif isinstance(item, _Refusal):
                 self._house.refused(item.number, item.reason)
+            elif isinstance(item, _RemovalApproved):
+                self._house.attempt(partial(self._house.removal_approved, *item))
+            elif isinstance(item, _RemovalRefused):
+                self._house.remover.refused(*item)
             elif isinstance(item, _AskSignatures):
                 self._house.attempt(self._house.ask_signatures)
+                self._house.remover.ask_again()
             else:
                 self._barriers.append(item)
         return bool(queue)
+
+    def _look_for_room(self) -> None:
+        with contextlib.suppress(OSError):  # a folder that is gone is told by what writes there
+            scarce = self._room.look()
+            if scarce is not None:
+                severity, left = (Severity.ALARM if scarce else Severity.NOTICE), self._room.left
+                event = "disk nearly full" if scarce else "disk has room"
+                self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
     def _attempt(self, action: Callable[[], None]) -> bool:
         """Do something with the database; whether it succeeded. A failure closes it until the next try."""

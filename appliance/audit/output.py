@@ -9,9 +9,13 @@ import json
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
+import msgspec
+
+from appliance.audit.moment import parse_moment
 from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference
 
 _SECOND = 1_000_000_000
+_NOT_THE_RECORDS = ("schema", "sequence", "chain")
 
 
 class Entry(NamedTuple):
@@ -56,6 +60,16 @@ def as_object(entry: Entry) -> dict[str, Any]:
         "duration_us": record.duration_us,
         "detail": record.detail,
     }
+
+
+def entry_of(fields: Any) -> Entry:
+    """A record from its documented JSON object. Raises `ValueError`, `KeyError` and `TypeError` for anything else."""
+    if not isinstance(fields, dict):
+        raise TypeError("not an object")
+    own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
+    time = str(fields["time"])
+    own["time"] = int(time[1:-2]) if time.startswith("@") else parse_moment(time, 0)
+    return Entry(int(fields["sequence"]), msgspec.convert(own, Record))
 
 
 def as_json(entry: Entry) -> str:

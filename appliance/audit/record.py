@@ -37,6 +37,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     `id` is sortable (time first) and unique; `time` is nanoseconds since the epoch, UTC; `decision` is
     `allow`, `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is microseconds from
     the request's arrival to the decision; `detail` holds the fields of this event.
+
+    Two are for the log alone and not stored: `stranger`: no rule of the policy names `host`; `folds`: it passed, and
+    its repetitions are counted, because it only reads.
     """
 
     id: str
@@ -53,3 +56,5 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
     duration_us: int | None = None
     detail: dict[str, Any] = {}
+    stranger: bool = False
+    folds: bool = False

@@ -43,6 +43,28 @@ _FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+_HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
+_CHAIN = {
+    "type": "object",
+    "description": "in an export: the place in the hash chain, as far as a signed checkpoint",
+    "properties": {
+        "previous": _HASH | {"description": "hash of the record before"},
+        "hash": _HASH | {"description": "hash of this record"},
+        "then": {
+            "type": ["array", "null"],
+            "items": _HASH,
+            "description": "content hashes of the records after it that are left out; null: version 0.1.0 wrote them",
+        },
+        "checkpoint": {
+            "type": ["object", "null"],
+            "description": "the signed checkpoint that seals what is up to here, as `rosrv audit checkpoints` gives it",
+        },
+    },
+    "required": ["previous", "hash", "then"],
+    "additionalProperties": False,
+}
+
+
 def json_schema() -> dict[str, Any]:
     """The JSON schema (2020-12) of a record as CLI, REST and export give it."""
     return {
@@ -55,6 +77,16 @@ def json_schema() -> dict[str, Any]:
     }
 
 
+def export_schema() -> dict[str, Any]:
+    """The JSON schema of a line of an export: a record and its place in the hash chain."""
+    record = json_schema()
+    return record | {
+        "title": f"ROSRV audit record with its place in the chain, version {SCHEMA_VERSION}",
+        "properties": record["properties"] | {"chain": _CHAIN},
+        "required": [*record["required"], "chain"],
+    }
+
+
 def markdown() -> str:
     """The generated part of the reviewer's page."""
     lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
@@ -64,6 +96,14 @@ def markdown() -> str:
         "The names of `event`, each with its fields of `detail`: [audit-events.md](audit-events.md).",
     ]
     lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
+    lines += [
+        "A line of an export has one field more, `chain`:",
+        "",
+        "```json",
+        json.dumps(_CHAIN, indent=2),
+        "```",
+        "",
+    ]
     return "\n".join(lines)
 
 

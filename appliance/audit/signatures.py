@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from appliance.audit.writer import ChainWriter
 
 Signer = Callable[[int, bytes], None]
+RemovalSigner = Callable[[int, bytes, bytes], None]
 ASKED_AT_ONCE = 64
 
 
@@ -98,22 +99,28 @@ class Signatures:
         text = writer.checkpoint_text(number)
         if text is None:
             return f"there is no checkpoint {number}"
-        if not signature_is_right(public_key, signature, text):
-            return f"the signature of checkpoint {number} is wrong"
-        if self._pin.exists():
-            try:
-                pinned = read_public_key(self._pin)
-            except KeyUnreadableError as error:
-                return str(error)
-            if pinned != public_key:
-                return (
-                    f"checkpoint {number} is signed with {public_key.hex()}, {self._pin} has {pinned.hex()}"
-                )
-        else:
+        wrong = self.wrong(f"checkpoint {number}", text, signature, public_key)
+        if wrong is not None:
+            return wrong
+        if not self._pin.exists():
             _pin_key(self._pin, public_key)
         writer.keep_signature(number, signature, public_key)
         if not self._asked and self._waiting:
             self.ask(writer)
+        return None
+
+    def wrong(self, what: str, text: bytes, signature: bytes, public_key: bytes) -> str | None:
+        """What is wrong with a signature: it does not fit, or is not made with the pinned key; None if nothing is."""
+        if not signature_is_right(public_key, signature, text):
+            return f"the signature of {what} is wrong"
+        if not self._pin.exists():
+            return None
+        try:
+            pinned = read_public_key(self._pin)
+        except KeyUnreadableError as error:
+            return str(error)
+        if pinned != public_key:
+            return f"{what} is signed with {public_key.hex()}, {self._pin} has {pinned.hex()}"
         return None
 
 

@@ -19,13 +19,12 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from appliance.audit import database
-from appliance.audit.chain import NO_CHECKPOINT, StoredColumns, genesis, record_hash
+from appliance.audit.chain import NO_CHECKPOINT, Removal, StoredColumns, follows, genesis
 from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
 from appliance.audit.copies import CopiesAudit, SignedCheckpoint
 from appliance.audit.database import LogUnreadableError, open_for_reading
 from appliance.audit.findings import Elsewhere, Finding, Kind, Verification
-from appliance.audit.signatures import pinned_key_path, read_public_key
-from appliance.audit.writer import RemovedRange
+from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_right
 
 _WINDOW = 64
 _TOLD_EVERY = 5000
@@ -52,6 +51,23 @@ class _Removal(msgspec.Struct, frozen=True):
     last_time: int
     last_checkpoint: _Count
     last_checkpoint_hash: _Hash
+    limit: str = ""
+    signature: str = ""
+
+    def is_signed(self, log: str, key: bytes) -> bool:
+        """Whether the signer with this key has signed exactly this removal."""
+        removal = Removal(
+            log,
+            self.last_checkpoint,
+            self.last_sequence,
+            self.last_hash,
+            self.last_checkpoint_hash,
+            self.limit,
+        )
+        try:
+            return signature_is_right(key, bytes.fromhex(self.signature), removal.text())
+        except ValueError:
+            return False
 
 
 class _Reported(msgspec.Struct, frozen=True):
@@ -104,7 +120,7 @@ class _Row(NamedTuple):
     def follows(self, previous: bytes, sequence: int) -> bool:
         """Whether this is the record that was written as `sequence` after the hash `previous`."""
         try:
-            return record_hash(previous, (sequence, *self.columns[1:])) == self.hash
+            return follows(previous, (sequence, *self.columns[1:]), self.hash)
         except UnicodeEncodeError:  # bytes that no writer stored
             return False
 
@@ -144,6 +160,7 @@ class _Verifier:
         self._progress = progress
         self._key = key
         self._log = log
+        self._remembered = remembered
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
         self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
         self._findings: list[Finding] = []
@@ -170,6 +187,7 @@ class _Verifier:
         self._walk(removed)
         self._check_checkpoints(removed)
         elsewhere = self._check_copies(removed)
+        removal = self._check_removal(removed)
         audit = self._checkpoints
         self._findings.sort(key=lambda one: one.first)
         if self._further is not None:
@@ -179,20 +197,45 @@ class _Verifier:
             removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
-            findings=self._findings, elsewhere=elsewhere,
+            findings=self._findings, elsewhere=elsewhere, removal=removal,
         )  # fmt: skip
 
-    def _check_copies(self, removed: RemovedRange | None) -> Elsewhere | None:
+    def _check_copies(self, removed: _Removal | None) -> Elsewhere | None:
         if self._copies is None:
             return None
         chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
+        if removed is not None:
+            chain[gone] = bytes.fromhex(removed.last_hash)
         try:
             stored = {row[0]: row[2].hex() for row in checkpoint_rows(self._connection)}
         except sqlite3.DatabaseError:
             stored = {}  # which is reported where the checkpoints themselves are checked
         self._findings += self._copies.check(chain, gone, last, stored)
         return self._copies.result()
+
+    def _check_removal(self, removed: _Removal | None) -> str:
+        """Whether the signer signed that the log's beginning goes.
+
+        If it did not, the removal is unfounded, unless it was made before removals were signed: then each checkpoint
+        that says how much is removed was made after it.
+        """
+        if removed is None:
+            return ""
+        if self._key is None:
+            return "unsigned"  # nor is anything else
+        if removed.is_signed(self._log, self._key):
+            return "signed"
+        said = self._checkpoints.removed + (self._copies.removed if self._copies else [])
+        if self._remembered is not None and self._remembered.removed is not None:
+            said = [*said, self._remembered.removed]
+        if min(said, default=removed.last_sequence) < removed.last_sequence or not self._checkpoints.signed:
+            message = (
+                "said to have been removed for their age or the log's size, and the signer did not sign that: nothing"
+                " shows that they had to go"
+            )
+            self._find(Kind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
+        return "unsigned"
 
     def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
         if len(self._findings) < _MOST_FINDINGS:
@@ -226,21 +269,20 @@ class _Verifier:
         message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were no text
         self._findings.append(Finding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
 
-    def _last_removal(self) -> RemovedRange | None:
+    def _last_removal(self) -> _Removal | None:
         """What retention removed last; its record is part of the chain that is walked."""
         query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
         try:
             row = self._connection.execute(query).fetchone()
             if row is None:
                 return None
-            removal = msgspec.json.decode(row[0], type=_Removal)
-            return RemovedRange(**{name: getattr(removal, name) for name in RemovedRange._fields})
+            return msgspec.json.decode(row[0], type=_Removal)
         except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
             return None  # a damaged record is found when it is walked
 
     # --- the chain ------------------------------------------------------------------------------------------
 
-    def _walk(self, removed: RemovedRange | None) -> None:
+    def _walk(self, removed: _Removal | None) -> None:
         self.last = removed.last_sequence if removed else 0
         previous = bytes.fromhex(removed.last_hash) if removed else genesis(self._log)
         try:
@@ -331,7 +373,7 @@ class _Verifier:
 
     # --- the checkpoints ------------------------------------------------------------------------------------
 
-    def _check_checkpoints(self, removed: RemovedRange | None) -> None:
+    def _check_checkpoints(self, removed: _Removal | None) -> None:
         before = (removed.last_checkpoint, removed.last_checkpoint_hash) if removed else (0, NO_CHECKPOINT)
         chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         audit = self._checkpoints

@@ -20,13 +20,16 @@ from appliance.audit.chain import (
     Checkpoint,
     StoredColumns,
     checkpoint_hash,
+    follows,
     genesis,
+    parse_checkpoint,
     record_hash,
 )
 from appliance.audit.columns import to_columns
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.folding import FoldState
+from appliance.audit.kinds import FoldState
 from appliance.audit.record import Record
+from appliance.audit.retention import as_kept
 
 # Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy
 # event loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a
@@ -100,8 +103,8 @@ class ChainWriter:
         rows.reverse()
         self.sequence, self.hash, self.last_id = 0, genesis(self.log_id), ""
         for number, row in enumerate(rows):
-            follows = number > 0 or row[0] == 1
-            if follows and (row[0] != self.sequence + 1 or record_hash(self.hash, row[:-1]) != row[-1]):
+            known = number > 0 or row[0] == 1  # what it follows
+            if known and (row[0] != self.sequence + 1 or not follows(self.hash, row[:-1], row[-1])):
                 raise LogUnreadableError(
                     f"{self.path}: record {row[0]} does not fit the chain, so the log was changed; run"
                     " 'rosrv audit verify', keep the file as evidence and move it away to begin a new log"
@@ -164,6 +167,7 @@ class ChainWriter:
             self.hash.hex(),
             time,
             self._checkpoint_hash,
+            self._first_sequence() - 1,
         )
         text = checkpoint.text()
         self._check_file()
@@ -237,35 +241,59 @@ class ChainWriter:
         return int((pages - free) * page_size)
 
     def removable(self, step: int, *, signed: bool, before: int | None = None) -> RemovedRange | None:
-        """The oldest records (before the time `before`), at most `step`, that a (signed) checkpoint seals."""
-        execute = self._connection.execute
-        (first,) = execute("SELECT coalesce(min(sequence), 0) FROM record").fetchone()
-        condition = "WHERE signature IS NOT NULL" if signed else ""
-        query = f"SELECT coalesce(max(sequence), 0) FROM checkpoint {condition}"  # noqa: S608  fixed text
-        last = min(first + step - 1, execute(query).fetchone()[0])
-        if before is not None:
-            young = "SELECT min(sequence) FROM record WHERE sequence BETWEEN ? AND ? AND time >= ?"
-            (kept,) = execute(young, (first, last, before)).fetchone()
-            last = last if kept is None else kept - 1
-        if not first or last < first:
-            return None
-        times = "SELECT time, hash FROM record WHERE sequence = ?"
-        first_time, _hash = execute(times, (first,)).fetchone()
-        last_time, last_hash = execute(times, (last,)).fetchone()
-        number, digest = 0, NO_CHECKPOINT
-        query = "SELECT number, text FROM checkpoint WHERE sequence <= ? ORDER BY number DESC LIMIT 1"
-        gone = execute(query, (last,)).fetchone()
-        if gone is not None:
-            number, digest = gone[0], checkpoint_hash(gone[1])
-        return RemovedRange(first, last, last_hash.hex(), first_time, last_time, number, digest)
+        """The oldest records: up to a (signed) checkpoint of before the time `before`, about `step` of them.
 
-    def remove(self, gone: RemovedRange, report: Record) -> None:
-        """Remove records and their checkpoints, and append the record that says so, in one transaction."""
+        The last checkpoint stays, for the next one follows from it.
+        """
+        first = self._first_sequence()
+        condition = "AND signature IS NOT NULL" if signed else ""
+        rows = self._connection.execute(
+            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"  # noqa: S608  fixed text
+            f" number < (SELECT max(number) FROM checkpoint) {condition} ORDER BY number LIMIT ?",
+            (first, step),
+        )
+        upto: tuple[int, int, bytes] | None = None
+        for row in rows:
+            too_young = before is not None and parse_checkpoint(row[2]).time >= before
+            if too_young or (upto is not None and row[1] >= first + step):
+                break
+            upto = row
+        return None if upto is None else self._range(first, *upto)
+
+    def _range(self, first: int, number: int, last: int, text: bytes) -> RemovedRange:
+        query = "SELECT time, hash FROM record WHERE sequence = ?"
+        first_time, _hash = self._connection.execute(query, (first,)).fetchone()
+        last_time, last_hash = self._connection.execute(query, (last,)).fetchone()
+        return RemovedRange(
+            first, last, last_hash.hex(), first_time, last_time, number, checkpoint_hash(text)
+        )
+
+    def _first_sequence(self) -> int:
+        query = "SELECT coalesce(min(sequence), ?) FROM record"
+        return int(self._connection.execute(query, (self.sequence + 1,)).fetchone()[0])
+
+    def newest_signed(self) -> bytes:
+        """The text of the last signed checkpoint; empty where there is none."""
+        query = "SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number DESC LIMIT 1"
+        row = self._connection.execute(query).fetchone()
+        return b"" if row is None else bytes(row[0])
+
+    def evidence(self, gone: RemovedRange) -> list[Record]:
+        """Of the records that go, those that are denials or alarms, each with its place in `detail.kept`."""
+        rows = self._connection.execute(
+            f"SELECT {database.COLUMNS}, hash FROM record WHERE sequence <= ? AND"  # noqa: S608  fixed names
+            " (decision = 'deny' OR severity = 'alarm') ORDER BY sequence",
+            (gone.last_sequence,),
+        )
+        return [as_kept(StoredColumns(*row[:-1]), row[-1]) for row in rows]
+
+    def remove(self, gone: RemovedRange, report: Record, kept: Sequence[Record] = ()) -> None:
+        """Remove records and their checkpoints, and append the record that says so and those that are kept, at once."""
         self._check_file()
         execute = self._connection.execute
         execute("BEGIN IMMEDIATE")
         try:
-            sequence, digest, last_id = self._insert([report])
+            sequence, digest, last_id = self._insert([report, *kept])
             (through,) = execute("SELECT through FROM indexed").fetchone()
             execute(
                 f"INSERT INTO words (words, rowid, text) SELECT 'delete', sequence, {database.TEXT_OF_RECORD}"  # noqa: S608  fixed names

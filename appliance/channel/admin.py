@@ -2,8 +2,8 @@
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make tokens. An api that fell to a stranger can change policy, monitors and hosts
-as an admin can: each change is recorded and can be taken back (`policy rollback`, `host revoke`).
+passes on `RestRequest`, which cannot make tokens. Of these, control makes a `RestChange` only with the proof that the
+holder of a token asked for just that (`appliance/master/rest_proof.py`).
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
@@ -15,6 +15,11 @@ import msgspec
 
 class AdminRequest(msgspec.Struct, frozen=True, tag_field="verb", forbid_unknown_fields=True):
     """A question or an order to the running appliance."""
+
+
+def verb_of(request: AdminRequest) -> str:
+    """The name of a request, as it stands in `verb`."""
+    return str(type(request).__struct_config__.tag)
 
 
 class StatusWanted(AdminRequest, frozen=True, tag="status"):
@@ -61,7 +66,9 @@ class PolicyRevisions(AdminRequest, frozen=True, tag="policy revisions"):
 
 
 class RegistrationsWanted(AdminRequest, frozen=True, tag="registrations"):
-    """What is registered now: rows of host, caller_id, category, resource."""
+    """What is live now (publications, subscriptions, services, calls, parameters), as rows of requests:
+    host, caller_id, category, resource.
+    """
 
 
 class GraphWanted(AdminRequest, frozen=True, tag="graph"):
@@ -90,10 +97,24 @@ class MonitorLoad(AdminRequest, frozen=True, tag="monitor load"):
     expected: str | None = None
 
 
+class MonitorReplace(AdminRequest, frozen=True, tag="monitor replace"):
+    """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name."""
+
+    name: str
+    text: str
+    definitions: dict[str, str] = {}
+    note: str = ""
+    expected: str | None = None
+
+
 class MonitorReload(AdminRequest, frozen=True, tag="monitor reload"):
-    """Take what the folder of specifications has now, in the place of what is in force."""
+    """Take what the folder of specifications has now.
+
+    What was loaded from elsewhere stays, unless `prune`: then what the folder does not have is removed.
+    """
 
     expected: str | None = None
+    prune: bool = False
 
 
 class MonitorRemove(AdminRequest, frozen=True, tag="monitor remove"):
@@ -118,7 +139,7 @@ class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
     expected: str | None = None
 
 
-MonitorChange = MonitorLoad | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume
+MonitorChange = MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume
 
 TokenRole = Literal["viewer", "operator", "admin"]
 
@@ -229,7 +250,7 @@ class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
 
 
 class HostPorts(AdminRequest, frozen=True, tag="host ports"):
-    """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch).
+    """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch; None: now).
 
     `name` is an enrolled or declared host's, or an address of a machine that nodes run on.
     """
@@ -237,7 +258,7 @@ class HostPorts(AdminRequest, frozen=True, tag="host ports"):
     name: str
     state: Literal["closed", "open", "unknown"]
     open: list[int]
-    checked: float
+    checked: float | None = None
     expected: int | None = None
 
 
@@ -255,16 +276,25 @@ class AuthorityWanted(AdminRequest, frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 
+class ChallengeWanted(AdminRequest, frozen=True, tag="challenge"):
+    """A challenge, under which the next order over REST is signed."""
+
+
 HostRequest = (
     HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | HostRenewed | HostList | HostKit | HostRevoke
     | HostPorts | HostsReload | RevocationsWanted | AuthorityWanted | HostEndpoint
 )  # fmt: skip
-RestRequest = (
+_Common = (
     StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
     | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange | TokenList | TokenRevoke
     | HostRequest
 )  # fmt: skip
-AnyRequest = RestRequest | TokenAdd
+RestRequest = _Common | ChallengeWanted
+RestChange = (
+    PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange | TokenRevoke | HostAdd | HostToken
+    | HostRenew | HostRevoke | HostPorts | HostsReload
+)  # fmt: skip
+AnyRequest = _Common | TokenAdd
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]

@@ -15,13 +15,21 @@ import msgspec
 import typer
 
 from appliance.audit.copies import read_copies
+from appliance.audit.exported import verify_export
 from appliance.audit.output import Entry, as_json, as_object
 from appliance.audit.query import Filter
 from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
 from appliance.cli.audit_errors import Errors, fail, tell
 from appliance.cli.audit_filter import filtered
-from appliance.cli.audit_output import line, print_entries, print_shown, print_verification, write
+from appliance.cli.audit_output import (
+    line,
+    print_entries,
+    print_export_verification,
+    print_shown,
+    print_verification,
+    write,
+)
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
 
@@ -115,16 +123,24 @@ def verify(
         Path | None,
         typer.Option("--checkpoints", help="Checkpoints kept on another machine: NDJSON, or a syslog file"),
     ] = None,
+    export_file: Annotated[
+        Path | None,
+        typer.Option("--export", help="What `rosrv audit export` wrote, on any machine; with --key"),
+    ] = None,
     as_json_lines: _Json = False,
 ) -> None:
     """Prove that the log is complete and unchanged: exit status 0, else 1; 2 if it cannot be read.
 
     The key is the one pinned beside the log, unless --key gives one that was kept elsewhere. The checkpoints
     are also held against what the signer remembers, if its directory can be read; with --checkpoints, the log against
-    what another machine was given, which nobody here can change, root neither.
+    what another machine was given, which nobody here can change, root neither. With --export, records that were
+    exported, held against the public key alone: neither the log nor the appliance is asked.
 
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
+    if export_file is not None:
+        _verify_export(export_file, key, copies=checkpoints is not None, as_json_lines=as_json_lines)
+        return
     with Errors():
         source = appliance.audit()
         copies = None if checkpoints is None else read_copies(checkpoints)
@@ -135,6 +151,23 @@ def verify(
             write(json.dumps(msgspec.to_builtins(result)))
         else:
             print_verification(result)
+        if not result.ok:
+            raise typer.Exit(1)
+
+
+def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines: bool) -> None:
+    with Errors():
+        if key is None or copies:
+            fail(
+                "--export takes --key, the appliance's public key (control/audit.pub in its state directory), and no"
+                " --checkpoints: the export has its own",
+                2,
+            )
+        result = verify_export(file, read_public_key(key))
+        if as_json_lines:
+            write(json.dumps(msgspec.to_builtins(result)))
+        else:
+            print_export_verification(result)
         if not result.ok:
             raise typer.Exit(1)
 
@@ -176,12 +209,14 @@ def export(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
-    """Write all records that match as NDJSON, oldest first.
+    """Write all records that match as NDJSON, oldest first, each with its place in the hash chain.
+
+    It proves itself elsewhere: `rosrv audit verify --export week.ndjson --key audit.pub`.
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
     source = appliance.audit()
-    entries = source.export(wanted)
+    entries = source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as told:
         if output is None:
             count = _write_all(entries, told, sys.stdout)
@@ -198,11 +233,11 @@ def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
     sys.stdout.flush()
 
 
-def _write_all(entries: Iterable[Entry], told: Callable[[int], None], file: TextIO) -> int:
+def _write_all(lines: Iterable[tuple[int, str]], told: Callable[[int], None], file: TextIO) -> int:
     count = 0
-    for count, entry in enumerate(entries, 1):
-        file.write(as_json(entry) + "\n")
+    for count, (sequence, line_of) in enumerate(lines, 1):
+        file.write(line_of + "\n")
         if count % _TOLD_EVERY == 0:
-            told(entry.sequence)
+            told(sequence)
     file.flush()
     return count

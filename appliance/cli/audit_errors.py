@@ -8,6 +8,7 @@ import typer
 
 from appliance.audit.copies import CopiesUnreadableError
 from appliance.audit.database import LogUnreadableError
+from appliance.audit.exported import ExportUnreadableError
 from appliance.audit.moment import MomentError
 from appliance.audit.output import printable
 from appliance.audit.query import FilterError
@@ -27,7 +28,7 @@ class Errors:
         match error:
             case LogUnreadableError() | KeyUnreadableError() | CopiesUnreadableError() | NotRunningError():
                 fail(str(error), CANNOT_READ)
-            case FilterError() | MomentError():
+            case FilterError() | MomentError() | ExportUnreadableError():
                 fail(str(error), CANNOT_READ)
             case BrokenPipeError():
                 # The reader (head, less) has enough: what is still buffered has nowhere to go.

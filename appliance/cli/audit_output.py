@@ -11,12 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.audit.findings import Elsewhere, Verification
+from appliance.audit.exported import ExportVerification
+from appliance.audit.findings import Elsewhere, Kind, Verification
 from appliance.audit.output import Entry, printable, rfc3339, rule_text
 from appliance.audit.record import Record, Severity
 from appliance.audit.search import Shown
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
+_FOLDED = ("denials folded", "repetitions folded")
 _MILLISECONDS = 23
 
 
@@ -84,7 +86,9 @@ def print_verification(result: Verification) -> None:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
     write(f"{result.records} records ({result.first} to {result.last}), log {printable(result.log)}")
     if result.removed:
-        write(f"records up to {result.removed} were removed by retention, which is recorded")
+        write(
+            f"records up to {result.removed} were removed by retention, which is recorded{_vouched(result)}"
+        )
     write(
         f"{result.signed_checkpoints} of {result.checkpoints} checkpoints are signed; records up to"
         f" {result.signed_through} are proven by a signature, {result.unsealed} after it by the chain only"
@@ -93,7 +97,43 @@ def print_verification(result: Verification) -> None:
         for text in _elsewhere(result.elsewhere):
             write(text)
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
-    write("The log is complete and unchanged." if result.ok else "The log was tampered with or is damaged.")
+    write(_verdict(result))
+
+
+def print_export_verification(result: ExportVerification) -> None:
+    """What of an export is proven, and each thing that is wrong on a line of its own."""
+    for finding in result.findings:
+        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+    write(
+        f"{result.records} records ({result.first} to {result.last}), log {', '.join(result.logs) or 'unknown'}"
+    )
+    write(f"{result.proven} are proven by a signed checkpoint")
+    if result.unsealed:
+        write(
+            f"{result.unsealed} come after the last signed checkpoint: nothing proves them yet; export later"
+        )
+    if result.left_out:
+        write(f"{result.left_out} records between them are not in the export")
+    write(f"key: {result.key}")
+    write(
+        "The records are as they were written."
+        if result.ok
+        else "The export was tampered with, or is not of this key."
+    )
+
+
+def _vouched(result: Verification) -> str:
+    if result.removal == "signed":
+        return "; the signer has signed that they had to go"
+    return "; the signer did not sign that: nothing proves that they had to go"
+
+
+def _verdict(result: Verification) -> str:
+    if result.ok:
+        return "The log is complete and unchanged."
+    if all(one.kind is Kind.PROVES_NOTHING for one in result.findings):
+        return "Nothing is wrong in the log itself, but the checkpoints kept elsewhere prove nothing of it."
+    return "The log was tampered with or is damaged."
 
 
 def _elsewhere(found: Elsewhere) -> Iterator[str]:
@@ -143,5 +183,5 @@ def _why(record: Record) -> str:
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"
-    count = record.detail.get("count") if record.event == "denials folded" else None
+    count = record.detail.get("count") if record.event in _FOLDED else None
     return printable(f"{count} more: {why}" if count else why)

@@ -11,10 +11,8 @@ import msgspec
 
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.findings import Verification
-from appliance.audit.moment import parse_moment
-from appliance.audit.output import Entry, rfc3339
+from appliance.audit.output import Entry, entry_of, rfc3339
 from appliance.audit.query import Filter, FilterError
-from appliance.audit.record import Record
 from appliance.audit.search import Page, Shown
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.audit_source import Progress
@@ -23,7 +21,6 @@ from appliance.cli.rest import ProblemError, RestClient
 _PATH = "/v1/audit"
 _PAGE = 1000
 _ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence; anything else is no record's
-_NOT_THE_RECORDS = ("schema", "sequence")
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream says something every 15 s
 _AGAIN_SECONDS = 1.0
@@ -47,7 +44,7 @@ class RestLog:
                 params["cursor"] = cursor
             with self._refusals():
                 page = self._get("", params)
-                entries += map(_entry, page["records"])
+                entries += map(entry_of, page["records"])
                 cursor = page["cursor"]
             if cursor is None or len(entries) >= limit:
                 return Page(entries, cursor)
@@ -59,8 +56,8 @@ class RestLog:
         try:
             with self._refusals():
                 found = self._get(f"/{record_id}", {"neighbours": neighbours})
-                before, after = ([*map(_entry, found[name])] for name in ("before", "after"))
-                return Shown(_entry(found["record"]), before, after)
+                before, after = ([*map(entry_of, found[name])] for name in ("before", "after"))
+                return Shown(entry_of(found["record"]), before, after)
         except _NothingThereError:
             return None
 
@@ -69,7 +66,14 @@ class RestLog:
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
             for line in lines:
                 if line:
-                    yield _entry(json.loads(line))
+                    yield entry_of(json.loads(line))
+
+    def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
+        """The same with their places in the chain, as the appliance gives them: sequences and lines."""
+        with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
+            for line in lines:
+                if line:
+                    yield int(json.loads(line)["sequence"]), line
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
         """The last records that match, then those that come; a connection that breaks is made anew."""
@@ -156,7 +160,7 @@ class RestLog:
             if name == "event":
                 event = value
             elif name == "data" and event == "record":
-                yield _entry(json.loads(value))
+                yield entry_of(json.loads(value))
             elif name == "data" and event == "end":
                 raise _EndedError(f"{self._client.url}: {json.loads(value)['reason']}")
 
@@ -171,6 +175,7 @@ class _EndedError(NotRunningError):
 
 def _parameters(wanted: Filter) -> dict[str, Any]:
     fields = {name: getattr(wanted, name) for name in Filter.__struct_fields__}
+    fields["looks"] = "0" if fields.pop("without_looks") else None
     params = {name: value for name, value in fields.items() if value not in (None, ())}
     for name in ("since", "until"):
         if name in params:
@@ -183,13 +188,3 @@ def _parameters(wanted: Filter) -> dict[str, Any]:
     if "decision" in params:
         params["decision"] = list(wanted.decision)
     return params
-
-
-def _entry(fields: Any) -> Entry:
-    """A record from its documented JSON object. Raises `ValueError`, `KeyError` and `TypeError` for anything else."""
-    if not isinstance(fields, dict):
-        raise TypeError("not an object")
-    own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
-    time = str(fields["time"])
-    own["time"] = int(time[1:-2]) if time.startswith("@") else parse_moment(time, 0)
-    return Entry(int(fields["sequence"]), msgspec.convert(own, Record))

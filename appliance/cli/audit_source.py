@@ -8,6 +8,7 @@ from typing import Protocol
 
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
+from appliance.audit.evidence import evidence, evidence_line
 from appliance.audit.findings import Verification
 from appliance.audit.output import Entry
 from appliance.audit.query import Filter
@@ -29,6 +30,9 @@ class AuditSource(Protocol):
 
     def export(self, wanted: Filter) -> Iterator[Entry]:
         """All records that match, the oldest first."""
+
+    def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
+        """The same as evidence: sequences, and lines of NDJSON with their places in the chain."""
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
         """The last records that match, the oldest first; then, if `on`, those that come, without end."""
@@ -70,6 +74,10 @@ class FileLog:
     def export(self, wanted: Filter) -> Iterator[Entry]:
         """All records that match, the oldest first."""
         return export(self._path, wanted)
+
+    def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
+        """The same as evidence: sequences, and lines of NDJSON with their places in the chain."""
+        return ((one.sequence, evidence_line(one, chain)) for one, chain in evidence(self._path, wanted))
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
         """The last records that match, then those that come."""

@@ -5,7 +5,7 @@ What `--help` and completion list is known without importing anything: names and
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,10 +33,16 @@ class Group:
     verbs: Mapping[str, Verb]
 
 
-def application(verbs: Verbs, **settings: Any) -> typer.Typer:
-    """An application of typer's with these verbs."""
-    app = typer.Typer(cls=_group_of(verbs), no_args_is_help=True, pretty_exceptions_enable=False, **settings)
-    app.callback()(_nothing)
+def application(verbs: Verbs, *, callback: Callable[..., None] | None = None, **settings: Any) -> typer.Typer:
+    """An application of typer's with these verbs; `callback` has the options that stand before a verb."""
+    app = typer.Typer(
+        cls=_group_of(verbs),
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        **settings,
+    )
+    app.callback()(callback or _nothing)
     return app
 
 
@@ -46,21 +52,21 @@ def _nothing() -> None:
 
 def _group_of(verbs: Verbs) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
-        """A group whose commands are made when they are asked for."""
+        """A group whose commands are imported when they are run."""
 
-        def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as typer has it
-            return list(verbs)
-
-        def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  as typer has it
-            match verbs.get(cmd_name):
-                case Group(help, inner):
-                    return _named(typer.main.get_group(application(inner, help=help)), cmd_name)
-                case Verb() as verb:
-                    return _Deferred(verb, cmd_name)
-                case None:
-                    return None
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            self.commands = {name: _command_of(verb, name) for name, verb in verbs.items()}
 
     return _Lazy
+
+
+def _command_of(verb: "Verb | Group", name: str) -> Any:
+    match verb:
+        case Group(help, inner):
+            return _named(typer.main.get_group(application(inner, help=help)), name)
+        case Verb():
+            return _Deferred(verb, name)
 
 
 def _named(command: Any, name: str) -> Any:

@@ -2,7 +2,11 @@
 
 import sys
 import traceback
+from typing import Annotated
 
+import typer
+
+from appliance import __version__
 from appliance.cli.lazy import Group, Verb, application
 
 VERBS: dict[str, Verb | Group] = {
@@ -58,7 +62,7 @@ VERBS: dict[str, Verb | Group] = {
             ),
             "reload": Verb(
                 "appliance.cli.monitor_running:reload",
-                "Take what the folder of specifications has now, in the place of what is in force.",
+                "Take what the folder of specifications has now; what was loaded from elsewhere stays in force.",
             ),
             "resume": Verb(
                 "appliance.cli.monitor_running:resume",
@@ -75,6 +79,7 @@ VERBS: dict[str, Verb | Group] = {
             ),
         },
     ),
+    "version": Verb("appliance.cli.version:version", "Show which version this is, and what it stands on."),
     "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
     "host": Verb("appliance.cli.host:app", "Enrol, list and revoke hosts that come through IPsec tunnels."),
     "backup": Verb(
@@ -87,7 +92,26 @@ VERBS: dict[str, Verb | Group] = {
     ),
     "token": Verb("appliance.cli.token:app", "Make, list and revoke access tokens for REST."),
 }
-app = application(VERBS, name="rosrv", help="A network-security appliance for ROS 1 robots.")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"rosrv {__version__}")
+        raise typer.Exit
+
+
+def _before_the_verb(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    pass
+
+
+app = application(
+    VERBS, callback=_before_the_verb, name="rosrv", help="A network-security appliance for ROS 1 robots."
+)
 
 _TOLD = frozenset({"ConfigError", "StartError", "NetworkError"})
 """Errors whose text is for a person. By name: their modules are imported only where they can occur."""
@@ -95,7 +119,7 @@ _TOLD = frozenset({"ConfigError", "StartError", "NetworkError"})
 
 def main() -> None:
     """Entry point of the command: errors are words, never a traceback."""
-    sys.argv[1:] = _without_old_flags(sys.argv[1:])
+    sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
         app()
     except Exception as error:  # noqa: BLE001  the last resort; what it was and where is still told
@@ -120,6 +144,11 @@ def _without_old_flags(arguments: list[str]) -> list[str]:
     """`rosrv -enable M…` is `rosrv monitor enable M…`."""
     verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
     return arguments if verb is None else ["monitor", verb, *arguments[1:]]
+
+
+def _asking_for_help(arguments: list[str]) -> list[str]:
+    """`rosrv help policy check` is `rosrv policy check --help`."""
+    return [*arguments[1:], "--help"] if arguments[:1] == ["help"] else arguments
 
 
 if __name__ == "__main__":

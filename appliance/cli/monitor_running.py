@@ -49,7 +49,7 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
     Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
     source = f" ({body['folder']})" if body["folder"] else ""
     differs = (
-        "; not what the folder has: rosrv monitor reload takes it"
+        "; not what the folder has (rosrv monitor reload takes that, and removes nothing that was loaded here)"
         if body["folder"] and body["differs_from_folder"]
         else ""
     )
@@ -120,13 +120,24 @@ def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
 
 @speaks
-def reload(appliance: Appliance, as_json: Json = False) -> None:
-    """Take what the folder of specifications has now, in the place of what is in force.
+def reload(
+    appliance: Appliance,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Also remove what was loaded from elsewhere than the folder")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Take what the folder of specifications has now; what was loaded from elsewhere stays in force.
 
     Example: rosrv monitor reload
     """
-    body = appliance.ask_or_exit(MonitorReload(), as_json=as_json)
+    body = appliance.ask_or_exit(MonitorReload(prune=prune), as_json=as_json)
     _say_replaced(body, as_json=as_json)
+    if body["kept"] and not as_json:
+        say(
+            f"not of the folder, and still in force: {', '.join(body['kept'])} (--prune removes them)",
+            "yellow",
+        )
     if not as_json:
         _say_disabled(appliance, [*body["added"], *body["changed"]])
 

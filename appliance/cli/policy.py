@@ -4,11 +4,13 @@ Exit status: 0 allowed, right, no difference; 1 denied, errors, a failed case, a
 """
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
+from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.policy_input import (
     Enrolled,
@@ -24,11 +26,11 @@ from appliance.cli.policy_input import (
 from appliance.cli.policy_learn import learn_policy
 from appliance.cli.policy_output import decision_fields, request_fields, say_finding
 from appliance.cli.policy_running import confirm, reload, revisions, rollback
+from appliance.cli.policy_trial import Trial, try_policy
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
     Category,
     Difference,
-    Finding,
     Policy,
     PolicyError,
     Request,
@@ -39,7 +41,7 @@ from appliance.policy import (
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.explain import Explanation, render
 from appliance.policy.findings import Severity
-from appliance.policy.policy import needs_node_rule
+from appliance.policy.rights import needs_node
 
 app = typer.Typer(
     help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
@@ -52,15 +54,23 @@ _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_d
 
 
 @app.command()
-def check(file: _File, robot: Robot = None, enrolled: Enrolled = None, as_json: Json = False) -> None:
+@speaks
+def check(
+    appliance: Appliance,
+    file: _File,
+    *,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+    as_json: Json = False,
+) -> None:
     """Report every error and warning with its place; exit status 1 if there is an error.
 
-    Example: rosrv policy check policies/landshark.ini
+    With --state or --api the running appliance says who is enrolled, and what is live and the policy would end.
+
+    Example: rosrv policy check policies/landshark.ini --state /var/lib/rosrv
     """
-    try:
-        findings: list[Finding] = list(compile_file(file, robot, enrolled).warnings)
-    except PolicyError as error:
-        findings = error.findings
+    trial = _tried(appliance, file, robot, enrolled)
+    findings = trial.findings
     errors = sum(finding.severity is Severity.ERROR for finding in findings)
     for finding in findings:
         say_finding(finding, as_json=as_json)
@@ -71,7 +81,29 @@ def check(file: _File, robot: Robot = None, enrolled: Enrolled = None, as_json: 
             f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
             "red" if errors else "green",
         )
+    for ending in trial.ends:
+        if as_json:
+            say_json({"ends": ending.what, **{k: v for k, v in asdict(ending).items() if k != "what"}})
+        else:
+            whose = f"{ending.caller_id or 'a client'} on {ending.host}"
+            say(
+                f"would end: {ending.what} {ending.resource or '(all)'} of {whose}: {ending.reason}", "yellow"
+            )
+    if trial.ends and not as_json:
+        say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
     raise typer.Exit(1 if errors else 0)
+
+
+def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Trial:
+    if appliance.said:
+        try:
+            return try_policy(appliance, file, robot, enrolled)
+        except NotRunningError as error:
+            typer.echo(f"rosrv policy: {error}; checked without it", err=True)
+    try:
+        return Trial(list(compile_file(file, robot, enrolled).warnings), [])
+    except PolicyError as error:
+        return Trial(error.findings, [])
 
 
 @app.command("explain")
@@ -115,7 +147,7 @@ def explain_request(
         request = Request(find_host(host, policy), node, category, check_resource(category, name))
     except BadWordError as error:
         raise usage_error(str(error)) from error
-    if needs_node_rule(request) and not node:
+    if needs_node(request) and not node:
         raise usage_error("this makes a node part of the graph: say its name with --node /NAME")
     explanation = explain(policy, request)
     if as_json:
@@ -130,6 +162,7 @@ def _explanation_fields(explanation: Explanation) -> dict[str, object]:
     fields: dict[str, object] = {
         **request_fields(explanation.request),
         **decision_fields(explanation.decision),
+        "told": explanation.told,
         "through": list(explanation.through),
         "lost": [
             {
@@ -142,8 +175,12 @@ def _explanation_fields(explanation: Explanation) -> dict[str, object]:
             for lost in explanation.lost
         ],
     }
-    if explanation.node is not None:
-        fields["node"] = _explanation_fields(explanation.node)
+    if explanation.limit:
+        fields["limit"] = explanation.limit
+    for word, also in (("node", explanation.node), ("command", explanation.command)):
+        if also is not None:
+            fields[word] = _explanation_fields(also)
+    if explanation.also:
         fields["together"] = "allow" if explanation.allowed else "deny"
     return fields
 
@@ -231,7 +268,7 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
 def _difference_lines(difference: Difference) -> Iterator[str]:
     request = difference.request
     who = f"{request.host} {request.caller_id}".strip()
-    yield f"{'granted' if difference.granted else 'denied'}: {who}: {request.category} {request.resource}"
+    yield f"{difference.word}: {who}: {request.category} {request.resource}"
     yield f"  seen in {counted(difference.count, 'record')}"
     yield f"  old: {difference.old.reason}"
     yield f"  new: {difference.new.reason}"

@@ -19,7 +19,7 @@ from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance, speaks
 from appliance.network import protect as protection
 from appliance.network.firewall.rules import PortRange
-from appliance.network.namespaces import NetworkError
+from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.scan import ScanResult, addresses_of, scan
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
@@ -119,6 +119,11 @@ def _make(
             sys.stderr.write(f"rosrv: note: {service} is outside {ports} and open in any case\n")
     if apply:
         protection.apply(text)
+        if Namespace.own().lacks_syn_cookies():
+            sys.stderr.write(
+                "rosrv: warning: net.ipv4.tcp_syncookies is 0 on this machine: whoever forges first packets under the"
+                " appliance's address keeps it out. sysctl -w net.ipv4.tcp_syncookies=1\n"
+            )
         _say(
             as_json,
             {"event": "applied", "ports": str(ports), "appliances": appliances},

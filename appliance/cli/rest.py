@@ -4,7 +4,8 @@ Invariants:
 
 1. The token leaves this machine encrypted, for a server whose certificate is trusted (`--api-ca`, else the system's
    authorities), or not at all: there is no way to switch that off. Clear text is for loopback addresses.
-2. The token comes from the environment, never from the command line, which every user of the machine can see.
+2. The token comes from the environment, never from the command line, which every user of the machine can see. It
+   does not leave the program: its reading key is sent, and each order is signed (`store/order_proof.py`).
 3. Nothing is followed elsewhere: no redirect, no proxy, no credentials from `.netrc`.
 """
 
@@ -12,7 +13,7 @@ import ipaddress
 import json
 import ssl
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.cli.admin_socket import SECONDS, NotRunningError
+from appliance.store.order_proof import HEADER, proof_of, reading_key, statement
+from appliance.store.tokens import parse_token
 
 _CONNECT_SECONDS = 10.0
 _LONGEST_ERROR = 1 << 20
@@ -30,8 +33,12 @@ _MAKE = "make one on its machine: rosrv token add NAME"
 class ProblemError(Exception):
     """REST refused what was asked; `lines` is what it says, the first line the sum of it."""
 
-    def __init__(self, status: int, kind: str, lines: list[str]) -> None:
+    def __init__(
+        self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
+    ) -> None:
+        """`findings`: the places of a text that are wrong, where it is about one."""
         super().__init__(lines[0])
+        self.findings = findings
         self.status = status
         self.kind = kind
         self.lines = lines
@@ -44,7 +51,7 @@ class _Place:
 
 
 class RestClient:
-    """Makes requests with a token; raises `NotRunningError` and `ProblemError`."""
+    """Makes requests for the holder of a token; raises `NotRunningError` and `ProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
         """Raises ValueError when it is no place to send a token to."""
@@ -55,7 +62,7 @@ class RestClient:
             raise ValueError(f"--api-ca is for https, and {self.url} is clear text")
         self._client = httpx.Client(
             base_url=place.url,
-            headers={"Authorization": f"Bearer {self._token}", "User-Agent": "rosrv"},
+            headers={"Authorization": f"Bearer {reading_key(self._token)}", "User-Agent": "rosrv"},
             verify=_context(authority) if place.secure else False,
             timeout=httpx.Timeout(SECONDS, connect=_CONNECT_SECONDS),
             trust_env=False,
@@ -71,11 +78,15 @@ class RestClient:
         body: Any = None,
         seconds: float | None = SECONDS,
         match: bool = False,
+        order: bool = True,
     ) -> dict[str, Any]:
-        """The answer's body. `match`: whatever is in force is changed (`If-Match: *`)."""
+        """The answer's body. `match`: whatever is in force is changed (`If-Match: *`).
+
+        What is no GET is signed, unless it is no `order`: a dry run.
+        """
         headers = {"If-Match": "*"} if match else {}
         with self.streamed(
-            method, path, params=params, body=body, seconds=seconds, headers=headers
+            method, path, params=params, body=body, seconds=seconds, headers=headers, order=order
         ) as answer:
             text = answer.read()
         try:
@@ -96,13 +107,23 @@ class RestClient:
         body: Any = None,
         seconds: float | None = SECONDS,
         headers: Mapping[str, str] | None = None,
+        order: bool = True,
     ) -> Iterator[httpx.Response]:
         """An answer while it comes."""
-        timeout = httpx.Timeout(seconds, connect=_CONNECT_SECONDS)
+        signed = order and method != "GET"
+        challenge = str(self.call("GET", "/v1/challenge").get("challenge", "")) if signed else ""
+        request = self._client.build_request(
+            method,
+            path,
+            params=params,
+            json=body,
+            headers=headers,
+            timeout=httpx.Timeout(seconds, connect=_CONNECT_SECONDS),
+        )
+        if challenge:
+            request.headers[HEADER] = proof_of(self._token, challenge, _stated(request, challenge))
         try:
-            with self._client.stream(
-                method, path, params=params, json=body, headers=headers, timeout=timeout
-            ) as answer:
+            with closing(self._client.send(request, stream=True)) as answer:
                 if answer.status_code not in (httpx.codes.OK, httpx.codes.CREATED):
                     raise self._problem(answer)
                 yield answer
@@ -154,7 +175,18 @@ class RestClient:
                 return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
         if kind == "unknown-path":
             return NotRunningError(f"{self.url}: this appliance's version does not know that over REST")
-        return ProblemError(answer.status_code, kind, detail.split("\n"))
+        return ProblemError(answer.status_code, kind, detail.split("\n"), problem.get("findings"))
+
+
+def _stated(request: httpx.Request, challenge: str) -> bytes:
+    return statement(
+        challenge,
+        method=request.method,
+        target=request.url.raw_path.decode("ascii"),
+        if_match=request.headers.get("If-Match", ""),
+        content_type=request.headers.get("Content-Type", ""),
+        body=request.content,
+    )
 
 
 def _place_of(url: str) -> _Place:
@@ -185,7 +217,7 @@ def _checked_token(token: str | None) -> str:
     text = (token or "").strip()
     if not text:
         raise ValueError(f"no access token: put it into the environment as ROSRV_TOKEN; {_MAKE}")
-    if not text.isascii() or not text.isprintable() or " " in text:
+    if parse_token(text) is None:
         raise ValueError(f"what is in ROSRV_TOKEN is no access token; {_MAKE}")
     return text
 

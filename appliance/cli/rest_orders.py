@@ -8,6 +8,11 @@ from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.rest_calls import Calls
 from appliance.cli.rest_host_orders import carry_out_on_hosts
 
+_OfMonitors = (
+    admin.MonitorsWanted | admin.MonitorLoad | admin.MonitorReload | admin.MonitorRemove | admin.MonitorSwitch
+    | admin.MonitorResume
+)  # fmt: skip
+
 
 def carry_out(rest: Calls, request: admin.AdminRequest) -> dict[str, Any]:
     """Ask over REST; the body that the admin socket's answer would have."""
@@ -62,7 +67,7 @@ def _policy(
             return rest.call("POST", "/v1/policy/confirm", match=True)
 
 
-def _monitors(rest: Calls, request: admin.MonitorsWanted | admin.MonitorChange) -> dict[str, Any]:
+def _monitors(rest: Calls, request: _OfMonitors) -> dict[str, Any]:
     path = "/v1/monitors"
     match request:
         case admin.MonitorsWanted(texts):
@@ -70,8 +75,9 @@ def _monitors(rest: Calls, request: admin.MonitorsWanted | admin.MonitorChange) 
         case admin.MonitorLoad(files, definitions, note):
             body = {"files": files, "definitions": definitions, "note": note}
             return _replaced(rest.call("POST", path, body=body, match=True))
-        case admin.MonitorReload():
-            return _replaced(rest.call("POST", f"{path}/reload", match=True))
+        case admin.MonitorReload(prune=prune):
+            params = {"prune": "1"} if prune else None
+            return _replaced(rest.call("POST", f"{path}/reload", params=params, match=True))
         case admin.MonitorRemove(names):
             return _replaced(rest.call("DELETE", path, params={"name": names}, match=True))
         case admin.MonitorSwitch(names, enabled):

@@ -1,5 +1,6 @@
 """Does the running appliance do what it must: its own status, a call through RVMaster, a message through the relay."""
 
+import secrets
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +15,7 @@ from appliance.cli.selftest_findings import Found, fail, ok, skip, told, warn
 from appliance.cli.selftest_nodes import TOPIC, RefusedError, call, message_through_the_relay
 from appliance.cli.status import troubles_of
 
-_CALLER = "/rosrv_selftest"
+_CALLER = "/rosrv_selftest"  # and a number of its own each time: what one caller reads again is counted only
 _MANY_RESTARTS = 3
 _MANY_RECORDS = 200_000
 _RECORD_SECONDS = 5.0
@@ -99,9 +100,10 @@ def _reachable(appliance: Appliance, master: str) -> str:
 def _call(appliance: Appliance, master: str) -> Iterator[Found]:
     """A call as any tool makes it: it must be answered, and be in the audit log."""
     before = _last(appliance)
+    caller = f"{_CALLER}_{secrets.token_hex(4)}"
     began, refusal = time.monotonic(), ""
     try:
-        call(master, "getPid", _CALLER)
+        call(master, "getPid", caller)
         text = "a call was allowed"
     except RefusedError as error:
         refusal = str(error)
@@ -116,7 +118,7 @@ def _call(appliance: Appliance, master: str) -> Iterator[Found]:
         yield skip("RVMaster", f"{text}; this user may not read the audit log")
         return
     try:
-        recorded = _recorded(appliance, before, refusal)
+        recorded = _recorded(appliance, before, caller, refusal)
     except (LogUnreadableError, NotRunningError) as error:
         yield skip("RVMaster", f"{text}; whether it was recorded cannot be seen: {error}")
         return
@@ -133,7 +135,7 @@ def _last(appliance: Appliance) -> int | None:
         return None
 
 
-def _recorded(appliance: Appliance, before: int, refusal: str) -> bool:
+def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
     """Whether a record after the sequence `before` is of our call; a refusal names its record.
 
     Looked for again and again, for over REST each look is a request: the pauses grow. Raises `LogUnreadableError` or
@@ -149,7 +151,7 @@ def _recorded(appliance: Appliance, before: int, refusal: str) -> bool:
                 raise
         else:
             new = [one.record for one in page.entries if one.sequence > before]
-            if any(one.caller_id == _CALLER or (refusal and one.id in refusal) for one in new):
+            if any(one.caller_id == caller or (refusal and one.id in refusal) for one in new):
                 return True
             if is_last:
                 return False

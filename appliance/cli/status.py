@@ -1,6 +1,7 @@
 """`rosrv status`: the running appliance on one screen."""
 
 import time
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
@@ -12,7 +13,7 @@ from appliance.channel.admin import StatusWanted
 from appliance.channel.serving import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.status_view import age, processes_table, shortened
+from appliance.cli.status_view import age, lacking_walls, processes_table, shortened
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
@@ -83,20 +84,25 @@ def _show(body: dict[str, Any], troubles: list[str]) -> None:
     grid.add_row("appliance", f"{body['version']} at {body['master']}, for {age(body['since'])}")
     isolation = Text(_isolation(body), style=_YELLOW if body["isolation"] == "none" else _GREEN)
     grid.add_row("isolation", isolation)
+    lacking = lacking_walls(body["processes"])
+    if lacking is not None:
+        grid.add_row("walls", Text(lacking, style=_YELLOW))
+    for name, text in _others_rules(body["firewall"]):
+        grid.add_row(name, text)
     differs = ""
     if policy["differs_from_file"]:
         theirs = policy["who"] != "disk"
         differs = (
             f"; loaded by {policy['who']}, not what the file has" if theirs else "; the file now differs"
         )
-        differs += ": rosrv policy reload takes the file"
+        differs += "" if theirs else ": rosrv policy reload takes the file"
     warnings = f", {counted(policy['warnings'], 'warning')}" if policy["warnings"] else ""
     grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
     monitors = body["monitors"]
     loaded = counted(monitors["loaded"], "monitor")
     shown = f"revision {monitors['revision']}, {monitors['enabled']} of {loaded} enabled"
     if monitors["differs_from_folder"]:
-        shown += f"; loaded by {monitors['who']}, not what the folder has: rosrv monitor reload takes it"
+        shown += f"; loaded by {monitors['who']}, not what the folder has"
     grid.add_row("monitors", shown)
     shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""
     grid.add_row(
@@ -143,8 +149,23 @@ def _ports(known: dict[str, dict[str, Any]]) -> str:
     return "; ".join(words) + (" (rosrv protect --check)" if by_state["unknown"] else "")
 
 
+def _others_rules(firewall: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What chains of other programs do on the host of isolation netns; their names are in the JSON object."""
+    translating, dropping = firewall.get("translations", []), firewall.get("obstacles", [])
+    words = []
+    if translating:
+        words.append(
+            f"{counted(len(translating), 'chain')} to translate addresses, not towards the appliance"
+        )
+    if dropping:
+        words.append(f"{counted(len(dropping), 'chain')} to drop what is forwarded")
+    if words:
+        yield "others' rules", f"{'; '.join(words)}: --json"
+
+
 def _isolation(body: dict[str, Any]) -> str:
     if body["isolation"] == "none":
         return "none: NO FIREWALL, every user of this machine reaches the ROS Master"
     back_end = body["firewall"].get("backend", "no back end reported")
-    return f"{body['isolation']}, firewall {back_end}, probe {body['probe'] or 'not run yet'}"
+    walled = ", processes walled in" if lacking_walls(body["processes"]) is None else ""
+    return f"{body['isolation']}, firewall {back_end}, probe {body['probe'] or 'not run yet'}{walled}"

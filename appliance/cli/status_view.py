@@ -36,6 +36,14 @@ def _cells(row: Mapping[str, Any], name: str, now: float | None) -> list[Text]:
     return [Text(name), Text(str(row["pid"])), Text(age(since, now)), restarts]
 
 
+def lacking_walls(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """What this kernel lacks of the walls around the processes, as far as a line holds it; None: they all stand."""
+    lacking = [f"{row['role']}: {what}" for row in rows for what in row["lacks"]]
+    if not lacking:
+        return None
+    return lacking[0] + (f" and {len(lacking) - 1} more (rosrv status --json)" if len(lacking) > 1 else "")
+
+
 def age(since: float, now: float | None = None) -> str:
     """How long ago a moment (seconds since the epoch) was, in at most two units."""
     seconds = max(0, int((time.time() if now is None else now) - since))

@@ -12,16 +12,17 @@ import setproctitle
 import structlog
 import typer
 
+from appliance.cli.up_inputs import read_inputs
 from appliance.config import Settings
 from appliance.config_sources import resolve
 from appliance.master.robot import own_address
-from appliance.policy import PolicyError, compile_policy
-from appliance.policy.policy import DEFAULT_PORTS
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.run import run_appliance
 from appliance.supervisor.supervisor import ControlReady
+
+_MOST_WARNINGS = 10
 
 log = structlog.get_logger()
 
@@ -79,20 +80,13 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
+    node_ports = read_inputs(settings)
     run_appliance(
         settings,
         roles_of(api=settings.api_address is not None, syslog=settings.audit.syslog.to is not None),
         partial(_announce, as_json=as_json),
-        node_ports=_node_ports(settings.policy),
+        node_ports=node_ports,
     )
-
-
-def _node_ports(file: Path) -> range:
-    """The ports that the policy gives to nodes. What is wrong with the policy is for control to say."""
-    try:
-        return compile_policy(file.read_text(encoding="utf-8", errors="replace"), file=str(file)).ports
-    except (OSError, PolicyError):
-        return DEFAULT_PORTS
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
@@ -108,9 +102,16 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         }
         if said.token is not None:
             event["token"] = said.token
+        if said.warnings:
+            event["warnings"] = said.warnings
         line = json.dumps(event)
     else:
         line = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
+        more += said.warnings[:_MOST_WARNINGS]
+        if len(said.warnings) > _MOST_WARNINGS:
+            more.append(
+                f"and {len(said.warnings) - _MOST_WARNINGS} more warnings: rosrv policy check {settings.policy}"
+            )
         if settings.isolation == "netns":
             port = settings.listen_address[1]
             more.append(

@@ -13,6 +13,8 @@ import json
 import socket
 from datetime import UTC, datetime
 
+import msgspec
+
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
 from appliance.audit.output import Entry, printable, rule_text
 from appliance.audit.record import Record, Severity
@@ -61,7 +63,9 @@ class Formatter:
     def checkpoint(self, one: SignedCheckpoint) -> bytes:
         """A signed checkpoint: what `rosrv audit verify --checkpoints` finds again in the receiver's file."""
         head = self._head(Severity.NOTICE, one.time, "checkpoint signed")
-        fields = {name: str(getattr(one, name)) for name in one.__struct_fields__}
+        fields = {
+            name: str(value) for name, value in msgspec.structs.asdict(one).items() if value is not None
+        }
         return _message(head, SYSLOG_ELEMENT, fields, f"checkpoint {one.number} of the audit log")
 
     def _head(self, severity: Severity, time: int, event: str) -> str:

@@ -4,7 +4,8 @@ Invariants:
 1. The private key is made at the first start in the signer's own directory (mode 0600) and never leaves the
    process; a key file that is damaged or readable by others is an error, never replaced.
 2. It parses only the messages of its lifeline and its link to control (and the signing requests in them), and
-   signs only audit checkpoints, certificates of the appliance's own authority and its list of revoked ones.
+   signs only audit checkpoints, removals of old records that follow from the settings (`removals.py`), certificates of
+   the appliance's own authority and its list of revoked ones.
 3. It remembers what it signed (`checkpoints.py`) and signs no second past; `rosrv audit verify` holds the log
    against that memory, so cutting the log's end or taking its signatures away is found.
 4. Every signing request is answered, whatever it does to the parser: what else was read with it is served.
@@ -38,6 +39,9 @@ from appliance.channel.messages import (
     Lifeline,
     Message,
     Ready,
+    RemovalApproved,
+    RemovalRefused,
+    RemovalWanted,
     RevocationsMade,
     RevocationsWanted,
     SignatureMade,
@@ -51,6 +55,7 @@ from appliance.ipsec.authority_key import Kind, read_passphrase
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 from appliance.ipsec.proof import RequestRefusedError
+from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
@@ -89,11 +94,12 @@ class Signer:
     """Answers one lifeline and the link to control until it is told to stop."""
 
     def __init__(
-        self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority
+        self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority, kept: Kept
     ) -> None:
         self._child = Child(lifeline, SignerLink, said=self._control_said)
         self._authority = authority
         self._signed = SignedCheckpoints(directory)
+        self._removals = Removals(self._signed, kept)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 
@@ -112,6 +118,8 @@ class Signer:
         match message:
             case SignatureWanted(number, text):
                 return self._sign(number, text)
+            case RemovalWanted(number, checkpoint, newest):
+                return self._approve_removal(number, checkpoint, newest)
             case AuthorityWanted(number):
                 return AuthorityStated(number, self._authority.certificate)
             case CertificateWanted():
@@ -128,6 +136,13 @@ class Signer:
         except (CheckpointRefusedError, OSError) as error:
             return SignatureRefused(number, str(error))
         return SignatureMade(number, self._key.sign(text), self._public_key)
+
+    def _approve_removal(self, number: int, checkpoint: bytes, newest: bytes) -> Message:
+        try:
+            text = self._removals.approve(checkpoint, newest)
+        except (RemovalRefusedError, CheckpointRefusedError, OSError) as error:
+            return RemovalRefused(number, str(error))
+        return RemovalApproved(number, text, self._key.sign(text), self._public_key)
 
     def _issue(self, wanted: CertificateWanted) -> Message:
         try:
@@ -146,11 +161,19 @@ class Signer:
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
     """Be the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the file that has it."""
     settings = load_resolved(config)
-    serve(lifeline_fd, settings.state / "signer", settings.ipsec.ca, passphrase)
+    audit = settings.audit
+    kept = Kept(audit.retention_days, None if audit.retention_bytes is None else int(audit.retention_bytes))
+    serve(lifeline_fd, settings.state / "signer", settings.ipsec.ca, passphrase, kept)
 
 
-def serve(lifeline_fd: int, directory: Path, kind: Kind = "ecdsa", passphrase: int | None = None) -> None:
-    """The same, with the directory of the keys and the kind of the authority's."""
+def serve(
+    lifeline_fd: int,
+    directory: Path,
+    kind: Kind = "ecdsa",
+    passphrase: int | None = None,
+    kept: Kept = Kept(),  # noqa: B008  frozen
+) -> None:
+    """The same, with the directory of the keys, the kind of the authority's, and how long records are kept."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
     try:
         os.umask(0o077)
@@ -159,4 +182,4 @@ def serve(lifeline_fd: int, directory: Path, kind: Kind = "ecdsa", passphrase: i
     except (SignerKeyError, OSError) as error:
         lifeline.send(Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)
-    asyncio.run(Signer(lifeline, directory, key, authority).run())
+    asyncio.run(Signer(lifeline, directory, key, authority, kept).run())

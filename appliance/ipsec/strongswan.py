@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.channel.messages import APPLIANCE_NAME, Esp
+from appliance.shares.table import IKE_HANDSHAKES
 
 USER_SPACE_INTERFACE = "ipsec0"
 IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")
@@ -52,8 +53,8 @@ charon-systemd {{
   retransmit_base = 1.6
   half_open_timeout = 15
   cookie_threshold = 30
-  block_threshold = 10
-  init_limit_half_open = 200
+  block_threshold = {IKE_HANDSHAKES.bounds.host}
+  init_limit_half_open = {IKE_HANDSHAKES.bounds.whole}
   plugins {{
     vici {{
       socket = unix://{directory}/vici.sock

@@ -13,6 +13,7 @@ import msgspec
 
 import appliance
 from appliance.channel import admin
+from appliance.master.allocation import TOPIC
 from appliance.master.core import Master
 from appliance.master.host_orders import MINE as HOST_ORDERS
 from appliance.master.host_orders import manage_hosts
@@ -35,7 +36,13 @@ from appliance.master.tokens import TokenRefusedError, Tokens
 from appliance.store.state import RevisionRow, StateStore
 from appliance.store.tokens import TokenRow
 
-_CATEGORIES = {Kind.PUBLICATION: "publish", Kind.SUBSCRIPTION: "subscribe", Kind.SERVICE: "offer"}
+# What is live, and the requests that it needs: the category, and the resource where it is another than its own.
+_LIVE: dict[Kind, tuple[tuple[str, str], ...]] = {
+    Kind.PUBLICATION: (("publish", ""),),
+    Kind.SUBSCRIPTION: (("subscribe", ""),),
+    Kind.SERVICE: (("offer", ""),),
+    Kind.PARAMETER: (("read", ""), ("command", "subscribeParam")),
+}
 _View = (
     admin.StatusWanted
     | admin.PolicyRevisions
@@ -120,6 +127,7 @@ class Administration:
                 return await self._manage_tokens(request)
             case (
                 admin.MonitorLoad()
+                | admin.MonitorReplace()
                 | admin.MonitorReload()
                 | admin.MonitorRemove()
                 | admin.MonitorSwitch()
@@ -267,16 +275,20 @@ class Administration:
         }
 
     def _registrations(self) -> list[dict[str, Any]]:
-        return [
-            {
-                "host": str(incarnation.host),
-                "caller_id": incarnation.name,
-                "category": _CATEGORIES[registration.kind],
-                "resource": registration.resource,
-            }
+        """Everything live that a policy may end, as the requests that it was granted by."""
+        rows = [
+            (str(incarnation.host), incarnation.name, category, resource or registration.resource)
             for incarnation, registration in self._master.registry.in_order()
-            if registration.kind in _CATEGORIES and not incarnation.own
+            if not incarnation.own
+            for category, resource in _LIVE[registration.kind]
         ]
+        rows += [
+            (row.host, row.caller_id, "call", row.resource)
+            for row in self._master.relay.permissions()
+            if row.kind != TOPIC  # a subscription is one already
+        ]
+        names = ("host", "caller_id", "category", "resource")
+        return [dict(zip(names, row, strict=True)) for row in dict.fromkeys(rows)]
 
 
 def _trouble(error: TokenRefusedError | HostRefusedError) -> admin.Trouble:

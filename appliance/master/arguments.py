@@ -73,10 +73,24 @@ def _service_api(value: Value, _caller_id: str) -> ApiUri:
     return ApiUri(text, parse_service_uri(text))
 
 
-def _anything(value: Value, _caller_id: str) -> Value:
+def _parameter_value(value: Value, _caller_id: str) -> Value:
     if value is None:
         raise ProtocolError("must be specified")
+    _check_members(value, "")
     return value
+
+
+def _check_members(value: Value, place: str) -> None:
+    """A namespace's members are below it: ROSMaster would read a name like `/a` as the key of another parameter."""
+    if not isinstance(value, dict):
+        return
+    for name, member in value.items():
+        if not names.is_relative_member(name):
+            where = f"in {place!a} " if place else ""
+            raise InvalidNameError(
+                f"has a member {where}named {name[:80]!a}, which is no relative name: write 'name' or 'namespace/name'"
+            )
+        _check_members(member, f"{place}/{name}"[:80])
 
 
 def _names(value: Value, caller_id: str) -> list[str]:
@@ -85,10 +99,13 @@ def _names(value: Value, caller_id: str) -> list[str]:
     return [_text(one, caller_id) for one in value]
 
 
-def _list(value: Value, _caller_id: str) -> list[Value]:
-    if not isinstance(value, list):
-        raise ProtocolError(f"must be a list, not {_type_name(value)}")
-    return value
+def _protocols(value: Value, _caller_id: str) -> list[list[Value]]:
+    if not isinstance(value, list) or not value:
+        raise ProtocolError("must be specified and a list that is not empty")
+    protocols = [one for one in value if isinstance(one, list)]
+    if len(protocols) != len(value):
+        raise ProtocolError("must be a list of protocols, each a list of its name and its parameters")
+    return protocols
 
 
 TOPIC = Parameter("topic", _name)
@@ -100,21 +117,21 @@ SERVICE_API = Parameter("service_api", _service_api)
 SUBGRAPH = Parameter("subgraph", _subgraph)
 KEY = Parameter("key", _key)
 SEARCH_KEY = Parameter("key", _search_key)
-VALUE = Parameter("value", _anything)
+VALUE = Parameter("value", _parameter_value)
 MESSAGE = Parameter("msg", _text)
 STATE = Parameter("state", _text)
 MONITORS = Parameter("monitors", _names)
-PROTOCOLS = Parameter("protocols", _list)
+PROTOCOLS = Parameter("protocols", _protocols)
 METHOD = Parameter("method_name", _text)
 
 
 def canonicalise(
-    parameters: tuple[Parameter, ...], required: int, caller_id: str, values: tuple[Value, ...]
+    parameters: tuple[Parameter, ...], caller_id: str, values: tuple[Value, ...]
 ) -> tuple[object, ...]:
     """The canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
-    check_arity(parameters, required, values)
+    check_arity(parameters, values)
     canonical = []
-    for parameter, value in zip(parameters, values, strict=False):
+    for parameter, value in zip(parameters, values, strict=True):
         try:
             canonical.append(parameter.canonicalise(value, caller_id))
         except PeerError as error:
@@ -122,9 +139,9 @@ def canonicalise(
     return tuple(canonical)
 
 
-def check_arity(parameters: tuple[Parameter, ...], required: int, values: tuple[Value, ...]) -> None:
+def check_arity(parameters: tuple[Parameter, ...], values: tuple[Value, ...]) -> None:
     """Raise `ProtocolError`, with ROSMaster's words, unless there are as many values as the call takes."""
-    if not required <= len(values) <= len(parameters):
+    if len(values) != len(parameters):
         raise ProtocolError("Error: bad call arity")
 
 

@@ -26,7 +26,6 @@ from appliance.master.graph import Graph
 from appliance.master.hosts import Hosts
 from appliance.master.http import Handler
 from appliance.master.inner import InnerFace
-from appliance.master.journal import StoreJournal
 from appliance.master.later import Later
 from appliance.master.lifeline import ControlLifeline
 from appliance.master.liveness import Liveness, LivenessSettings
@@ -34,6 +33,7 @@ from appliance.master.mediation import Mediation
 from appliance.master.monitors import Monitors
 from appliance.master.moving import Moving
 from appliance.master.node_calls import NODE_CALLS
+from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameters import ParameterMirror, may_be_told
 from appliance.master.pipeline import Pipeline
 from appliance.master.places import Places
@@ -42,15 +42,19 @@ from appliance.master.publisher import OwnPublisher
 from appliance.master.reconcile import Reconciler
 from appliance.master.recorder import Recorder
 from appliance.master.registration import withdraw_lost
-from appliance.master.registry import Incarnation, Life, Registration, Registry
+from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RelayControl
 from appliance.master.reminders import Reminders
 from appliance.master.revocation import Revocation
 from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.master.standing import HostStanding
+from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.ros.standard import standard_definitions
 from appliance.ros.xmlrpc import Value
+from appliance.shares.pool import Pool
+from appliance.shares.table import PARAMETER_BYTES
 from appliance.store.state import StateStore
 
 RVMASTER, INNER = "rvmaster", "inner"
@@ -72,6 +76,8 @@ class Foundation:
     policies: Policies
     monitors: Monitors
     hosts: Hosts
+    registry: Registry
+    standing: HostStanding
     doors: Doors
     sockets: Mapping[str, socket.socket]
     parameters_dirty: asyncio.Event
@@ -138,6 +144,9 @@ class _Wires:
     def redecide_for(self, host: Address, caller_id: str) -> int:
         return self.revocation().redecide_for(host, caller_id)
 
+    def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
+        return self.revocation().may_have(incarnation, kind, resource)
+
     def may_be_told(self, incarnation: Incarnation, key: str, value: Value) -> bool:
         return may_be_told(self.master(), incarnation, key, value)
 
@@ -165,7 +174,7 @@ def assemble(base: Foundation) -> Parts:
     parameters = ParameterMirror(
         base.store.load_parameters(),
         base.parameters_dirty.set,
-        bytes_limit=int(base.settings.limits.parameter_bytes),
+        _make_charges(base),
         depth_limit=base.settings.limits.nesting,
         note=base.store.note_parameter,
         since=base.store.parameter_changes(),
@@ -179,6 +188,7 @@ def assemble(base: Foundation) -> Parts:
             parameters,
             base.recorder,
             own_parameters=own_parameters,
+            may_have=wires.may_have,
         )
     )
     wires.liveness.fill(_make_liveness(base, wires, reach, reconciler))
@@ -186,14 +196,22 @@ def assemble(base: Foundation) -> Parts:
     return _finish(base, wires, reach, master)
 
 
+def _make_charges(base: Foundation) -> ParameterCharges:
+    whole = int(base.settings.limits.parameter_bytes)
+    bounds = PARAMETER_BYTES.bounds.sized(whole, whole // 2)
+    pool = Pool("bytes of parameters", bounds, base.standing)
+    return ParameterCharges(pool, base.store, base.store.parameter_owners())
+
+
 def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
     settings = base.settings
-    registry = Registry(StoreJournal(base.store))
+    registry = base.registry
     places = Places(
         settings.listen_address[0],
         base.policies.current.ports,
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
+        named_as=lambda host: base.policies.current.named_as(host),  # noqa: PLW0108 - the one in force then
         relays=settings.relays,
     )
     addresses = Addresses(
@@ -205,6 +223,7 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         timeout=settings.limits.node_call_seconds,
         limits=value_limits(settings),
         troubled=wires.node_troubled,
+        standing=base.standing,
     )
     relay = RelayControl(
         registry,
@@ -213,6 +232,7 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         delivery,
         base.recorder,
         allocation=base.monitors.allocation,
+        policy=lambda: base.policies.current,
         broken=wires.look_at,
     )
     mediation = Mediation(
@@ -265,6 +285,7 @@ def _make_liveness(base: Foundation, wires: _Wires, reach: _Reach, reconciler: R
         withdraw=wires.withdraw,
         put_back=reconciler.put_back,
         returned=wires.returned,
+        standing=base.standing,
     )
 
 
@@ -321,11 +342,17 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
         str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own
     )
 
-    def policy_changed(ports: range) -> int:
-        reach.places.set_range(ports)
-        return revocation.redecide()
+    in_force = base.policies.current
 
-    base.policies.changed = lambda policy: policy_changed(policy.ports)
+    def policy_changed(policy: Policy) -> int:
+        nonlocal in_force
+        before, in_force = in_force, policy
+        reach.places.policy_changed(policy.ports)
+        revoked = revocation.redecide()
+        relay.policy_changed(before, policy)
+        return revoked
+
+    base.policies.changed = policy_changed
     return Parts(
         master=master,
         places=reach.places,
@@ -338,14 +365,10 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
                 master,
                 limits=value_limits(base.settings),
                 offload=int(base.settings.limits.offload_bytes),
+                standing=base.standing,
             )
         ),
-        inner=InnerFace(
-            reach.registry,
-            reach.delivery,
-            value_limits(base.settings),
-            tell_parameter=reach.graph.tell_parameter,
-        ),
+        inner=InnerFace(reach.registry),
     )
 
 

@@ -4,19 +4,24 @@ A tree of parameters takes ten times its size while it is read from ROSMaster an
 needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, one of each host, and hosts take turns.
 """
 
+import contextlib
+from collections.abc import AsyncIterator, Callable
 from typing import Self
 
 from appliance.master.turns import Turns
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Value
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import LARGE_WRITES
 
 AT_ONCE = 2
+_BOUNDS = Bounds(whole=AT_ONCE, host=1, strangers=1, kept=1)
 _VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # about what XML-RPC writes around a value
 
 
-def bulk_turns() -> Turns:
+def bulk_turns(standing: Callable[[Address], Standing]) -> Turns:
     """The turns that all requests share."""
-    return Turns(AT_ONCE, 1)
+    return Turns(_BOUNDS, standing)
 
 
 class Bulk:
@@ -26,6 +31,7 @@ class Bulk:
         self._turns = turns
         self._host = host
         self.taken = False
+        self.large = False  # whether the request itself is
 
     async def __aenter__(self) -> Self:
         return self
@@ -44,6 +50,30 @@ class Bulk:
         if self.taken:
             self.taken = False
             self._turns.leave(self._host)
+
+
+class LargeWrites:
+    """Large values on their way to ROSMaster: few at a time, one of each host.
+
+    ROSMaster is one Python process: what many of its threads read at once, all others wait for. Whoever has a turn
+    waits for nothing but ROSMaster.
+    """
+
+    def __init__(self, enough: int, standing: Callable[[Address], Standing]) -> None:
+        self._turns = Turns(LARGE_WRITES.bounds, standing)
+        self._enough = enough
+
+    @contextlib.asynccontextmanager
+    async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[None]:
+        """Carry out what brings these values to ROSMaster; small ones wait for nobody."""
+        if weigh(values, self._enough) < self._enough:
+            yield
+            return
+        await self._turns.enter(host)
+        try:
+            yield
+        finally:
+            self._turns.leave(host)
 
 
 def weigh(value: Value, enough: int) -> int:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from appliance.master.arguments import Parameter
 from appliance.master.http import Peer
-from appliance.master.registry import Incarnation
-from appliance.policy.model import Category, Decision
+from appliance.master.registry import Incarnation, Kind
+from appliance.policy.model import Category, Decision, told_of
+from appliance.policy.rights import category_of, touch_of
 from appliance.ros.xmlrpc import Value
 
 if TYPE_CHECKING:
@@ -23,9 +24,9 @@ Answer = list[Value]
 Perform = Callable[["Master", "Caller", tuple[object, ...]], Awaitable[Value]]
 
 
-def denial_text(decision: Decision, record: str) -> str:
-    """What a denied caller is told: the reason, which names the rule and where it stands, and the record's id."""
-    return f"{decision.reason} [{record}]"
+def denial_text(decision: Decision, record: str, tell: str) -> str:
+    """What a denied caller is told: as much of the reason as the policy lets be told, and the record's id."""
+    return f"{told_of(decision, tell)} [{record}]"
 
 
 class LimitReachedError(Exception):
@@ -38,13 +39,6 @@ class Identity(enum.Enum):
     NODE = "node"  # makes the node part of the graph: [Nodes] must grant the name, nobody else may hold it
     FREE = "free"  # nobody else may hold the name; it need not be a node's
     NOBODY = "nobody"  # the call has no caller_id
-
-
-class Touch(enum.Enum):
-    """How a call touches a parameter, for `[Parameters]`."""
-
-    READ = "read"
-    WRITE = "write"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +60,38 @@ class Caller:
 class Call:
     """One row of a table of calls.
 
-    parameters  what follows the caller_id; the last `optional` of them may be left out
+    parameters  what follows the caller_id
     denial      the value of a denied answer: of the type the call returns, so that no client library stumbles over it
     identity    what is checked of the caller_id; `reads`: the call only reads, an empty one will do
-    category    what the policy is asked about, with the parameter at `resource`, or the call's own name as a command
-    command     asked of `[Commands]` as well, or under this name
-    touches     how it touches a parameter: asked of `[Parameters]` as well, when the policy has it
+    resource    which parameter it is about: a topic, a service, or a ROS parameter's key
+    command     the name that the policy knows it by, where that is another (`policy/rights` says what it needs)
     api         which parameter is the node's API URI
+    registers   what a node has from then on; `gives_up`: what it has no more
     """
 
     name: str
     perform: Perform
     parameters: tuple[Parameter, ...] = ()
-    optional: int = 0
     denial: Value = 0
     identity: Identity = Identity.FREE
-    category: Category = Category.COMMAND
     resource: int | None = None
     command: str | None = None
-    touches: Touch | None = None
     api: int | None = None
+    registers: Kind | None = None
+    gives_up: Kind | None = None
     reads: bool = False
+
+    @property
+    def category(self) -> Category:
+        """What kind of thing it is decided and recorded as."""
+        return category_of(self.policy_name)
+
+    @property
+    def touches(self) -> Category | None:
+        """Whether it reads or writes the ROS parameter that it is about."""
+        return touch_of(self.policy_name)
+
+    @property
+    def policy_name(self) -> str:
+        """The name that the policy knows it by."""
+        return self.command or self.name

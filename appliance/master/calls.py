@@ -1,7 +1,8 @@
 """The table of the Master API: one row per call. A call that is not here is denied.
 
 The columns are explained at `Call`. To add a call, write its function beside its kin (`registration`, `lookups`,
-`parameters`, `parameter_search`) and its row here; the policy knows it by `policy/commands.py`.
+`parameters`, `parameter_search`) and its row here; the policy knows it by `policy/commands.py` and says what it needs
+in `policy/rights.py`.
 """
 
 from appliance.master import lookups, monitor_calls, parameter_search, parameters, registration
@@ -21,8 +22,8 @@ from appliance.master.arguments import (
     TOPIC_TYPE,
     VALUE,
 )
-from appliance.master.call import Answer, Call, Caller, Identity, Touch
-from appliance.policy.model import Category
+from appliance.master.call import Answer, Call, Caller, Identity
+from appliance.master.registry import Kind
 
 _REGISTRATION = (
     Call(
@@ -31,18 +32,18 @@ _REGISTRATION = (
         (TOPIC, TOPIC_TYPE, CALLER_API),
         denial=[],
         identity=Identity.NODE,
-        category=Category.PUBLISH,
         resource=0,
         api=2,
+        registers=Kind.PUBLICATION,
     ),
     Call(
         "unregisterPublisher",
         registration.unregister_publisher,
         (TOPIC, CALLER_API),
         identity=Identity.NODE,
-        category=Category.PUBLISH,
         resource=0,
         api=1,
+        gives_up=Kind.PUBLICATION,
     ),
     Call(
         "registerSubscriber",
@@ -50,35 +51,35 @@ _REGISTRATION = (
         (TOPIC, TOPIC_TYPE, CALLER_API),
         denial=[],
         identity=Identity.NODE,
-        category=Category.SUBSCRIBE,
         resource=0,
         api=2,
+        registers=Kind.SUBSCRIPTION,
     ),
     Call(
         "unregisterSubscriber",
         registration.unregister_subscriber,
         (TOPIC, CALLER_API),
         identity=Identity.NODE,
-        category=Category.SUBSCRIBE,
         resource=0,
         api=1,
+        gives_up=Kind.SUBSCRIPTION,
     ),
     Call(
         "registerService",
         registration.register_service,
         (SERVICE, SERVICE_API, CALLER_API),
         identity=Identity.NODE,
-        category=Category.OFFER,
         resource=0,
         api=2,
+        registers=Kind.SERVICE,
     ),
     Call(
         "unregisterService",
         registration.unregister_service,
         (SERVICE, SERVICE_API),
         identity=Identity.NODE,
-        category=Category.OFFER,
         resource=0,
+        gives_up=Kind.SERVICE,
     ),
 )
 
@@ -89,9 +90,7 @@ _LOOKUPS = (
         lookups.lookup_service,
         (SERVICE,),
         denial="",
-        category=Category.CALL,
         resource=0,
-        command="lookupService",
         reads=True,
     ),
     Call("getSystemState", lookups.get_system_state, denial=[[], [], []], reads=True),
@@ -99,14 +98,14 @@ _LOOKUPS = (
     Call("getTopicTypes", lookups.get_topic_types, denial=[], reads=True),
     Call("getUri", lookups.get_uri, denial="", reads=True),
     Call("getPid", lookups.get_pid, denial=-1, reads=True),
-    Call("shutdown", lookups.shutdown_master, (MESSAGE,), optional=1, command="shutdownMaster"),
+    Call("shutdown", lookups.shutdown_master, (MESSAGE,), command="shutdownMaster"),
 )
 
 _PARAMETERS = (
-    Call("getParam", parameters.get_param, (KEY,), touches=Touch.READ, reads=True),
-    Call("hasParam", parameters.has_param, (KEY,), denial=False, touches=Touch.READ, reads=True),
-    Call("setParam", parameters.set_param, (KEY, VALUE), touches=Touch.WRITE),
-    Call("deleteParam", parameters.delete_param, (KEY,), touches=Touch.WRITE),
+    Call("getParam", parameters.get_param, (KEY,), resource=0, reads=True),
+    Call("hasParam", parameters.has_param, (KEY,), denial=False, resource=0, reads=True),
+    Call("setParam", parameters.set_param, (KEY, VALUE), resource=0),
+    Call("deleteParam", parameters.delete_param, (KEY,), resource=0),
     Call("searchParam", parameter_search.search_param, (SEARCH_KEY,), denial="", reads=True),
     Call("getParamNames", parameters.get_param_names, denial=[], reads=True),
     Call(
@@ -114,16 +113,18 @@ _PARAMETERS = (
         parameters.subscribe_param,
         (CALLER_API, KEY),
         identity=Identity.NODE,
-        touches=Touch.READ,
+        resource=1,
         api=0,
+        registers=Kind.PARAMETER,
     ),
     Call(
         "unsubscribeParam",
         parameters.unsubscribe_param,
         (CALLER_API, KEY),
         identity=Identity.NODE,
-        touches=Touch.READ,
+        resource=1,
         api=0,
+        gives_up=Kind.PARAMETER,
     ),
 )
 

@@ -1,6 +1,7 @@
 """What the relays carry, as they report it: connections, each with its records, and traffic."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import zip_longest
@@ -9,6 +10,7 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.messages import TopicTraffic
 from appliance.master.recorder import Recorder
+from appliance.policy.limits import LimitRule
 
 MOST_RESOURCES = 2000
 OTHERS = "(others)"  # no name of ROS has a bracket
@@ -71,12 +73,26 @@ class Traffic:
 class Carried:
     """Connections and traffic of all relays; `name(key)` is the name of an incarnation, None of an unknown one."""
 
-    def __init__(self, recorder: Recorder, name: Callable[[str], str | None], relays: int) -> None:
+    def __init__(
+        self,
+        recorder: Recorder,
+        name: Callable[[str], str | None],
+        relays: int,
+        *,
+        is_own: Callable[[str, str, str], bool],
+    ) -> None:
+        """`name` is of a key; `is_own` says of host, caller id and topic whether our own node subscribes there."""
         self._recorder = recorder
         self._name_of = name
+        self._is_own = is_own
         self._relays = relays
         self.connections: dict[tuple[int, int], Connection] = {}
         self.traffic: dict[tuple[str, str], Traffic] = {}
+        self.limited_messages: Counter[tuple[str, str]] = Counter()
+        """How many messages limits dropped, by topic and whose limit it was; of at most `MOST_RESOURCES` topics."""
+        self._limited_topics: set[str] = set()
+        self.memory: dict[int, dict[str, int]] = {}
+        """The bytes that each relay holds, by what they are."""
         self.past: dict[str, Traffic] = {}
         """What went through topics and services of incarnations that are forgotten: counters never go back.
 
@@ -105,7 +121,8 @@ class Carried:
         }
 
     def lost(self, relay: int) -> None:
-        """A relay is gone, and its connections with it."""
+        """A relay is gone, and its connections and memory with it."""
+        self.memory.pop(relay, None)
         for number in [one for one in self.connections if one[0] == relay]:
             del self.connections[number]
 
@@ -169,14 +186,16 @@ class Carried:
         )
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """Somebody was turned away."""
+        """Somebody was turned away; our own node that comes too late for what it may have attacks nobody."""
+        own = self._is_own(message.host, message.caller_id, message.resource)
         self._recorder.happened(
             "connection refused",
             message.reason,
-            severity=Severity.WARNING,
-            decision="deny",
+            severity=Severity.INFO if own else Severity.WARNING,
+            decision=None if own else "deny",
             host=message.host,
             caller_id=message.caller_id,
+            category=message.kind or None,
             resource=message.resource,
             node=self._name(message.key),
             count=message.count,
@@ -195,6 +214,46 @@ class Carried:
                 category="topic",
                 resource=message.topic,
             )
+
+    def latch_refused(self, message: messages.LatchRefused, host: str) -> None:
+        """A relay does not keep the latched message of a publisher at this address."""
+        self._recorder.happened(
+            "limit exceeded",
+            "its latched message is not kept for later subscribers: its host has no memory left for such in the relay",
+            severity=Severity.ALARM,
+            decision="deny",
+            host=host,
+            caller_id=self._name(message.key),
+            category="topic",
+            resource=message.topic,
+            size=message.size,
+        )
+
+    def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
+        """A relay dropped messages that were beyond a limit of the policy (`rule`, unless that has gone meanwhile)."""
+        topic = row.topic or OTHERS
+        known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
+        self._limited_topics.add(name := topic if known else OTHERS)
+        self.limited_messages[name, row.part] += row.messages
+        whose = {
+            "publisher": "a publisher may send",
+            "subscriber": "a subscriber gets",
+            "topic": "all publishers together may send",
+        }[row.part]
+        self._recorder.happened(
+            "rate limited",
+            f"messages beyond what {whose} were dropped",
+            severity=Severity.INFO if row.part == "subscriber" else Severity.WARNING,
+            host=row.host or None,
+            caller_id=row.caller_id or None,
+            category="topic",
+            resource=row.topic,
+            rule=rule.rule if rule is not None else None,
+            part=row.part,
+            publisher=self._name(row.key),
+            count=row.messages,
+            bytes=row.bytes,
+        )
 
     def publication_refused(self, message: messages.PublicationRefused) -> None:
         """A publisher is not carried."""

@@ -8,10 +8,12 @@ import asyncio
 import socket
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import cast
 
 import httptools
 
+from appliance.master.bulk import weigh
 from appliance.ros.errors import PeerError
 from appliance.ros.uris import NodeUri, node_uri
 from appliance.ros.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
@@ -23,6 +25,14 @@ class CallFailedError(Exception):
 
 class RefusedError(CallFailedError):
     """The other side refuses connections or cannot be reached: nobody is there."""
+
+
+class UnreachedError(CallFailedError):
+    """The time was over before there was a connection: the other side's machine is away, or its answers are."""
+
+
+class UnansweredError(CallFailedError):
+    """There was a connection and the time was over before an answer: the other side hangs, or is very slow."""
 
 
 class BrokenOffError(CallFailedError):
@@ -60,15 +70,18 @@ class XmlRpcClient:
 
     async def call(self, method: str, *params: Value) -> Value:
         """Call `method` and return its value. Raises `CallFailedError` (or `RefusedError`)."""
-        body = build_call(method, params)
+        body = await self._written(method, params)
         request = self._head % len(body) + body
+        attempt = _Attempt()
         try:
             async with asyncio.timeout(self._timeout):
-                response = await self._exchange(request)
+                response = await self._exchange(request, attempt)
         except TimeoutError:
-            raise CallFailedError(
-                f"{self._where} did not answer {method} within {self._timeout:g} s"
-            ) from None
+            if attempt.connected:
+                why = f"{self._where} did not answer {method} within {self._timeout:g} s"
+                raise UnansweredError(why) from None
+            why = f"{self._where} cannot be reached: no connection within {self._timeout:g} s"
+            raise UnreachedError(why) from None
         except OSError as error:
             raise _kind(error)(f"{self._where} could not be called: {error.strerror or error}") from error
         try:
@@ -80,24 +93,32 @@ class XmlRpcClient:
         except PeerError as error:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
+    async def _written(self, method: str, params: tuple[Value, ...]) -> bytes:
+        if weigh(list(params), _OFFLOAD) < _OFFLOAD:
+            return build_call(method, params)
+        return await asyncio.to_thread(build_call, method, params)
+
     @property
     def _where(self) -> str:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
-    async def _exchange(self, request: bytes) -> bytes:
+    async def _exchange(self, request: bytes, attempt: "_Attempt") -> bytes:
         while self._idle:
             connection = self._idle.pop()
             if connection.alive:
+                attempt.connected = True
                 try:
                     return await self._request(connection, request)
                 except ConnectionResetError:
                     if connection.answering:
                         raise
                     continue  # kept-alive connections may be closed by the server at any time: ask on another
+        attempt.connected = False
         loop = asyncio.get_running_loop()
         _transport, connection = await loop.create_connection(
             lambda: _Connection(self._limits.body, self._disconnected), self.uri.host, self.uri.port
         )
+        attempt.connected = True
         return await self._request(connection, request)
 
     async def _request(self, connection: "_Connection", request: bytes) -> bytes:
@@ -116,6 +137,13 @@ class XmlRpcClient:
         """Close the kept connections."""
         while self._idle:
             self._idle.pop().close()
+
+
+@dataclass(slots=True)
+class _Attempt:
+    """How far a call came."""
+
+    connected: bool = False
 
 
 class _Connection(asyncio.Protocol):
@@ -204,5 +232,5 @@ def _kind(error: OSError) -> type[CallFailedError]:
 
 
 _HEAD_LIMIT = 64 << 10
-_OFFLOAD = 256 << 10  # bytes of an answer that are parsed on the event loop
+_OFFLOAD = 256 << 10  # bytes of a call or an answer that are written or read on the event loop
 _UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH

@@ -15,7 +15,11 @@ import structlog
 
 from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.master.registry import Incarnation
+from appliance.master.turns import Turns
+from appliance.policy.model import Address
 from appliance.ros.xmlrpc import FaultReceived, Limits, Value
+from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.shares.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
 
 _log = structlog.get_logger()
 MASTER_NAME = "/master"
@@ -64,7 +68,9 @@ class _Queue:
 class Delivery:
     """The queues. `timeout` is seconds for one call; `troubled(incarnation, call, why)` hears of a call that is lost.
 
-    A queue holds at most `bound` calls, all together `bound_bytes`: beyond, the oldest go, of the queue that has most.
+    A queue holds at most `bound` calls, those of a host and all together what `queued` says in bytes: beyond, the
+    oldest go, of the queue that has most: of the host's own, or of the host that has most where all are too much.
+    Hosts take turns at `at_once` calls: nodes of one that answer nothing delay no call to another's.
     """
 
     def __init__(
@@ -73,16 +79,22 @@ class Delivery:
         timeout: float,
         limits: Limits,
         troubled: Callable[[Incarnation, NodeCall, str], None],
+        standing: Callable[[Address], Standing],
         bound: int = 10_000,
-        bound_bytes: int = 64 << 20,
+        queued: Bounds = QUEUED_NODE_CALLS.bounds,
+        at_once: Bounds = NODE_CALLS_UNDER_WAY.bounds,
         tries: int = 4,
     ) -> None:
         self._timeout = timeout
         self._limits = limits
         self._troubled = troubled
         self._bound = bound
-        self._bound_bytes = bound_bytes
-        self._weight = 0  # of all queues
+        self._held: Pool[Address] = Pool(
+            "bytes of calls that wait for nodes",
+            queued,
+            lambda _host: Standing.REGISTERED,  # nobody else is told anything
+        )
+        self._turns = Turns(at_once, standing)
         self._tries = tries
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
@@ -95,21 +107,18 @@ class Delivery:
     @property
     def weight(self) -> int:
         """About how many bytes they take."""
-        return self._weight
+        return self._held.total
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         """Queue a call for a node."""
         queue = self._queues.setdefault(incarnation.key, _Queue(incarnation))
         weight = call.weight
         queue.put(call, weight)
-        self._weight += weight
+        self._held.charge(incarnation.host, weight)
         if len(queue.calls) > self._bound:
             self._lose(queue, f"more than {self._bound} calls wait for it")
-        while self._weight > self._bound_bytes:
-            heaviest = max(self._queues.values(), key=lambda one: one.weight)
-            self._lose(
-                heaviest, f"calls that wait take more than {self._bound_bytes} bytes, most for this node"
-            )
+        while why := self._held.refusal(incarnation.host, 0):
+            self._lose(self._heaviest(incarnation.host), why)
         if incarnation.key not in self._workers:
             worker = asyncio.get_running_loop().create_task(self._work(incarnation))
             self._workers[incarnation.key] = worker
@@ -118,14 +127,21 @@ class Delivery:
         """Forget what waits for a node."""
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:
-            self._weight -= queue.weight
+            self._held.give_back(incarnation.host, queue.weight)
+
+    def _heaviest(self, host: Address) -> _Queue:
+        """The queue that makes room: of this host when it is beyond its own share, else of the host that has most."""
+        if self._held.held(host) <= self._held.bounds.host:
+            host, _ = max(self._held.holders(), key=lambda holder: holder[1])
+        queues = (queue for queue in self._queues.values() if queue.incarnation.host == host)
+        return max(queues, key=lambda queue: queue.weight)
 
     def _lose(self, queue: _Queue, why: str) -> None:
         self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
 
     def _take(self, queue: _Queue) -> NodeCall:
         call, weight = queue.take()
-        self._weight -= weight
+        self._held.give_back(queue.incarnation.host, weight)
         return call
 
     def close(self) -> None:
@@ -148,6 +164,7 @@ class Delivery:
     async def _deliver(self, incarnation: Incarnation, call: NodeCall) -> None:
         pause = 0.1
         for attempt in range(self._tries):
+            await self._turns.enter(incarnation.host)
             try:
                 await self.client(incarnation).call(call.method, MASTER_NAME, *call.parameters)
             except CallFailedError as error:
@@ -156,6 +173,8 @@ class Delivery:
                     return  # a node told to shut down often dies before it answers: that is success
             else:
                 return
+            finally:
+                self._turns.leave(incarnation.host)
             if attempt + 1 < self._tries:
                 await asyncio.sleep(pause)
                 pause *= 3

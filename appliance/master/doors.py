@@ -1,36 +1,57 @@
 """Who is let in to the listeners of control, and under which limits: RVMaster's, the outer faces', the inner ones'.
 
-A stranger (an address that no rule of the policy names) is refused before its body is read; while the real ROS Master
-is not hidden, everybody is.
+A stranger (an address that no rule of the policy names) is refused by the beginning of its body, which says what was
+asked for; while the real ROS Master is not hidden, everybody is refused.
 """
 
 import socket
 from collections.abc import Callable
+from functools import partial
 
 from appliance.audit.record import Severity
 from appliance.config import Settings
-from appliance.master.http import Handler, HttpLimits, HttpServer, Peer, Visitors
+from appliance.master.glimpse import asked_for
+from appliance.master.http import Handler, HttpLimits, HttpServer, Peer, Refusal
+from appliance.master.paced_turns import PacedTurns
 from appliance.master.recorder import Recorder
 from appliance.master.turns import Turns
+from appliance.master.visitors import Visitors
 from appliance.policy import Policy
+from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Limits, build_fault
+from appliance.shares.descriptors import connections_within
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
 
 
 class Doors:
-    """The limits and the visitors of all listeners; `policy()` is the one in force."""
+    """The limits and the visitors of all listeners; `policy()` is the one in force, `standing` says what hosts are."""
 
-    def __init__(self, settings: Settings, recorder: Recorder, policy: Callable[[], Policy]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        recorder: Recorder,
+        policy: Callable[[], Policy],
+        standing: Callable[[Address], Standing],
+    ) -> None:
         limits = settings.limits
         self.http = HttpLimits(
             head_bytes=int(limits.header_bytes),
             head_seconds=limits.header_seconds,
             body_bytes=int(limits.body_bytes),
             idle_seconds=limits.idle_seconds,
-            connections_per_host=limits.connections_per_host,
-            connections=limits.connections,
         )
-        self.visitors = Visitors(self.http)
-        self.turns = Turns(self.http.slots, self.http.slots_per_host)
+        self.visitors = Visitors(
+            standing,
+            connections=RVMASTER_CONNECTIONS.bounds.sized(
+                connections_within(limits.connections), limits.connections_per_host
+            ),
+        )
+        self.turns = PacedTurns(
+            RVMASTER_REQUESTS.bounds, standing, recorder.pause, lambda host: policy().named_as(host)
+        )
+        self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
+        self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._recorder = recorder
         self._policy = policy
         self._unhidden = ""
@@ -42,8 +63,8 @@ class Doors:
             sock.dup(),
             handler,
             limits=self.http,
-            visitors=self.visitors if guarded else Visitors(self.http),
-            turns=self.turns if guarded else Turns(self.http.slots, self.http.slots),
+            visitors=self.visitors if guarded else self._own_visitors,
+            turns=self.turns if guarded else self._own_turns,
             refuse=self.refuse if guarded else _refuse_nobody,
             troubled=self.troubled,
         )
@@ -55,13 +76,18 @@ class Doors:
         for server in self._servers:
             server.close()
 
-    def refuse(self, peer: Peer) -> bytes | None:
-        """The answer to somebody who is not to be served at all; None for the others."""
+    def refuse(self, peer: Peer) -> Refusal | None:
+        """What answers somebody who is not to be served at all; None for the others."""
         if self._unhidden:
-            return build_fault(1, f"the appliance does not serve: {self._unhidden}")
+            fault = build_fault(1, f"the appliance does not serve: {self._unhidden}")
+            return lambda _beginning: fault
         # The rosout aggregator calls from this machine, which the policy need not name; whoever does is decided by it.
         if peer.here or self._policy().knows(peer.host):
             return None
+        return partial(self._refuse_stranger, peer)
+
+    def _refuse_stranger(self, peer: Peer, beginning: bytes) -> bytes:
+        asked = asked_for(beginning)
         reason = f"no rule of the policy names {peer.text}"
         record = self._recorder.happened(
             "decision",
@@ -69,8 +95,10 @@ class Doors:
             severity=Severity.WARNING,
             decision="deny",
             host=peer.text,
-            category="command",
-            resource="",
+            caller_id=asked.caller_id,
+            category=asked.category.value,
+            resource=asked.resource,
+            more=asked.about,
         )
         return build_fault(1, f"{reason} [{record}]")
 
@@ -102,5 +130,16 @@ def value_limits(settings: Settings) -> Limits:
     )
 
 
-def _refuse_nobody(_peer: Peer) -> bytes | None:
+# The appliance's own nodes and the ROS Master come from one address, and nobody else reaches those listeners.
+_FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
+    Bounds(whole=bounds.whole, host=bounds.whole, strangers=0, kept=0)
+    for bounds in (RVMASTER_CONNECTIONS.bounds, RVMASTER_BYTES.bounds, RVMASTER_REQUESTS.bounds)
+)
+
+
+def _own_node(_host: Address) -> Standing:
+    return Standing.REGISTERED
+
+
+def _refuse_nobody(_peer: Peer) -> Refusal | None:
     return None

@@ -10,10 +10,11 @@ from collections.abc import Awaitable, Callable
 
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Caller
-from appliance.master.http import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Visitors
+from appliance.master.http import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Refusal
 from appliance.master.places import NoPortError, Places
 from appliance.master.registry import Incarnation, Life, Registry, new_key
 from appliance.master.turns import Turns
+from appliance.master.visitors import Visitors
 from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
 
@@ -36,7 +37,7 @@ class Faces:
         limits: HttpLimits,
         visitors: Visitors,
         turns: Turns,
-        refuse: Callable[[Peer], bytes | None],
+        refuse: Callable[[Peer], Refusal | None],
         troubled: Callable[[Peer, str], None],
         revive: Callable[[Incarnation], Awaitable[None]],
         forget: Callable[[Incarnation], None],
@@ -97,7 +98,7 @@ class Faces:
         return await asyncio.shield(coming)
 
     async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
-        outer_port, relay_port, *more = self._places.open()
+        outer_port, relay_port, *more = self._open_ports(caller.peer.host)
         incarnation = Incarnation(
             key=new_key(),
             name=caller.caller_id,
@@ -115,6 +116,17 @@ class Faces:
         self._registry.add(incarnation)
         await self.open(incarnation)
         return incarnation
+
+    def _open_ports(self, host: Address) -> tuple[int, ...]:
+        """Ports for a node of this host; who has no registration makes room at once. Raises `NoPortError`."""
+        while True:
+            try:
+                return self._places.open(host)
+            except NoPortError:
+                spare = self._registry.spare(host)
+                if spare is None:
+                    raise
+                self._forget(spare)
 
     async def open(self, incarnation: Incarnation) -> None:
         """Serve the outer face."""

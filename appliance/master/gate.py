@@ -5,18 +5,25 @@ nothing. A question that only the network can answer (is the node that holds thi
 `Contest`, and asked again with the answer.
 """
 
+import enum
 import ipaddress
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
 from appliance.master.arguments import ApiUri
-from appliance.master.call import Call, Caller, Identity, Touch
-from appliance.master.parameters import Tree, holds_others, standing_at
+from appliance.master.call import Call, Caller, Identity
+from appliance.master.own_node import OWN, ROSOUT
 from appliance.master.registry import Incarnation, Kind, Life, Registry
 from appliance.policy import Policy
-from appliance.policy.model import Category, Decision, Request
+from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.rights import decide, request_of, rights_of_call
+from appliance.ros.parameter_tree import Tree
 from appliance.ros.xmlrpc import Value
+from appliance.shares.table import NAMES
+
+_TIMES_THE_REST = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +34,30 @@ class Contest:
     decision: Decision
 
 
+class Presence(enum.Enum):
+    """What came of an attempt to call a node."""
+
+    GONE = "gone"  # it refuses connections, or cannot be reached
+    SILENT = "silent"  # it takes connections and does not answer
+    ANSWERS = "answers"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """The answer to a contest's question; `patience` is seconds until a silent node is unregistered."""
+
+    holder: Incarnation
+    presence: Presence
+    patience: float
+
+
 @dataclass(frozen=True, slots=True)
 class HostLimits:
     """How much of the registry one host may take."""
 
     nodes: int = 500
-    registrations: int = 5000
+    registrations: int = NAMES.bounds.host
+    registrations_in_all: int = NAMES.bounds.whole
 
 
 class Gate:
@@ -43,18 +68,19 @@ class Gate:
         self._registry = registry
         self._limits = limits
 
-    def asked(self, call: Call, arguments: tuple[object, ...]) -> tuple[Category, str]:
-        """The category and resource that a call is decided and recorded under."""
-        if call.resource is None:
-            return Category.COMMAND, call.command or call.name
-        return call.category, str(arguments[call.resource])
+    def asked(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Request:
+        """What a call is decided and recorded as."""
+        resource = "" if call.resource is None else str(arguments[call.resource])
+        return request_of(call.policy_name, caller.peer.host, caller.caller_id, resource)
 
     def decide(
         self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
     ) -> Decision | Contest:
         """Whether `caller` may make this call with these canonical arguments, while `tree` are the parameters."""
-        if caller.own or self._is_own_subscriber(caller, call, arguments):
-            return Decision(True, None, "the appliance's own node")
+        if caller.own:
+            return ROSOUT.decide(caller.caller_id, call, arguments)
+        if self._asks_for_its_topic(caller, call, arguments):
+            return Decision(True, None, OWN)
         decision = self._by_policy(caller, call, arguments, tree)
         if not decision.allowed:
             return decision
@@ -69,51 +95,16 @@ class Gate:
             return denial
         return self._bound(caller, call, decision)
 
-    def may(self, request: Request) -> Decision:
-        """Decide one plain question (used when what is live is decided again)."""
-        return self._policy().decide(request)
-
-    def may_be_node(self, request: Request) -> Decision:
-        """Decide a question about something a node has: its category, then `[Nodes]` for its name."""
-        policy = self._policy()
-        decision = policy.decide(request)
-        if not decision.allowed:
-            return decision
-        return _both(decision, policy.decide(_node_request(request)))
-
-    # --- the policy ---
+    def may_have(self, call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> Decision:
+        """Decide again what a call gave: what is live, or seems to be."""
+        request = request_of(call, host, caller_id, resource)
+        return decide(self._policy(), rights_of_call(request, call, resource, tree=tree))
 
     def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree) -> Decision:
-        policy = self._policy()
-        host, caller_id = caller.peer.host, caller.caller_id
-        category, resource = self.asked(call, arguments)
-        decision = policy.decide(Request(host, caller_id, category, resource))
-        if decision.allowed and category is not Category.COMMAND and call.command is not None:
-            decision = _both(
-                decision, policy.decide(Request(host, caller_id, Category.COMMAND, call.command))
-            )
-        if decision.allowed and call.touches is not None and policy.has_section(Category.READ):
-            decision = _both(decision, self._parameter(policy, caller, call, arguments, tree))
-        if decision.allowed and call.identity is Identity.NODE:
-            decision = _both(decision, policy.decide(Request(host, caller_id, Category.NODE, caller_id)))
-        return decision
-
-    def _parameter(
-        self, policy: Policy, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
-    ) -> Decision:
-        """Everything the call touches: the key, what is below it, and what a value below a value takes the place of."""
-        category = Category.READ if call.touches is Touch.READ else Category.WRITE
-        host, caller_id = caller.peer.host, caller.caller_id
-        key = str(arguments[-1] if category is Category.READ else arguments[0])
-        there, in_the_way = standing_at(tree, key)
-        value = cast(Value, arguments[1]) if category is Category.WRITE and len(arguments) > 1 else None
-        decision = policy.decide_parameter(
-            Request(host, caller_id, category, key),
-            namespace=holds_others(value) or (holds_others(there) and not call.name.startswith("un")),
-        )
-        if value is not None and in_the_way is not None and decision.allowed:
-            decision = _both(decision, policy.decide(Request(host, caller_id, category, in_the_way)))
-        return decision
+        key = None if call.resource is None else str(arguments[call.resource])
+        value = cast(Value, arguments[1]) if call.touches is Category.WRITE and len(arguments) > 1 else None
+        request = self.asked(caller, call, arguments)
+        return decide(self._policy(), rights_of_call(request, call.policy_name, key, value=value, tree=tree))
 
     # --- the binding of claims ---
 
@@ -131,7 +122,7 @@ class Gate:
 
     def _unreachable(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
         """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
-        if call.api is None or call.name.startswith("un") or caller.peer.host.is_loopback:
+        if call.api is None or call.gives_up is not None or caller.peer.host.is_loopback:
             return None
         api = arguments[call.api]
         assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
@@ -150,35 +141,61 @@ class Gate:
             return _no(f"the name {holder.name} belongs to the appliance")
         if holder.host == caller.peer.host:
             return decision
-        if call.identity is Identity.NODE and call.name.startswith("register"):
+        if call.registers not in {None, Kind.PARAMETER}:
             if self._policy().takeover == "granted":
                 return decision
             return Contest(holder, decision)
-        return _no(f"{caller.caller_id} is held by {holder.host}; {caller.peer.host} cannot speak for it")
+        held, other = f"{caller.caller_id} is held by", f"{caller.peer.host} cannot speak for it"
+        return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
 
-    def _is_own_subscriber(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> bool:
-        """Whether a node of the appliance asks another node, at its outer face, for a topic that it subscribed to.
+    def _asks_for_its_topic(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> bool:
+        asks = caller.target is not None and call.category is Category.SUBSCRIBE
+        return asks and self.is_own_subscriber(caller, str(arguments[0]))
+
+    def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
+        """Whether a node of the appliance calls another node, at its outer face, for a topic that it subscribed to.
 
         RVMaster has a listener for the appliance's own nodes, the faces have not.
         """
-        if caller.target is None or call.category is not Category.SUBSCRIBE or not caller.peer.here:
-            return False
-        holder = self._registry.holder(caller.caller_id)
-        return holder is not None and holder.own and (Kind.SUBSCRIPTION, arguments[0]) in holder.registrations
+        holder = self._registry.holder(caller.caller_id) if caller.peer.here else None
+        return holder is not None and holder.own and (Kind.SUBSCRIPTION, topic) in holder.registrations
 
     # --- limits ---
 
     def _over_limit(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
-        if call.api is None or call.name.startswith("un"):
+        if call.api is None or call.gives_up is not None:
             return None
         host = caller.peer.host
         if self._registry.registrations_of(host) >= self._limits.registrations:
             return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
+        denial = self._too_many_names(host)
+        if denial is not None:
+            return denial
         api = arguments[call.api]
         assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
         if self._is_one_too_many(caller, api) and self._registry.spare_of(host) is None:
             return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
         return None
+
+    def _too_many_names(self, host: Address) -> Decision | None:
+        """Hosts that the policy names as one network count as one: nobody gains by many addresses."""
+        left = max(0, self._limits.registrations_in_all - self._registry.registrations)
+        if self._registry.registrations < _TIMES_THE_REST * left:
+            return None  # nobody has so many
+        policy = self._policy()
+        named = policy.named_as(host)
+        mine = sum(
+            count
+            for other, count in self._registry.registrations_by_host()
+            if policy.named_as(other) == named
+        )
+        if mine < _TIMES_THE_REST * left:
+            return None
+        who = named if named.num_addresses > 1 else host
+        return _no(
+            f"{who} has {mine} registrations, and {left} are left for all other hosts: a host may have"
+            f" {_TIMES_THE_REST} times as many as are left"
+        )
 
     def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         """The node of the caller's host that is gone and goes for good, so that a new one has room."""
@@ -192,13 +209,32 @@ class Gate:
         )
 
 
-def contested(contest: Contest, gone: bool) -> Decision:
-    """The decision of a contest, once it is known whether the holder's node is gone."""
-    if gone:
-        return contest.decision
+def contested(contest: Contest, probe: Probe | None) -> Decision:
+    """The decision of a contest, once the holder's node was probed; not, when another has come to hold the name."""
+    holder = contest.holder
+    if probe is not None and probe.holder is holder:
+        if probe.presence is Presence.GONE:
+            return contest.decision
+        if probe.presence is Presence.SILENT:
+            return _held_by(
+                holder,
+                "a node",
+                " that takes connections and does not answer (it "
+                f"hangs, or was stopped); unless it answers it is unregistered in {math.ceil(probe.patience)} s: "
+                "start this node again then (or at once with [Options] takeover = granted)",
+            )
+    return _held_by(
+        holder,
+        "a running node",
+        "; another host may take the name over once that node is gone "
+        "(or at once with [Options] takeover = granted)",
+    )
+
+
+def _held_by(holder: Incarnation, what: str, rest: str) -> Decision:
     return _no(
-        f"{contest.holder.name} is held by a running node on {contest.holder.host}; another host may take the name "
-        "over once that node is gone (or at once with [Options] takeover = granted)"
+        f"{holder.name} is held by {what} on {holder.host}{rest}",
+        told=f"{holder.name} is held by {what} of another host{rest}",
     )
 
 
@@ -211,14 +247,6 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _both(first: Decision, second: Decision) -> Decision:
-    """Both must allow; the one that denies (or would) is the answer, else the first."""
-    return second if not second.allowed or (second.would_deny and not first.would_deny) else first
-
-
-def _no(reason: str) -> Decision:
-    return Decision(False, None, reason)
-
-
-def _node_request(request: Request) -> Request:
-    return Request(request.host, request.caller_id, Category.NODE, request.caller_id)
+def _no(reason: str, told: str | None = None) -> Decision:
+    """A denial by no rule; `told` where the reason names another host."""
+    return Decision(False, None, reason, told=told)

@@ -1,17 +1,20 @@
 """A change of the registry and what follows from it: who is told, what the relay carries, what is recorded.
 
 Every way in which the graph changes is a verb here, so that no change can happen without its consequences. The
-lists of publishers that subscribers get are made from the registry at the moment of the change, never from what
-ROSMaster's notification threads say later: a list that is partial (while ROSMaster is rebuilt) or out of date
-never reaches a node.
+lists of publishers that subscribers get are made from the registry at the moment of the change, values of parameters
+from the call that set them, never from what ROSMaster's notification threads say later: what is partial (while
+ROSMaster is rebuilt), out of date or misread by ROSMaster never reaches a node.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterable
 
 from appliance.audit.record import Severity
+from appliance.master.bulk import weigh
 from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.mediation import Mediation
+from appliance.master.parameter_updates import settled, updates_of
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RelayControl
@@ -117,8 +120,10 @@ class Graph:
             self._registry.unshelve(other, kind, resource)
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
-        """Another incarnation took the name; ROSMaster tells the old one to shut down."""
+        """Another incarnation took the name; the old one is told to shut down, with ROSMaster's words."""
         lost = self._registry.replace(incarnation, time.time())
+        reason = f"[{incarnation.name}] Reason: new node registered with same name"
+        self._delivery.push(incarnation, NodeCall("shutdown", (reason,)))
         self._tell_withdrawn(lost)
         self._relay.forgotten(incarnation)
         self._closed(incarnation)
@@ -218,14 +223,33 @@ class Graph:
         elif (Kind.SUBSCRIPTION, topic) in subscriber.shelf:
             self._empty(subscriber, topic)
 
-    def tell_parameter(self, subscriber: Incarnation, key: str, value: Value, size: int) -> None:
-        """Tell a node the value of a parameter as ROSMaster does: keys end with `/`, and an unset one has `{}`.
+    def parameter_set(self, key: str, value: Value, caller_id: str) -> None:
+        """ROSMaster took this value; who set it is not told of it where others are who subscribed above."""
+        self._tell_parameters(key, value, caller_id)
 
-        It is told what it may read: ROSMaster tells all that comes to be below a key to those who subscribed to it,
-        which was decided by what was there then.
+    def parameter_deleted(self, key: str) -> None:
+        """The parameter is gone at ROSMaster."""
+        self._tell_parameters(key, {}, None)
+
+    def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> None:
+        calls: dict[str, NodeCall] = {}
+        for update in updates_of(key, value, self._registry.subscribed_below(key)):
+            for subscriber in self._registry.registered(Kind.PARAMETER, update.subscribed):
+                if update.key == key and subscriber.name == caller_id:
+                    continue
+                if update.key not in calls:
+                    calls[update.key] = _param_update(update.key, settled(update.value))
+                if self._may_be_told(subscriber, update.key, update.value):
+                    self._delivery.push(subscriber, calls[update.key])
+
+    def tell_parameter(self, subscriber: Incarnation, key: str, value: Value) -> None:
+        """Tell a node the value that a parameter has, which nobody changes any more.
+
+        It is told what it may read: all that comes to be below a key is told to those who subscribed to it, which was
+        decided by what was there then.
         """
-        if self._may_be_told(subscriber, key.rstrip("/") or "/", value):
-            self._delivery.push(subscriber, NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), size))
+        if self._may_be_told(subscriber, key, value):
+            self._delivery.push(subscriber, _param_update(key, value))
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""
@@ -268,3 +292,8 @@ class Graph:
             category=kind.value,
             resource=resource,
         )
+
+
+def _param_update(key: str, value: Value) -> NodeCall:
+    """The call as ROSMaster makes it: keys end with `/`, and an unset one has `{}`."""
+    return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))

@@ -1,5 +1,6 @@
 """What is asked about hosts over the admin socket and REST, carried out."""
 
+import time
 from typing import Any
 
 from appliance.channel import admin
@@ -81,6 +82,7 @@ async def _change(hosts: Hosts, request: _Change, who: str) -> dict[str, Any]:
         case admin.HostRevoke(name, expected):
             return await hosts.revoke(name, who, expected)
         case admin.HostPorts(name, state, opened, checked, expected):
-            return await hosts.ports.tell(name, state, opened, checked=checked, who=who, expected=expected)
+            when = time.time() if checked is None else checked
+            return await hosts.ports.tell(name, state, opened, checked=when, who=who, expected=expected)
         case admin.HostsReload(expected):
             return await hosts.reload(who, expected)

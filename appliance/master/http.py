@@ -3,12 +3,13 @@
 httptools (llhttp) parses; this module bounds. Invariants:
 
 1. Nothing is buffered beyond the limits: head 64 KiB within 10 s, body by `Limits.body`, one request in
-   flight per connection (reading pauses meanwhile; those that came with it in one piece wait), one response in the
-   write buffer (the next request is not served before it is sent). What all connections of a host hold together is
-   bounded, too: bodies, requests that wait, answers.
+   flight per connection (reading pauses meanwhile; up to 512 that came with it in one piece wait), one response in the
+   write buffer (the next request is not served before it is sent).
 2. A connection that makes no progress is closed by the sweep, whatever state it is in.
-3. An address that no rule names is answered before its body is read.
-4. Hosts are served in turn (`turns`): one host has at most `slots_per_host` requests being served.
+3. An address that no rule names is answered before its body is read, but for the beginning: what it asked for is told
+   in the refusal's record.
+4. Connections, the bytes that they hold (`visitors`) and requests being served (`turns`) have shares for each host,
+   for strangers, and for hosts with a registration.
 5. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
 6. Who goes over a limit is told so, in a fault that says which; of connections that are too many, a few at a time.
 """
@@ -16,8 +17,9 @@ httptools (llhttp) parses; this module bounds. Invariants:
 import asyncio
 import ipaddress
 import socket
+import struct
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import cast
@@ -26,15 +28,22 @@ import httptools
 import structlog
 
 from appliance.master.turns import Turns
+from appliance.master.visitors import Stage, Visitors
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import build_fault
 
 _log = structlog.get_logger()
 
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
+
 # A head of many short fields is as long as the bytes it came in.
 _FIELD_FRAMING = len(": \r\n")
-# About what a request takes beside its body and its path: small ones may come by the thousand.
-_REQUEST_BYTES = 400
+# ROS clients send the next request after the answer. More is read than that, but not so much that it takes long.
+_MOST_PIPELINED = 512
+# What a request counts beside its body and its path: ten times its memory, because thousands of small ones take time.
+_REQUEST_BYTES = 4096
+_BEGINNING = 4096  # bytes of a body that are looked at to say what was refused
+_BEGINNING_SECONDS = 1.0  # that they are waited for
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +55,7 @@ class HttpLimits:
     body_bytes: int = 16 << 20
     stall_seconds: float = 30.0
     idle_seconds: float = 300.0
-    connections_per_host: int = 512
-    connections: int = 4096
-    slots: int = 64
-    slots_per_host: int = 16
-    held_bytes_per_host: int = 64 << 20
-    held_bytes: int = 512 << 20
     linger_seconds: float = 2.0
-    turned_away_per_host: int = 8  # connections that are too many and are being told so
-    turned_away: int = 256
 
     @property
     def framing_bytes(self) -> int:
@@ -88,87 +89,19 @@ class HttpRequest:
 
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
+Refusal = Callable[[bytes], bytes]
+"""Makes the answer to a request that is not served, of the beginning of its body."""
 
-class Visitors:
-    """All connections of every listener that shares it, and the bytes they hold (bodies that are not answered yet,
-    answers that are not taken yet): counted per host, and swept of those that are stuck.
-    """
 
-    def __init__(self, limits: HttpLimits) -> None:
-        self._limits = limits
-        self.connections: set[_Connection] = set()
-        self._per_host: dict[Address, int] = {}
-        self._total = 0
-        self._turned_away: Counter[Address] = Counter()
-        self._held: Counter[Address] = Counter()
-        self._held_in_all = 0
-
-    def enter(self, host: Address) -> str | None:
-        """Count a connection in; a sentence instead when the host or the appliance has too many."""
-        mine = self._per_host.get(host, 0)
-        if mine >= self._limits.connections_per_host:
-            return f"{host} has {mine} connections open, the limit for one host"
-        if self._total >= self._limits.connections:
-            return f"{self._total} connections are open, the limit for all hosts"
-        self._per_host[host] = mine + 1
-        self._total += 1
-        return None
-
-    def leave(self, host: Address) -> None:
-        """Count a connection out."""
-        self._total -= 1
-        remaining = self._per_host[host] - 1
-        if remaining:
-            self._per_host[host] = remaining
-        else:
-            del self._per_host[host]
-
-    def turn_away(self, host: Address) -> bool:
-        """Whether a connection that is too many may stay until it was told so; it is counted then."""
-        if (
-            self._turned_away[host] >= self._limits.turned_away_per_host
-            or self._turned_away.total() >= self._limits.turned_away
-        ):
-            return False
-        self._turned_away[host] += 1
-        return True
-
-    def turned_away(self, host: Address) -> None:
-        """Such a connection is gone."""
-        self._turned_away[host] -= 1
-        if not self._turned_away[host]:
-            del self._turned_away[host]
-
-    def hold(self, host: Address, size: int) -> str | None:
-        """Count bytes in that are kept for a host; a sentence instead (nothing is counted) when it is too much."""
-        if self._held[host] + size > self._limits.held_bytes_per_host:
-            return f"{host} has {self._held[host]} bytes in requests and answers under way, the limit for one host"
-        if self._held_in_all + size > self._limits.held_bytes:
-            return f"{self._held_in_all} bytes of requests and answers are under way, the limit for all hosts"
-        self._held[host] += size
-        self._held_in_all += size
-        return None
-
-    def release(self, host: Address, size: int) -> None:
-        """Count bytes out."""
-        self._held_in_all -= size
-        self._held[host] -= size
-        if not self._held[host]:
-            del self._held[host]
-
-    async def sweep(self) -> None:
-        """Every second, close the connections whose deadline has passed; runs until cancelled."""
-        while True:
-            await asyncio.sleep(1.0)
-            now = time.monotonic()
-            for connection in [one for one in self.connections if one.deadline < now]:
-                connection.expire()
+class NoAnswerError(Exception):
+    """A handler raises it where the peer is to find its connection reset, as at a node that is gone."""
 
 
 class HttpServer:
     """Serves one listening socket: each request goes to `handler`, whose bytes are the response body.
 
-    `refuse(peer)` is asked when the head of a request is there: the bytes it returns are sent instead of reading
+    `refuse(peer)` is asked when the head of a request is there: what it returns is given the beginning of the body, as
+    far as it comes in time, and the bytes that it makes of it are sent instead of reading
     the body, and the connection is closed. `troubled(peer, reason)` hears of every limit that was hit.
     """
 
@@ -180,7 +113,7 @@ class HttpServer:
         limits: HttpLimits,
         visitors: Visitors,
         turns: Turns,
-        refuse: Callable[[Peer], bytes | None] = lambda peer: None,  # noqa: ARG005 - names the parameter
+        refuse: Callable[[Peer], Refusal | None] = lambda peer: None,  # noqa: ARG005 - names the parameter
         troubled: Callable[[Peer, str], None] = lambda peer, reason: None,  # noqa: ARG005 - same
     ) -> None:
         self.socket = sock
@@ -190,6 +123,7 @@ class HttpServer:
         self.turns = turns
         self.refuse = refuse
         self.troubled = troubled
+        self.connections: set[_Connection] = set()
         self._server: asyncio.Server | None = None
 
     async def start(self) -> None:
@@ -202,7 +136,7 @@ class HttpServer:
         """Stop accepting and cut what is connected; the listening socket is closed with it."""
         if self._server is not None:
             self._server.close()
-        for connection in [one for one in self.visitors.connections if one.server is self]:
+        for connection in list(self.connections):
             connection.abort()
 
 
@@ -214,7 +148,6 @@ class _Connection(asyncio.Protocol):
         self._limits = server.limits
         self.deadline = time.monotonic() + server.limits.head_seconds
         self._counted = False
-        self._turned_away = False
         self._busy: asyncio.Task[None] | None = None
         self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
@@ -223,6 +156,10 @@ class _Connection(asyncio.Protocol):
         self._in_request = False
         self._head_done = False
         self._unsent = 0  # bytes of an answer that the peer does not take, as they were counted
+        self._refusal: Refusal | None = None
+        self._patience: asyncio.TimerHandle | None = (
+            None  # until that answer does not wait for the body any more
+        )
         self._writable = True
         self._closing = False
 
@@ -237,30 +174,18 @@ class _Connection(asyncio.Protocol):
             return
         host = plain_address(peername[0])
         self.peer = Peer(host, str(host), str(plain_address(sockname[0])))
-        too_many = self.server.visitors.enter(host)
-        if too_many is not None:
+        self.server.connections.add(self)
+        too_many = self.server.visitors.enter(self, host)
+        if too_many:
             self._turn_away(too_many)
             return
         self._counted = True
-        self.server.visitors.connections.add(self)
         sock = transport.get_extra_info("socket")
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._parser = httptools.HttpRequestParser(self)
 
     def connection_lost(self, _error: Exception | None) -> None:
-        self._closing = True
-        if self._counted:
-            self.server.visitors.leave(self.peer.host)
-            self._counted = False
-            self._release(len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending))
-            self._body, self._unsent = bytearray(), 0
-        if self._turned_away:
-            self.server.visitors.turned_away(self.peer.host)
-            self._turned_away = False
-        self.server.visitors.connections.discard(self)
-        self._pending.clear()
-        if self._busy is not None and self._waiting:
-            self._busy.cancel()
+        self._leave()
 
     def data_received(self, data: bytes) -> None:
         if not self._closing:
@@ -303,12 +228,20 @@ class _Connection(asyncio.Protocol):
     # --- httptools callbacks ---
 
     def on_message_begin(self) -> None:
+        if len(self._pending) >= _MOST_PIPELINED:
+            self._reject(
+                b"400 Bad Request", f"sent {_MOST_PIPELINED} requests more while one was being answered"
+            )
+        if self._closing:
+            raise ConnectionAbortedError  # what else came is not looked at
         self._url = b""
         self._received = 0
         self._head_bytes = 0
         self._in_request = True
         self._head_done = False
         self._expects = False
+        if self._busy is None:
+            self.server.visitors.file(self, Stage.UNFINISHED)
         if self._busy is None and self._writable:
             self.deadline = time.monotonic() + self._limits.head_seconds
 
@@ -344,9 +277,12 @@ class _Connection(asyncio.Protocol):
         if self._parser.should_upgrade():
             self._reject(b"501 Not Implemented", "asked for another protocol")
             return
-        refusal = self.server.refuse(self.peer)
-        if refusal is not None:
-            self._write(b"200 OK", refusal, keep=False, unread=True)
+        self._refusal = self.server.refuse(self.peer)
+        if self._expects and self._refusal is not None:
+            self._refuse_request(self._refusal)
+        elif self._refusal is not None:
+            later = asyncio.get_running_loop().call_later
+            self._patience = later(_BEGINNING_SECONDS, self._refuse_request, self._refusal)
         elif self._expects:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
@@ -357,16 +293,21 @@ class _Connection(asyncio.Protocol):
             self._reject(b"413 Content Too Large", f"sent a body beyond {self._limits.body_bytes} bytes")
             return
         too_much = self.server.visitors.hold(self.peer.host, len(piece))
-        if too_much is not None:
+        if too_much:
             self._reject(b"503 Service Unavailable", f"sent a body while {too_much}")
             return
         self._body += piece
+        if self._refusal is not None and len(self._body) >= _BEGINNING:
+            self._refuse_request(self._refusal)
 
     def on_message_complete(self) -> None:
         if self._closing:
             return
+        if self._refusal is not None:
+            self._refuse_request(self._refusal)
+            return
         too_much = self.server.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
-        if too_much is not None:
+        if too_much:
             self._reject(b"503 Service Unavailable", f"sent a request while {too_much}")
             return
         self._in_request = False
@@ -378,6 +319,32 @@ class _Connection(asyncio.Protocol):
         else:
             self._transport.pause_reading()
 
+    def _refuse_request(self, refusal: Refusal) -> None:
+        """Answer without having read more than the beginning of the body."""
+        if self._patience is not None:
+            self._patience.cancel()
+        self._write(b"200 OK", refusal(bytes(self._body[:_BEGINNING])), keep=False, unread=True)
+
+    @property
+    def holding(self) -> int:
+        """Bytes that are held for it and that its end sets free: not those of a request that is being served."""
+        return len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending)
+
+    def _leave(self) -> None:
+        """Count for nothing any more, once; what is being served goes on, and its answer is thrown away."""
+        self._closing = True
+        if self._patience is not None:
+            self._patience.cancel()
+        self.server.connections.discard(self)
+        if self._counted:
+            self._counted = False
+            self._release(self.holding)
+            self._body, self._unsent = bytearray(), 0
+        self.server.visitors.leave(self)
+        self._pending.clear()
+        if self._busy is not None and self._waiting:
+            self._busy.cancel()
+
     # --- serving ---
 
     def _go_on(self) -> None:
@@ -386,6 +353,8 @@ class _Connection(asyncio.Protocol):
         if self._pending:
             self._serve_next()
         elif not self._transport.is_closing():
+            if not self._in_request:
+                self.server.visitors.file(self, Stage.IDLE)
             self._transport.resume_reading()
 
     def _serve_next(self) -> None:
@@ -396,6 +365,9 @@ class _Connection(asyncio.Protocol):
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         try:
             status, body = await self._answer(request)
+        except NoAnswerError:
+            self._reset()
+            return
         finally:
             self._busy = None
             self._release(_held_by(request))
@@ -414,18 +386,22 @@ class _Connection(asyncio.Protocol):
             await turns.enter(host)
         finally:
             self._waiting = False
+        self.server.visitors.file(self, Stage.SERVED)
         try:
             return b"200 OK", await self.server.handler(request)
+        except NoAnswerError:
+            raise
         except Exception:  # noqa: BLE001 - a defect of ours must not leave the peer without an answer
             _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
             return b"500 Internal Server Error", b""
         finally:
             turns.leave(host)
+            self.server.visitors.file(self, Stage.UNFINISHED)  # until its answer is taken
 
     def _hold_unsent(self) -> None:
         unsent = self._transport.get_write_buffer_size()
         too_much = self.server.visitors.hold(self.peer.host, unsent)
-        if too_much is not None:
+        if too_much:
             self.server.troubled(self.peer, f"an answer is not taken while {too_much}")
             self.abort()
             return
@@ -447,6 +423,8 @@ class _Connection(asyncio.Protocol):
             return
         self._closing = True
         if unread:
+            self._release(len(self._body))
+            self._body = bytearray()
             self.deadline = time.monotonic() + self._limits.linger_seconds
             self._transport.write_eof()
         else:
@@ -462,9 +440,7 @@ class _Connection(asyncio.Protocol):
 
     def _turn_away(self, why: str) -> None:
         """One connection too many: it is told so, if not too many are being told."""
-        if self.server.visitors.turn_away(self.peer.host):
-            self._turned_away = True
-            self.server.visitors.connections.add(self)
+        if self.server.visitors.turn_away(self, self.peer.host):
             self._refuse(b"503 Service Unavailable", why)
         else:
             self._closing = True
@@ -483,9 +459,14 @@ class _Connection(asyncio.Protocol):
             self.server.troubled(self.peer, f"{self.peer.text} did not finish a request in time")
         self.abort()
 
+    def _reset(self) -> None:
+        """Cut the connection so that the peer sees it broken, not ended."""
+        self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        self.abort()
+
     def abort(self) -> None:
-        """Cut the connection now."""
-        self._closing = True
+        """Cut the connection now; it counts for nothing from here on."""
+        self._leave()
         self._transport.abort()
 
 

@@ -12,15 +12,26 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from appliance.master.client import CallFailedError, RefusedError, XmlRpcClient
+from appliance.master.client import (
+    BrokenOffError,
+    CallFailedError,
+    RefusedError,
+    UnansweredError,
+    UnreachedError,
+    XmlRpcClient,
+)
 from appliance.master.delivery import NodeCall
+from appliance.master.gate import Presence, Probe
 from appliance.master.graph import Graph
 from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.relays import RELAY_NAME
+from appliance.master.turns import Turns
+from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Limits
+from appliance.shares.pool import Standing
+from appliance.shares.table import PROBES
 
 _log = structlog.get_logger()
-_AT_ONCE = 64  # nodes asked at the same time
 _REPLACED_SECONDS = 60.0
 _IDLE_SECONDS = 30.0  # longer than a registering call can be on its way
 _LOOK_AGAIN_SECONDS = 0.3
@@ -48,7 +59,8 @@ class _Missed:
 class Liveness:
     """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster.
 
-    `returned(incarnation)` hears of a node that was away, once what it had counts again.
+    `returned(incarnation)` hears of a node that was away, once what it had counts again. Hosts take turns: nodes of one
+    that answer nothing delay no look at another's.
     """
 
     def __init__(
@@ -61,6 +73,7 @@ class Liveness:
         withdraw: Callable[[Incarnation, list[Registration]], Awaitable[None]],
         put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
         returned: Callable[[Incarnation], None],
+        standing: Callable[[Address], Standing],
     ) -> None:
         self._registry = registry
         self._graph = graph
@@ -72,7 +85,7 @@ class Liveness:
         self._answered: dict[str, float] = {}
         self._missed: dict[str, _Missed] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
-        self._slots = asyncio.Semaphore(_AT_ONCE)
+        self._turns = Turns(PROBES.bounds, standing)
 
     def client(self, incarnation: Incarnation) -> XmlRpcClient:
         """A client that calls the node at its peer address."""
@@ -107,15 +120,22 @@ class Liveness:
         missed.parameters |= call.method == "paramUpdate"
         self.look_at(incarnation)
 
-    async def is_gone(self, incarnation: Incarnation) -> bool:
-        """Whether the node refuses connections or cannot be reached, asked now."""
+    async def probe(self, incarnation: Incarnation) -> Probe:
+        """Whether the node is there, asked now."""
+        now = time.monotonic()
+        since = self._answered.setdefault(incarnation.key, now)
+        patience = max(0.0, self._settings.silent - (now - since)) + self._settings.interval
         try:
             await self.client(incarnation).call("getPid", RELAY_NAME)
-        except RefusedError:
-            return True
+        except (RefusedError, UnreachedError):
+            presence = Presence.GONE
+        except (UnansweredError, BrokenOffError):
+            presence = Presence.SILENT
         except CallFailedError:
-            return False
-        return False
+            presence = Presence.ANSWERS
+        else:
+            presence = Presence.ANSWERS
+        return Probe(incarnation, presence, patience)
 
     async def revive(self, incarnation: Incarnation) -> None:
         """A shadow registers: it is there again, and so is all it had."""
@@ -128,8 +148,11 @@ class Liveness:
         return registrations
 
     async def _look(self, incarnation: Incarnation) -> None:
-        async with self._slots:
+        await self._turns.enter(incarnation.host)
+        try:
             there, why = await self._ask(incarnation)
+        finally:
+            self._turns.leave(incarnation.host)
         if self._registry.by_key(incarnation.key) is not incarnation:
             return
         now = time.monotonic()

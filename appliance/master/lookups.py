@@ -1,11 +1,12 @@
 """The calls that ask about the graph, and RVMaster's own."""
 
+import asyncio
 import os
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.call import Answer, Caller
 from appliance.master.registration import key_of_stand_in
-from appliance.master.registry import Kind
+from appliance.master.registry import Incarnation, Kind
 from appliance.ros.uris import node_uri, service_uri
 from appliance.ros.xmlrpc import Value
 
@@ -13,28 +14,28 @@ if TYPE_CHECKING:
     from appliance.master.core import Master
 
 
+_ASK_AGAIN = (0.0, 0.01, 0.05, 0.2, 0.5, 0.0)  # seconds until ROSMaster is asked for a provider again
+
+
 async def lookup_node(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`lookupNode(caller_id, node_name)` → the node's outer URI."""
     answer = await master.rosmaster.call("lookupNode", caller.caller_id, str(arguments[0]))
     if answer[0] == 1:
         incarnation = master.faces.by_inner_uri(str(answer[2]))
-        if incarnation is None:
+        if incarnation is None or incarnation.name != arguments[0]:
             return [-1, f"unknown node [{arguments[0]}]", ""]
-        outer = incarnation.outer_uri(master.addresses.told_to(caller.peer))
-        answer[2] = outer if master.mediation.stand_ins else incarnation.real_uri
+        told = master.addresses.told_to(caller.peer)
+        answer[2] = incarnation.uri_for(told, hidden=master.mediation.stand_ins)
     return answer
 
 
 async def lookup_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`lookupService(caller_id, service)` → the relay's port for it; the caller's host may then call it."""
+    """`lookupService(caller_id, service)` → the relay's port for it; the caller may then call it."""
     service = str(arguments[0])
-    answer = await master.rosmaster.call("lookupService", caller.caller_id, service)
-    if answer[0] == 1:
-        incarnation = master.registry.by_key(key_of_stand_in(str(answer[2])))
-        if incarnation is None or (Kind.SERVICE, service) not in incarnation.registrations:
-            return [-1, "no provider", ""]
+    answer, incarnation = await _provider(master, caller, service)
+    if incarnation is not None:
         if master.mediation.carries_service(service):
-            master.relay.grant_service(incarnation, service, caller.peer.host)
+            master.relay.grant_service(incarnation, service, caller.peer.host, caller.caller_id)
             port = master.relay.port(incarnation, Kind.SERVICE, service)
             uri = service_uri(master.addresses.told_to(caller.peer), port)
         else:
@@ -42,6 +43,23 @@ async def lookup_service(master: "Master", caller: Caller, arguments: tuple[obje
             uri = service_uri(str(incarnation.host), port)
         answer[1], answer[2] = f"rosrpc URI: [{uri}]", uri
     return answer
+
+
+async def _provider(master: "Master", caller: Caller, service: str) -> tuple[Answer, Incarnation | None]:
+    """ROSMaster's answer, and the provider that it names and the registry has.
+
+    While a service gets another provider the two do not agree for a moment: ROSMaster's answer may be older than the
+    registry, or newer, for answers overtake each other. A node asks once, so ROSMaster is asked until they do.
+    """
+    for pause in _ASK_AGAIN:
+        answer = await master.rosmaster.call("lookupService", caller.caller_id, service)
+        if answer[0] != 1:
+            return answer, None
+        incarnation = master.registry.by_key(key_of_stand_in(str(answer[2])))
+        if incarnation is not None and (Kind.SERVICE, service) in incarnation.registrations:
+            return answer, incarnation
+        await asyncio.sleep(pause)
+    return [-1, "no provider", ""], None
 
 
 async def get_system_state(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
@@ -80,6 +98,6 @@ async def get_pid(_master: "Master", _caller: Caller, _arguments: tuple[object, 
 
 async def shutdown_master(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`shutdown(caller_id, msg)`: ends the appliance, as it would end `roscore`."""
-    message = str(arguments[0]) if arguments else ""
+    message = str(arguments[0])
     master.stop(f"{caller.caller_id} on {caller.peer.text} called shutdown: {message}")
     return [1, "shutdown", 0]

@@ -47,6 +47,11 @@ def measures_of(master: Master) -> dict[str, Any]:
             )
             for kind in ("drop", "change")
         },
+        "limited": [[*labels, count] for labels, count in master.relay.carried.limited_messages.items()],
+        "memory": {
+            what: sum(held.get(what, 0) for held in master.relay.carried.memory.values())
+            for what in ("frames", "queues", "latched", "headers")
+        },
         "connections": dict(Counter(one.kind for one in master.relay.connections.values())),
     }
 

@@ -25,7 +25,10 @@ class Mediation:
     def carries_topic(self, topic: str) -> bool:
         """Whether the relay carries a topic."""
         return (
-            self.relay_all or topic in self.policy().monitored_topics or self.specifications().of_topic(topic)
+            self.relay_all
+            or topic in self.policy().monitored_topics
+            or self.policy().limit_rule(topic) is not None
+            or self.specifications().of_topic(topic)
         )
 
     def carries_service(self, service: str) -> bool:

@@ -14,8 +14,12 @@ async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who:
         case admin.MonitorLoad(files, definitions, note, expected):
             loaded = await monitors.load(files, definitions, who=who, note=note, expected=expected)
             return _replaced(loaded, monitors.tag)
-        case admin.MonitorReload(expected):
-            return _replaced(await monitors.reload(who=who, expected=expected), monitors.tag)
+        case admin.MonitorReplace(name, text, definitions, note, expected):
+            file = monitors.file_of(name)
+            loaded = await monitors.load({file: text}, definitions, who=who, note=note, expected=expected)
+            return _replaced(loaded, monitors.tag)
+        case admin.MonitorReload(expected, prune):
+            return _replaced(await monitors.reload(who=who, expected=expected, prune=prune), monitors.tag)
         case admin.MonitorRemove(names, expected):
             return _replaced(await monitors.remove(names, who=who, expected=expected), monitors.tag)
         case admin.MonitorSwitch(names, enabled, expected):
@@ -94,4 +98,5 @@ def _replaced(replaced: Replaced, tag: str) -> dict[str, Any]:
         "warnings": replaced.warnings,
         "moved": replaced.moved,
         "began": replaced.began,
+        "kept": replaced.kept,
     }

@@ -7,6 +7,9 @@ and say everything that is wrong with them. The relay compiles them again and ha
 Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
 with its monitor: another that is loaded later under the same name is as if nobody had switched it.
 
+Which files are the folder's is kept, too: a reload takes what the folder has in their place, and leaves what was loaded
+from elsewhere alone unless it is told to remove that.
+
 What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
 a change that is meant for another tag than the present one is refused.
 """
@@ -14,7 +17,7 @@ a change that is meant for another tag than the present one is refused.
 import asyncio
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -41,7 +44,12 @@ _log = structlog.get_logger()
 _DISK = "disk"
 _SWITCHES = "monitor switches"
 _ACTS = "monitor acts"
+_FROM_FOLDER = "monitor files of the folder"
 ALLOCATION = "relays"
+_NO_FOLDER = (
+    "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
+    " --monitors DIR (monitors: DIR in appliance.yaml), or load files: rosrv monitor load FILE"
+)
 
 
 class UnknownMonitorError(Exception):
@@ -64,7 +72,8 @@ class Replaced:
     """What a load did: the revision in force, the one before, files added, changed and removed, the lint.
 
     `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
-    did: new ones, edited ones, and those whose messages have another definition.
+    did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in
+    force although the folder does not have them: they were loaded from elsewhere.
     """
 
     revision: int
@@ -75,6 +84,7 @@ class Replaced:
     warnings: list[str]
     moved: list[str]
     began: list[str]
+    kept: list[str]
 
 
 class Monitors:
@@ -102,6 +112,7 @@ class Monitors:
         self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
         self._switches: dict[str, bool] = {}
         self._acts = 0  # switches and resumptions, ever
+        self._from_folder: frozenset[str] = frozenset()  # the files in force that were read from the folder
         self._changing = asyncio.Lock()
         self.revision = 0
         self.sources = Sources()
@@ -121,10 +132,13 @@ class Monitors:
         settings = self._store.settings()
         self._switches = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
+        self._from_folder = frozenset(json.loads(settings.get(_FROM_FOLDER, "[]")))
         last = self._store.monitor_revision()
         if last is not None and (restarted or last.who != _DISK):
             sources = Sources(**json.loads(last.sources))
             self._enforce(sources, _check_kept(sources, last), last)
+            if _FROM_FOLDER not in settings and last.who == _DISK:  # of a version that did not keep it
+                self._note_folder(sources.files)
         else:
             sources = self._folder.read()
             checked = check(sources)
@@ -132,6 +146,7 @@ class Monitors:
                 self._enforce(sources, checked, last)
             elif sources.files or last is not None:
                 self._keep(sources, checked, who=_DISK, note="read at start")
+            self._note_folder(sources.files)
         now = Revision(self.revision, self.sources, self.checked)
         self._stating.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         unknown = sorted(self._named() - self.checked.monitors.keys())
@@ -168,8 +183,8 @@ class Monitors:
 
     @property
     def differs_from_folder(self) -> bool:
-        """Whether what is in force is something else than the folder has now."""
-        return self._folder.looked_at() != self.sources
+        """Whether what is in force is something else than the folder has now; not where there is no folder."""
+        return self.folder is not None and self._folder.looked_at() != self.sources
 
     def enabled(self, name: str) -> bool:
         """Whether a monitor's events happen."""
@@ -179,6 +194,14 @@ class Monitors:
     def names(self) -> list[str]:
         """All monitors, in the order in which they see messages."""
         return list(self.checked.monitors)
+
+    def file_of(self, name: str) -> str:
+        """The file of this name, or the file that this monitor stands in. Raises `UnknownMonitorError`."""
+        if name in self.sources.files:
+            return name
+        if name not in self.checked.monitors:
+            raise UnknownMonitorError(self._unknown([name]))
+        return self.checked.monitors[name]
 
     def statement(self, relay: int = 0) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
@@ -198,14 +221,30 @@ class Monitors:
         """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`."""
         async with self._changing:
             self._expect(expected)
-            return await self._change(self.sources.with_files(files, definitions), who, who, note or "loaded")
+            sources = self.sources.with_files(files, definitions)
+            folders = self._from_folder - files.keys()
+            return await self._change(sources, who, who, note or "loaded", from_folder=folders)
 
-    async def reload(self, *, who: str, expected: str | None = None) -> Replaced:
-        """Take what the folder has now. Raises `SpecificationsRefusedError`."""
+    async def reload(self, *, who: str, expected: str | None = None, prune: bool = False) -> Replaced:
+        """Take what the folder has now; what was loaded from elsewhere stays, unless `prune`.
+
+        Raises `SpecificationsRefusedError`, also when there is no folder.
+        """
         async with self._changing:
             self._expect(expected)
+            if self.folder is None:
+                raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
-            return await self._change(sources, _DISK, who, "reloaded from disk")
+            from_folder = frozenset(sources.files)
+            kept = [] if prune else sorted(self.sources.files.keys() - self._from_folder - from_folder)
+            if kept:
+                left = {name: self.sources.files[name] for name in kept}
+                definitions = self.sources.definitions | sources.definitions
+                sources = sources.with_files(left, definitions)
+            keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
+            return await self._change(
+                sources, keeper, who, "reloaded from disk", from_folder=from_folder, kept=kept
+            )
 
     async def remove(self, names: list[str], *, who: str, expected: str | None = None) -> Replaced:
         """Remove files, by their names or those of their monitors.
@@ -227,9 +266,8 @@ class Monitors:
             if left:
                 text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
                 raise SpecificationsRefusedError([text])
-            return await self._change(
-                self.sources.without(files), who, who, f"removed {', '.join(sorted(files))}"
-            )
+            sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
+            return await self._change(sources, who, who, note, from_folder=self._from_folder - files)
 
     async def switch(
         self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
@@ -328,7 +366,20 @@ class Monitors:
         await self._store.settled()
         self._acts += 1
 
-    async def _change(self, sources: Sources, keeper: str, who: str, note: str) -> Replaced:
+    def _note_folder(self, files: Iterable[str]) -> None:
+        self._from_folder = frozenset(files)
+        self._store.save_setting(_FROM_FOLDER, json.dumps(sorted(self._from_folder)))
+
+    async def _change(
+        self,
+        sources: Sources,
+        keeper: str,
+        who: str,
+        note: str,
+        *,
+        from_folder: Collection[str],
+        kept: Sequence[str] = (),
+    ) -> Replaced:
         before, previous = self.revision, self.sources
         try:
             checked = await asyncio.to_thread(check, sources)
@@ -343,13 +394,15 @@ class Monitors:
             )
             raise
         began = self._stating.began(checked.monitors)
+        self._note_folder(from_folder)
         self._keep(sources, checked, who=keeper, note=note, by=who, before=previous, began=began)
         await self._store.settled()
         await self._stating.all_taken()
         self.published()
         added, changed, removed = sources.difference(previous)
         began = self._stating.began(checked.monitors)  # by those that have it only now, too
-        return Replaced(self.revision, before, added, changed, removed, list(checked.warnings), moved, began)
+        warnings = list(checked.warnings)
+        return Replaced(self.revision, before, added, changed, removed, warnings, moved, began, list(kept))
 
     def _keep(
         self,

@@ -1,19 +1,22 @@
 """The outer face: the node API that other nodes and tools call, answered as if the appliance were not there.
 
 `caller.target` is the incarnation the call is for. Only `getPid` and `shutdown` are carried to the node; the rest is
-answered from the registry and the relay. `publisherUpdate` and `paramUpdate` are not in the table: only a master
-sends those, so from anybody else they are denied like any unknown call.
+answered from the registry and the relay. A `getPid` that the node does not answer breaks off as the node's own
+connection would: `rosnode` takes that for a node it cannot reach and goes on, and ends at an answer that is an error.
+The node that publishes for monitors is control itself: its process is control's. `publisherUpdate` and `paramUpdate`
+are not in the table: only a master sends those, so from anybody else they are denied like any unknown call.
 """
 
+import os
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.allocation import TOPIC as TOPIC_CONNECTION
 from appliance.master.arguments import MESSAGE, PROTOCOLS, TOPIC
 from appliance.master.call import Answer, Call, Caller, Identity
 from appliance.master.client import CallFailedError
+from appliance.master.http import NoAnswerError
 from appliance.master.registry import Incarnation, Kind
 from appliance.master.relays import tcpros_port
-from appliance.policy.model import Category
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Value
 
@@ -24,14 +27,15 @@ if TYPE_CHECKING:
 async def request_topic(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`requestTopic(caller_id, topic, protocols)` → the relay's port; the grant is installed first."""
     target = _target(caller)
-    topic, protocols = str(arguments[0]), cast(list[Value], arguments[1])
+    topic, protocols = str(arguments[0]), cast(list[list[Value]], arguments[1])
     if (Kind.PUBLICATION, topic) not in target.registrations:
-        return [0, f"{target.name} is not a publisher of [{topic}]", []]
-    names = [one[0] for one in protocols if isinstance(one, list) and one]
+        return [-1, f"Not a publisher of [{topic}]", []]
+    names = [one[0] for one in protocols if one]
     if "TCPROS" not in names:
         offered = ", ".join(str(one)[:40] for one in names) or "nothing"
         return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
-    if not master.mediation.carries_topic(topic):
+    own = target.own or master.gate.is_own_subscriber(caller, topic)  # who has no way but the relay
+    if not own and not master.mediation.carries_topic(topic):
         return await _negotiated_directly(master, target, topic, caller)
     master.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
     address = master.addresses.told_to(caller.peer)
@@ -54,20 +58,29 @@ async def _negotiated_directly(master: "Master", target: Incarnation, topic: str
 
 async def get_pid(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`getPid(caller_id)`: asked of the node."""
+    target = _target(caller)
+    if target.of_monitors:
+        return [1, "", os.getpid()]
     try:
-        answer = await master.liveness.client(_target(caller)).call("getPid", caller.caller_id)
+        answer = await master.liveness.client(target).call("getPid", caller.caller_id)
     except CallFailedError as error:
-        master.liveness.look_at(_target(caller))
-        return [0, str(error) if caller.own else f"{_target(caller).name} does not answer", -1]
+        master.liveness.look_at(target)
+        raise NoAnswerError from error
     if isinstance(answer, list) and len(answer) == 3:
         return answer
-    return [0, f"{_target(caller).name} answered with something that is not [code, message, pid]", -1]
+    return [0, f"{target.name} answered with something that is not [code, message, pid]", -1]
 
 
 async def shutdown(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`shutdown(caller_id, msg)`: carried to the node, which often dies before it answers."""
     target = _target(caller)
-    message = str(arguments[0]) if arguments else ""
+    if target.of_monitors:
+        return [
+            0,
+            f"{target.name} publishes for the appliance's monitors; `rosrv monitor` takes those back",
+            0,
+        ]
+    message = str(arguments[0])
     try:
         await master.liveness.client(target).call("shutdown", caller.caller_id, message)
     except CallFailedError:
@@ -77,7 +90,7 @@ async def shutdown(master: "Master", caller: Caller, arguments: tuple[object, ..
 
 async def get_name(_master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
     """`getName(caller_id)`."""
-    return [1, "node name", _target(caller).name]
+    return [1, "", _target(caller).name]
 
 
 async def get_uri(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
@@ -146,7 +159,7 @@ async def get_bus_stats(master: "Master", caller: Caller, _arguments: tuple[obje
                 traffic = master.relay.traffic.get((one.key, topic))
                 rows.append([one.number, traffic.bytes if traffic is not None else 0, -1, True])
         subscribed.append([topic, rows])
-    return [1, "bus stats", [published, subscribed, []]]
+    return [1, "", [published, subscribed, []]]
 
 
 def _target(caller: Caller) -> Incarnation:
@@ -168,11 +181,10 @@ NODE_CALLS: dict[str, Call] = {
             (TOPIC, PROTOCOLS),
             denial=[],
             identity=Identity.NODE,
-            category=Category.SUBSCRIBE,
             resource=0,
         ),
         Call("getPid", get_pid, denial=-1, reads=True),
-        Call("shutdown", shutdown, (MESSAGE,), optional=1),
+        Call("shutdown", shutdown, (MESSAGE,)),
         Call("getName", get_name, denial="", reads=True),
         Call("getUri", get_uri, denial="", reads=True),
         Call("getMasterUri", get_master_uri, denial="", reads=True),

@@ -75,6 +75,8 @@ class MonitorRecords:
             name,
             text,
             severity=severity,
+            host=event.host or None,
+            caller_id=event.caller_id or None,
             category="monitor",
             resource=event.resource,
             more=event.detail,

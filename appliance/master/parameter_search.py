@@ -9,9 +9,9 @@ is told when nothing is found depends on the policy alone.
 from typing import TYPE_CHECKING
 
 from appliance.master.call import Answer, Caller, denial_text
-from appliance.master.parameters import standing_at
 from appliance.policy.model import Category, Decision, Request
 from appliance.ros.names import resolve_parameter
+from appliance.ros.parameter_tree import standing_at
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
@@ -72,4 +72,4 @@ def _decide(master: "Master", caller: Caller, name: str) -> Decision:
 
 def _recorded(master: "Master", caller: Caller, name: str, decision: Decision) -> str:
     record = master.recorder.decided(caller, "searchParam", Category.READ.value, name, decision)
-    return denial_text(decision, record)
+    return denial_text(decision, record, master.policy().tell)

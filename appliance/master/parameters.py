@@ -1,11 +1,13 @@
 """The parameter calls, and the mirror of ROSMaster's parameter tree that survives its death.
 
-The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
+The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change. So it answers what asks
+for one value: a node that starts asks for hundreds (roscpp for five with every subscription). While ROSMaster is away
+or not whole, such a question waits as all calls do.
 """
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from appliance.master.arguments import ApiUri
 from appliance.master.batch import Wanted
@@ -13,29 +15,36 @@ from appliance.master.bulk import weigh
 from appliance.master.call import Answer, Caller, LimitReachedError, denial_text
 from appliance.master.client import CallFailedError
 from appliance.master.http import Peer
-from appliance.master.registration import incarnation_of
+from appliance.master.parameter_charges import (
+    APPLIANCE,
+    NAME_WEIGHT,
+    ParameterCharges,
+    measure,
+    member_weight,
+)
+from appliance.master.registration import registering
 from appliance.master.registry import Incarnation, Kind
-from appliance.policy.model import Category, Request
+from appliance.policy.model import Address, Category, Request
+from appliance.policy.rights import decide_right, right_to_read
 from appliance.ros.errors import EncodingError, PeerError, ProtocolError
 from appliance.ros.names import resolve_parameter
+from appliance.ros.parameter_tree import Tree, parts_of, standing_at
 from appliance.ros.xmlrpc import Value
+from appliance.shares.pool import Pool
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
 
-Tree = dict[str, Value]
 # Calls that go to ROSMaster together when they follow each other in a multicall, and how much of them.
 IN_ORDER = frozenset({"setParam", "deleteParam", "hasParam"})
 _TOGETHER_BYTES = 256 << 10
-_NAME_WEIGHT = 40
 
 
 class ParameterMirror:
-    """A copy of ROSMaster's parameter tree, and how much there is of it; `changed()` hears of every change.
+    """A copy of ROSMaster's parameter tree, and who is charged for it; `changed()` hears of every change.
 
     `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
     tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
-    `bytes_limit` is what all parameters together may weigh.
     `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`.
     """
 
@@ -43,138 +52,157 @@ class ParameterMirror:
         self,
         tree: Tree,
         changed: Callable[[], None],
+        charges: ParameterCharges,
         *,
-        bytes_limit: int = 64 << 20,
         depth_limit: int = 100,
-        note: Callable[[str, Value], None] = lambda _key, _value: None,
+        note: Callable[[str, Value], None],
         since: Iterable[tuple[str, Value]] = (),
     ) -> None:
         self.tree = tree
-        self.weight = measure(tree)[0]
+        self.charges = charges
+        self.weight = 0
         self._changed = changed
-        self._note: Callable[[str, Value], None] = lambda _key, _value: None
+        self._note = note
+        self._depth_limit = depth_limit
         for key, value in since:
             if value is None:
-                self.delete(key)
+                self._take_out(key)
             else:
-                self.set(key, value)
-        self._note = note
-        self.bytes_limit = bytes_limit
-        self._depth_limit = depth_limit
+                self._put_in(key, value)
+        self._recount(final=False)
 
-    def check(self, key: str, value: Value) -> None:
-        """Raise `ProtocolError` or `LimitReachedError` for a value that would be too deep or too much."""
-        weight, depth = measure(value)
-        if len(_parts(key)) + depth > self._depth_limit:
+    @property
+    def bytes_limit(self) -> int:
+        """What all parameters together may weigh."""
+        return self.charges.pool.bounds.whole
+
+    def check(self, key: str, depth: int) -> None:
+        """Raise `ProtocolError` for a value that would be too deep."""
+        if len(parts_of(key)) + depth > self._depth_limit:
             raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
-        if self.weight + weight > self.bytes_limit:
-            raise LimitReachedError(
-                f"all parameters together would have {self.weight + weight} bytes; the limit is {self.bytes_limit}"
-            )
 
-    def has_room(self, weight: int) -> bool:
-        """Whether so much can come in addition to what is there."""
-        return self.weight + weight <= self.bytes_limit
+    def reserve(self, key: str, weight: int, host: Address) -> "Reserved":
+        """Keep room for a value that a host is about to set. Raises `LimitReachedError` when there is none for it.
+
+        What takes no more than one host had there takes the place of that: it is charged to this host if it has room,
+        and stays the other's if not. So whoever may write can always correct a parameter, and two hosts together get
+        no more than their shares.
+        """
+        pool = self.charges.pool
+        parts, before = self._place_of(key)
+        held = self.charges.held(parts, before)
+        after = _with_namespaces(key, len(parts), weight)
+        growth = max(0, after - held[host])
+        refusal = pool.take(host, growth) if growth else ""
+        if not refusal:
+            return Reserved(pool, host, growth, weight)
+        former, most = held.most_common(1)[0]
+        if after > most:
+            raise LimitReachedError(f"parameter {key[:80]} is not set: {refusal}")
+        return Reserved(pool, former, 0, weight)
 
     def replace(self, tree: Tree) -> None:
         """Take the tree that ROSMaster has."""
         self.tree = tree
-        self.weight = measure(tree)[0]
+        self._recount(final=True)
         self._changed()
 
-    def set(self, key: str, value: Value) -> None:
+    def set(self, key: str, value: Value, reserved: "Reserved") -> None:
         """`key` (canonical) has this value, which is the mirror's from now on; a dictionary replaces the namespace."""
-        parts = _parts(key)
+        reserved.release()
+        parts, before = self._place_of(key)
+        self._put_in(key, value)
+        after = _with_namespaces(key, len(parts), reserved.weight)
+        self.charges.replaced(parts, before, after, reserved.owner)
+        self.weight += after - before
+        if parts:
+            self._note(key, value)
+        self._changed()
+
+    def delete(self, key: str) -> None:
+        """`key` (canonical) is gone."""
+        parts = parts_of(key)
+        there, in_the_way = standing_at(self.tree, key)
+        if not parts or there is None or in_the_way is not None:
+            return
+        before = member_weight(parts[-1], there)
+        self._take_out(key)
+        self.charges.replaced(parts, before, 0, APPLIANCE)
+        self.weight -= before
+        self._note(key, None)
+        self._changed()
+
+    def _recount(self, *, final: bool) -> None:
+        self.weight = measure(self.tree)[0]
+        self.charges.recount(self.tree, final=final)
+
+    def _place_of(self, key: str) -> tuple[list[str], int]:
+        """The topmost key that is new, or another, when `key` is set; and what is there now, in bytes."""
+        parts = parts_of(key)
+        node: Value = self.tree
+        for depth, part in enumerate(parts, 1):
+            assert isinstance(node, dict)  # noqa: S101 - the root is one, and no other goes on; narrows for mypy
+            if part not in node:
+                return parts[:depth], 0
+            if depth == len(parts) or not isinstance(node[part], dict):
+                return parts[:depth], member_weight(part, node[part])
+            node = node[part]
+        return [], self.weight
+
+    def _put_in(self, key: str, value: Value) -> None:
+        parts = parts_of(key)
         if not parts:
-            self.replace(cast(Tree, value))
+            self.tree = cast(Tree, value)
             return
         node = self.tree
         for part in parts[:-1]:
             below = node.get(part)
             if not isinstance(below, dict):
-                below = {}
-                self._put(node, part, below)
+                node[part] = below = {}
             node = below
-        self._put(node, parts[-1], value)
-        self._note(key, value)
-        self._changed()
+        node[parts[-1]] = value
 
-    def delete(self, key: str) -> None:
-        """`key` (canonical) is gone."""
-        parts = _parts(key)
-        node: Value = self.tree
-        for part in parts[:-1]:
-            if not isinstance(node, dict):
-                return
-            node = node.get(part)
-        if parts and isinstance(node, dict) and parts[-1] in node:
-            self.weight -= _member(parts[-1], node.pop(parts[-1]))
-            self._note(key, None)
-            self._changed()
-
-    def _put(self, node: Tree, name: str, value: Value) -> None:
-        if name in node:
-            self.weight -= _member(name, node[name])
-        node[name] = value
-        self.weight += _member(name, value)
+    def _take_out(self, key: str) -> None:
+        above, _, name = key.rpartition("/")
+        node, _ = standing_at(self.tree, above or "/")
+        if isinstance(node, dict):
+            node.pop(name, None)
 
 
-def measure(value: Value) -> tuple[int, int]:
-    """About how many bytes a value takes on the wire, and how deep it is (0: no array or struct).
+class Reserved:
+    """Room for a value of this weight until ROSMaster has it or refuses it; `owner` is charged for it."""
 
-    Raises `ProtocolError` for `<nil/>`.
-    """
-    if isinstance(value, str):
-        return 35 + len(value), 0
-    if isinstance(value, bytes):
-        return 35 + len(value) * 4 // 3, 0
-    if isinstance(value, list):
-        measured = [measure(one) for one in value]
-        return 50 + sum(weight for weight, _ in measured), 1 + max(
-            (depth for _, depth in measured), default=0
-        )
-    if isinstance(value, dict):
-        measured = [measure(one) for one in value.values()]
-        weight = 40 + sum(_NAME_WEIGHT + len(name) for name in value) + sum(weight for weight, _ in measured)
-        return weight, 1 + max((depth for _, depth in measured), default=0)
-    if value is None:
-        raise ProtocolError("a value has <nil/> in it, which neither ROSMaster nor roscpp can send")
-    return 45, 0
+    __slots__ = ("_amount", "_pool", "owner", "weight")
+
+    def __init__(self, pool: Pool[Address], owner: Address, amount: int, weight: int) -> None:
+        self._pool = pool
+        self._amount = amount
+        self.owner = owner
+        self.weight = weight
+
+    def release(self) -> None:
+        """It is set, and charged as what it is; or it could not be."""
+        self._pool.give_back(self.owner, self._amount)
+        self._amount = 0
 
 
-def _member(name: str, value: Value) -> int:
-    return _NAME_WEIGHT + len(name) + measure(value)[0]
-
-
-def _parts(key: str) -> list[str]:
-    return [part for part in key.split("/") if part]
-
-
-def holds_others(value: Value) -> bool:
-    """Whether a value is a namespace with something in it: whose rights are asked, too."""
-    return isinstance(value, dict) and bool(value)
-
-
-def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
-    """What `key` (canonical) has, None for nothing; and its parent that has a value and is no namespace, if any.
-
-    Such a parent is in the way: ROSMaster replaces it by a namespace when something below it is set.
-    """
-    node: Value = tree
-    passed = ""
-    for part in _parts(key):
-        if not isinstance(node, dict):
-            return None, passed
-        node = node.get(part)
-        if node is None:
-            return None, None
-        passed += f"/{part}"
-    return node, None
+def _with_namespaces(key: str, first: int, weight: int) -> int:
+    """What a value of this weight takes with its name and those of its key from the `first` on, which are new."""
+    if not first:
+        return weight
+    *namespaces, name = parts_of(key)[first - 1 :]
+    return NAME_WEIGHT + len(name) + weight + sum(member_weight(part, {}) for part in namespaces)
 
 
 async def get_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`getParam(caller_id, key)`."""
     key = str(arguments[0])
+    if master.rosmaster.reachable:
+        there, _ = standing_at(master.parameters.tree, key)
+        if there is None:
+            return [-1, f"Parameter [{key}] is not set", 0]
+        if not isinstance(there, dict):
+            return [1, f"Parameter [{key}]", there]
     answer = await master.rosmaster.call("getParam", caller.caller_id, key)
     hidden = _hidden(master, caller, "getParam", key, answer)
     return answer if hidden is None else [0, hidden, 0]
@@ -194,10 +222,11 @@ def _hidden(master: "Master", caller: Caller, method: str, key: str, answer: Ans
     ):
         return None
     request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
-    decision = policy.decide_parameter(request, namespace=holds_others(answer[2]))
+    decision = decide_right(policy, right_to_read(request, answer[2]))
     if decision.allowed:
         return None
-    return denial_text(decision, master.recorder.decided(caller, method, Category.READ.value, key, decision))
+    record = master.recorder.decided(caller, method, Category.READ.value, key, decision)
+    return denial_text(decision, record, policy.tell)
 
 
 def asks_for(mirror: ParameterMirror, params: Sequence[Value], enough: int) -> bool:
@@ -223,7 +252,7 @@ def may_be_told(master: "Master", incarnation: Incarnation, key: str, value: Val
     if incarnation.own or not policy.has_section(Category.READ):
         return True
     request = Request(incarnation.host, incarnation.name, Category.READ, key)
-    decision = policy.decide_parameter(request, namespace=holds_others(value))
+    decision = decide_right(policy, right_to_read(request, value))
     if not decision.allowed:
         peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
         caller = Caller(peer, incarnation.name, time.monotonic_ns())
@@ -233,26 +262,34 @@ def may_be_told(master: "Master", incarnation: Incarnation, key: str, value: Val
 
 async def has_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`hasParam(caller_id, key)`."""
+    key = str(arguments[0])
+    if master.rosmaster.reachable:
+        return [1, key, standing_at(master.parameters.tree, key)[0] is not None]
     return await master.rosmaster.call("hasParam", caller.caller_id, str(arguments[0]))
 
 
 async def set_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`setParam(caller_id, key, value)`."""
-    key, value = str(arguments[0]), cast(Value, arguments[1])
-    master.parameters.check(key, value)
-    answer = await master.rosmaster.call("setParam", caller.caller_id, key, value)
-    if _is_set(answer, key, value):
-        master.parameters.set(key, value)
-    return answer
+    [outcome] = await in_order(master, [(caller, "setParam", arguments)])
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
 def _is_set(answer: Answer, key: str, value: Value) -> bool:
     """Whether ROSMaster has a value now, by its answer to `setParam`.
 
-    It has it before it looks whom to tell, and answers with an error when that fails (a name with a slash in a
+    It has it before it looks whom to tell, and answers with an error when that fails (a name like `a/b` in a
     dictionary, and somebody who subscribed to what it looks like). What it does not take is a root that is none.
     """
     return answer[0] == 1 or key != "/" or isinstance(value, dict)
+
+
+class _Part(NamedTuple):
+    """A call on its way to ROSMaster, and the room that is kept for its value."""
+
+    wanted: Wanted
+    reserved: Reserved | None
 
 
 async def in_order(
@@ -263,60 +300,80 @@ async def in_order(
     A value is checked as if it came alone after those before it; one that fails holds up no other.
     """
     outcomes: list[Answer | Exception] = []
-    waiting: list[Wanted] = []
+    waiting: list[_Part] = []
     weight = 0
     for caller, method, arguments in wanted:
         key, value = str(arguments[0]), cast(tuple[Value, ...], arguments[1:])
         try:
-            more = sum(_NAME_WEIGHT + len(key) + measure(one)[0] for one in value)
-            if weight + more > _TOGETHER_BYTES or not master.parameters.has_room(weight + more):
+            measured, depth = measure(value[0]) if value else (0, 0)
+            master.parameters.check(key, depth)
+            if weight + measured + len(key) > _TOGETHER_BYTES:
                 outcomes += await _send(master, waiting)
                 waiting, weight = [], 0
-            for one in value:
-                master.parameters.check(key, one)
+            reserved = None
+            if value:
+                try:
+                    reserved = master.parameters.reserve(key, measured, _charged(caller))
+                except LimitReachedError:  # those before it may make room
+                    outcomes += await _send(master, waiting)
+                    waiting, weight = [], 0
+                    reserved = master.parameters.reserve(key, measured, _charged(caller))
         except (ProtocolError, LimitReachedError) as error:
             outcomes += [*await _send(master, waiting), error]
             waiting, weight = [], 0
             continue
-        waiting.append((method, (caller.caller_id, key, *value)))
-        weight += more
+        waiting.append(_Part((method, (caller.caller_id, key, *value)), reserved))
+        weight += NAME_WEIGHT + len(key) + measured
     return outcomes + await _send(master, waiting)
 
 
-async def _send(master: "Master", calls: list[Wanted]) -> list[Answer | Exception]:
-    """Make them, as one call if they are several; the mirror follows what ROSMaster took."""
-    outcomes: list[Answer | Exception] = []
+def _charged(caller: Caller) -> Address:
+    return APPLIANCE if caller.own else caller.peer.host
+
+
+async def _send(master: "Master", parts: list[_Part]) -> list[Answer | Exception]:
+    """Make the calls; mirror, charges and subscribers follow what ROSMaster took."""
+    try:
+        outcomes = await _make(master, [part.wanted for part in parts])
+    finally:
+        for part in parts:
+            if part.reserved is not None:
+                part.reserved.release()
+    for ((method, (caller_id, key, *value)), reserved), outcome in zip(parts, outcomes, strict=True):
+        if isinstance(outcome, Exception):
+            continue
+        if reserved is not None and _is_set(outcome, str(key), value[0]):
+            master.parameters.set(str(key), value[0], reserved)
+            master.graph.parameter_set(str(key), value[0], str(caller_id))
+        elif method == "deleteParam" and outcome[0] == 1:
+            master.parameters.delete(str(key))
+            master.graph.parameter_deleted(str(key))
+    return outcomes
+
+
+async def _make(master: "Master", calls: list[Wanted]) -> list[Answer | Exception]:
+    """The outcomes of the calls, made as one if they are several."""
     if not calls:
-        return outcomes
+        return []
     try:
         if len(calls) == 1:
             method, params = calls[0]
-            outcomes.append(await master.rosmaster.call(method, *params))
-        else:
-            outcomes += await master.rosmaster.call_in_order(calls)
+            return [await master.rosmaster.call(method, *params)]
+        return list[Answer | Exception](await master.rosmaster.call_in_order(calls))
     except EncodingError as error:
         if len(calls) == 1:
             return [error]
-        return [outcome for one in calls for outcome in await _send(master, [one])]  # nothing was sent yet
+        return [outcome for one in calls for outcome in await _make(master, [one])]  # nothing was sent yet
     except CallFailedError as error:
         return [error] * len(calls)
-    for (method, (_caller_id, key, *value)), outcome in zip(calls, outcomes, strict=True):
-        if isinstance(outcome, Exception):
-            continue
-        if method == "setParam" and _is_set(outcome, str(key), value[0]):
-            master.parameters.set(str(key), value[0])
-        elif method == "deleteParam" and outcome[0] == 1:
-            master.parameters.delete(str(key))
-    return outcomes
 
 
 async def delete_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`deleteParam(caller_id, key)`."""
-    key = str(arguments[0])
-    answer = await master.rosmaster.call("deleteParam", caller.caller_id, key)
-    if answer[0] == 1:
-        master.parameters.delete(key)
-    return answer
+    [outcome] = await in_order(master, [(caller, "deleteParam", arguments)])
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
 async def get_param_names(master: "Master", caller: Caller, _arguments: tuple[object, ...]) -> Answer:
@@ -341,19 +398,19 @@ async def get_param_names(master: "Master", caller: Caller, _arguments: tuple[ob
 async def subscribe_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`subscribeParam(caller_id, caller_api, key)`."""
     api, key = cast(ApiUri, arguments[0]), str(arguments[1])
-    incarnation = await incarnation_of(master, caller, api)
-    answer = await master.rosmaster.call(
-        "subscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
-    )
-    hidden = _hidden(master, caller, "subscribeParam", key, answer)
-    if hidden is not None:
-        await master.rosmaster.call(
-            "unsubscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
+    async with registering(master, caller, api) as incarnation:
+        answer = await master.rosmaster.call(
+            "subscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
         )
-        return [0, hidden, 0]
-    if answer[0] == 1:
-        master.graph.registered(incarnation, Kind.PARAMETER, key, "")
-    return answer
+        hidden = _hidden(master, caller, "subscribeParam", key, answer)
+        if hidden is not None:
+            await master.rosmaster.call(
+                "unsubscribeParam", caller.caller_id, master.faces.inner_uri(incarnation), key
+            )
+            return [0, hidden, 0]
+        if answer[0] == 1:
+            master.graph.registered(incarnation, Kind.PARAMETER, key, "")
+        return answer
 
 
 async def unsubscribe_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:

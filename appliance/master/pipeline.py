@@ -6,30 +6,32 @@ an answer of the right shape for the caller, and a record; never an exception fo
 
 import asyncio
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import structlog
 
 from appliance.audit.record import Severity
 from appliance.master.arguments import KEY, NODE, SEARCH_KEY, SUBGRAPH, canonicalise, check_arity
-from appliance.master.bulk import Bulk, bulk_turns, weigh
-from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError, Touch, denial_text
+from appliance.master.bulk import Bulk, LargeWrites, bulk_turns, weigh
+from appliance.master.call import Answer, Call, Caller, Identity, LimitReachedError, denial_text
 from appliance.master.claims import Claims
 from appliance.master.client import CallFailedError
-from appliance.master.gate import Contest, contested
+from appliance.master.gate import Contest, Probe, contested
 from appliance.master.http import Handler, HttpRequest
+from appliance.master.method_name import method_named
 from appliance.master.parameters import IN_ORDER, asks_for, in_order
 from appliance.master.places import NoPortError
 from appliance.master.recorder import NOT_RECORDED
 from appliance.master.registration import given_up
 from appliance.master.registry import Incarnation
 from appliance.master.write_turns import WriteTurns
-from appliance.policy.model import Category, Decision
+from appliance.policy.model import Address, Category, Decision
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
 from appliance.ros.names import check_caller_id, check_tool_id
 from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
+from appliance.shares.pool import Standing
 
 if TYPE_CHECKING:
     from appliance.master.core import Master
@@ -48,13 +50,21 @@ _PARSE_FAULT, _LIMIT_FAULT, _INTERNAL_FAULT = -32700, -32600, -32603
 class Pipeline:
     """Serves requests by a table of calls. Bodies and answers over `offload` bytes are read and written in a thread."""
 
-    def __init__(self, master: "Master", *, limits: Limits, offload: int) -> None:
+    def __init__(
+        self,
+        master: "Master",
+        *,
+        limits: Limits,
+        offload: int,
+        standing: Callable[[Address], Standing],
+    ) -> None:
         self._master = master
         self._limits = limits
         self._offload = offload
         self._claims = Claims()
         self._writes = WriteTurns()
-        self._bulk = bulk_turns()
+        self._bulk = bulk_turns(standing)
+        self._large = LargeWrites(offload, standing)
 
     def handler(
         self, calls: Mapping[str, Call], *, own: bool = False, target: Incarnation | None = None
@@ -78,7 +88,7 @@ class Pipeline:
                 else:
                     method_call = await self._parse_large(body, bulk)
             except PeerError as error:
-                return self._not_understood(caller, error)
+                return self._not_understood(caller, body, error)
             try:
                 answer = await self._answer_all(calls, caller, method_call, bulk)
                 known = method_call.method in calls or method_call.method == _MULTICALL
@@ -95,13 +105,14 @@ class Pipeline:
                 )
 
     async def _parse_large(self, body: bytes, bulk: Bulk) -> MethodCall:
+        bulk.large = True
         await bulk.take()
         try:
             return await asyncio.to_thread(parse_call, body, self._limits)
         finally:
             bulk.give_back()  # to carry it out may take long
 
-    def _not_understood(self, caller: Caller, error: PeerError) -> bytes:
+    def _not_understood(self, caller: Caller, body: bytes, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)
         decision = self._master.recorder.happened(
             "limit exceeded" if limit else "malformed",
@@ -109,6 +120,8 @@ class Pipeline:
             severity=Severity.WARNING,
             decision="deny",
             host=caller.peer.text,
+            category=Category.COMMAND.value,
+            resource=method_named(body),
         )
         return build_fault(_LIMIT_FAULT if limit else _PARSE_FAULT, f"{error} [{decision}]")
 
@@ -120,7 +133,7 @@ class Pipeline:
         if call.method != _MULTICALL or caller.target is not None:
             if self._asks_for_much(call.method, call.params):
                 await bulk.take()
-            return await self._answer(calls, caller, call.method, call.params)
+            return await self._answer(calls, caller, call.method, call.params, bulk)
         if len(call.params) != 1 or not isinstance(call.params[0], list):
             why = "system.multicall takes one list of calls"
             self._part_refused(caller, why)
@@ -129,12 +142,15 @@ class Pipeline:
         room = self._master.parameters.bytes_limit  # as much as one call can be answered
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
         for run in _runs(call.params[0]):
+            left = len(call.params[0]) - len(results)
             if room <= 0:
-                return results + self._too_much(caller, len(call.params[0]) - len(results))
+                return results + self._too_much(caller, left)
+            if owing := self._master.recorder.owing(caller.peer.text):
+                return results + self._beyond(caller, f"{owing}; {left} more parts are not carried out", left)
             # Roslaunch clears and sets parameters in one multicall, and the order is what counts: a run of parameter
             # calls goes to ROSMaster as one, in its order. Everything else waits for the part before it.
             if len(run) > 1:
-                results += await self._answer_run(calls, caller, run)
+                results += await self._answer_run(calls, caller, run, bulk)
             else:
                 results.append(await self._answer_part(calls, caller, run[0], bulk))
                 room -= await self._weigh(results[-1], bulk)
@@ -161,18 +177,29 @@ class Pipeline:
         why = (
             f"the answers to a multicall have more than {limit} bytes; {count} more parts are not carried out"
         )
+        return self._beyond(caller, why, count)
+
+    def _beyond(self, caller: Caller, why: str, count: int) -> list[Value]:
         return [self._multicall_fault(caller, _LIMIT_FAULT, "limit exceeded", why)] * count
 
-    async def _answer_run(self, calls: Mapping[str, Call], caller: Caller, run: list[Value]) -> list[Value]:
+    async def _answer_run(
+        self, calls: Mapping[str, Call], caller: Caller, run: list[Value], bulk: Bulk
+    ) -> list[Value]:
         """Each part is decided and recorded by itself; those that may be carried out are carried out in order."""
         parts: list[_Allowed | Answer | dict[str, Value]] = []
         for part in run:
             call = _part_of(part)
             parts.append(
-                self._part_refused(caller, _FORM) if call is None else self._first_look(calls, caller, *call)
+                self._part_refused(caller, _FORM)
+                if call is None
+                else await self._first_look(calls, caller, *call, bulk)
             )
-        writes = [str(one.arguments[0]) for one in parts if isinstance(one, _Allowed) and _writes(one.call)]
-        async with self._writes.alone(writes):
+        writing = [one for one in parts if isinstance(one, _Allowed) and _writes(one.call)]
+        values = [_value(one.arguments) for one in writing]
+        async with (
+            self._writes.alone([str(one.arguments[0]) for one in writing]),
+            self._large.turn(caller.peer.host, values),
+        ):
             return await self._carry_out_run(
                 [self._judge(one) if isinstance(one, _Allowed) else one for one in parts]
             )
@@ -201,7 +228,7 @@ class Pipeline:
             return self._part_refused(caller, _FORM)
         if self._asks_for_much(*call):
             await bulk.take()
-        return [await self._answer(calls, caller, *call)]
+        return [await self._answer(calls, caller, *call, bulk)]
 
     def _part_refused(self, caller: Caller, why: str) -> dict[str, Value]:
         return self._multicall_fault(caller, _PARSE_FAULT, "malformed", why)
@@ -220,38 +247,45 @@ class Pipeline:
         return {"faultCode": code, "faultString": f"{why} [{record}]"}
 
     async def _answer(
-        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...], bulk: Bulk
     ) -> Value:
-        understood = self._understand(calls, caller, method, params)
+        understood = await self._understand(calls, caller, method, params, bulk)
         if not isinstance(understood, _Allowed):
             return understood
         caller, call, arguments = understood
         if _writes(call) and self._decide(caller, call, arguments).allowed:
-            async with self._writes.alone((str(arguments[0]),)):
+            large = self._large.turn(caller.peer.host, [_value(arguments)])
+            async with self._writes.alone((str(arguments[0]),)), large:
                 return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
         if call.identity is not Identity.NODE or caller.target is not None:
             return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments))
-        gone = await self._gone(caller, call, arguments)
-        async with self._claims.alone(caller.caller_id):
-            return await self._carry_out(caller, call, arguments, self._decide(caller, call, arguments, gone))
+        probe = await self._probe(caller, call, arguments)
+        # Who subscribes to a parameter hears of every write after the value that answers: no write is under way.
+        keys = () if call.touches is None or call.resource is None else (str(arguments[call.resource]),)
+        async with self._claims.alone(caller.caller_id), self._writes.alone(keys):
+            return await self._carry_out(
+                caller, call, arguments, self._decide(caller, call, arguments, probe)
+            )
 
-    def _understand(
-        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+    async def _understand(
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...], bulk: Bulk
     ) -> "_Allowed | Answer":
         """The call with its canonical arguments, nothing decided yet; the answer when there is none."""
         call = calls.get(method)
         if call is None:
             return self._unknown(caller, method, params)
         try:
+            if bulk.large and weigh(list(params), self._offload) >= self._offload:
+                return _Allowed(*await asyncio.to_thread(_canonical, call, caller, params))
             return _Allowed(*_canonical(call, caller, params))
         except PeerError as error:
             return self._malformed(call, caller, params, error)
 
-    def _first_look(
-        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...]
+    async def _first_look(
+        self, calls: Mapping[str, Call], caller: Caller, method: str, params: tuple[Value, ...], bulk: Bulk
     ) -> "_Allowed | Answer":
         """Understood, and not denied as things are; else the answer. The call is decided when it is its turn."""
-        understood = self._understand(calls, caller, method, params)
+        understood = await self._understand(calls, caller, method, params, bulk)
         if isinstance(understood, _Allowed) and not self._decide(*understood).allowed:
             return self._judge(understood)
         return understood
@@ -260,7 +294,7 @@ class Pipeline:
         """Decided and recorded: the same when it may be carried out, or the answer."""
         decision = self._decide(*understood)
         record = self._record(*understood, decision)
-        return understood if decision.allowed else [0, denial_text(decision, record), understood.call.denial]
+        return understood if decision.allowed else [0, self._told(decision, record), understood.call.denial]
 
     async def _carry_out(
         self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision
@@ -268,12 +302,12 @@ class Pipeline:
         policy = self._master.policy()
         record = self._record(caller, call, arguments, decision)
         if not decision.allowed:
-            given_up(self._master, caller, call.name, arguments)
+            given_up(self._master, caller, call, arguments)
         obstacle = await self._obstacle()
         if obstacle is not None:
             return [0, obstacle, call.denial]
         if not decision.allowed:
-            return [0, denial_text(decision, record), call.denial]
+            return [0, self._told(decision, record), call.denial]
         answer = await self._perform(call, caller, arguments)
         lasts = call.identity is Identity.NODE or call.category is Category.CALL
         if lasts and self._master.policy() is not policy:
@@ -282,10 +316,16 @@ class Pipeline:
         return answer
 
     def _record(self, caller: Caller, call: Call, arguments: tuple[object, ...], decision: Decision) -> str:
-        category, resource = self._master.gate.asked(call, arguments)
-        asked_of = _asked_of(call, arguments)
+        asked = self._master.gate.asked(caller, call, arguments)
+        asked_of = what_about(call, arguments)
         return self._master.recorder.decided(
-            caller, call.name, category.value, resource, decision, **asked_of
+            caller,
+            call.name,
+            asked.category.value,
+            asked.resource,
+            decision,
+            reads=call.reads and asked.category is Category.COMMAND,
+            **asked_of,
         )
 
     async def _obstacle(self) -> str | None:
@@ -295,21 +335,20 @@ class Pipeline:
             return None
         return f"denied: {NOT_RECORDED}"
 
-    async def _gone(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Incarnation | None:
-        """The incarnation that holds the name the caller wants, if its node is gone."""
+    async def _probe(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Probe | None:
+        """What is known now of the node that holds the name the caller wants, if another host's does."""
         outcome = self._master.gate.decide(caller, call, arguments, self._master.parameters.tree)
-        if isinstance(outcome, Contest) and await self._master.liveness.is_gone(outcome.holder):
-            return outcome.holder
-        return None
+        return await self._master.liveness.probe(outcome.holder) if isinstance(outcome, Contest) else None
 
     def _decide(
-        self, caller: Caller, call: Call, arguments: tuple[object, ...], gone: Incarnation | None = None
+        self, caller: Caller, call: Call, arguments: tuple[object, ...], probe: Probe | None = None
     ) -> Decision:
-        obstacle = self._master.recorder.obstacle
-        if obstacle is not None:
+        recorder = self._master.recorder
+        obstacle = recorder.obstacle or ("" if caller.own else recorder.shut_out(caller.peer.text))
+        if obstacle:
             return Decision(False, None, obstacle)
         outcome = self._master.gate.decide(caller, call, arguments, self._master.parameters.tree)
-        return contested(outcome, outcome.holder is gone) if isinstance(outcome, Contest) else outcome
+        return contested(outcome, probe) if isinstance(outcome, Contest) else outcome
 
     async def _perform(self, call: Call, caller: Caller, arguments: tuple[object, ...]) -> Value:
         try:
@@ -328,6 +367,10 @@ class Pipeline:
                     severity=Severity.ALARM,
                     decision="deny",
                     host=caller.peer.text,
+                    caller_id=caller.caller_id,
+                    category=call.category.value,
+                    resource=call.name,
+                    call=call.name,
                 )
                 return [0, f"{error} [{record}]", call.denial]
             case PeerError():
@@ -340,15 +383,18 @@ class Pipeline:
                 return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
         raise error
 
+    def _told(self, decision: Decision, record: str) -> str:
+        return denial_text(decision, record, self._master.policy().tell)
+
     def _unknown(self, caller: Caller, method: str, params: tuple[Value, ...]) -> Answer:
-        claimed = _claimed(params)
+        claimed = claimed_name(params)
         caller = replace(caller, caller_id=claimed)
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
         record = self._master.recorder.decided(caller, method, Category.COMMAND.value, method[:200], decision)
-        return [0, denial_text(decision, record), 0]
+        return [0, self._told(decision, record), 0]
 
     def _malformed(self, call: Call, caller: Caller, params: tuple[Value, ...], error: PeerError) -> Answer:
-        claimed = _claimed(params)
+        claimed = claimed_name(params)
         self._master.recorder.happened(
             "malformed",
             str(error),
@@ -397,7 +443,12 @@ def _runs(parts: list[Value]) -> Iterator[list[Value]]:
 
 def _writes(call: Call) -> bool:
     """Whether the call, whose first parameter is then the key, changes a parameter."""
-    return call.touches is Touch.WRITE
+    return call.touches is Category.WRITE
+
+
+def _value(arguments: tuple[object, ...]) -> Value:
+    """The value that a call which changes a parameter brings; None for a call that takes one away."""
+    return cast(Value, arguments[1]) if len(arguments) > 1 else None
 
 
 def _as_part(answer: "Answer | dict[str, Value]") -> Value:
@@ -408,12 +459,17 @@ def _as_part(answer: "Answer | dict[str, Value]") -> Value:
 def _canonical(
     call: Call, caller: Caller, params: tuple[Value, ...]
 ) -> tuple[Caller, Call, tuple[object, ...]]:
-    required = len(call.parameters) - call.optional
+    caller_id, arguments = canonical_call(call, params)
+    return replace(caller, caller_id=caller_id), call, arguments
+
+
+def canonical_call(call: Call, params: tuple[Value, ...]) -> tuple[str, tuple[object, ...]]:
+    """The name that a call claims, and its canonical arguments. Raises `PeerError`."""
     if call.identity is Identity.NOBODY:
-        return caller, call, canonicalise(call.parameters, required, "", params)
+        return "", canonicalise(call.parameters, "", params)
     if not params:
         raise ProtocolError("missing required caller_id parameter")
-    check_arity(call.parameters, required, params[1:])
+    check_arity(call.parameters, params[1:])
     caller_id = params[0]
     if not isinstance(caller_id, str):
         raise ProtocolError("caller_id must be a string")
@@ -421,13 +477,12 @@ def _canonical(
         check_caller_id(caller_id)
     elif caller_id or not call.reads:
         check_tool_id(caller_id)
-    caller = replace(caller, caller_id=caller_id)
-    return caller, call, canonicalise(call.parameters, required, caller_id, params[1:])
+    return caller_id, canonicalise(call.parameters, caller_id, params[1:])
 
 
-def _asked_of(call: Call, arguments: tuple[object, ...]) -> dict[str, str]:
+def what_about(call: Call, arguments: tuple[object, ...]) -> dict[str, str]:
     """What a command is about (a parameter's key, a node's name), for the record: its resource is the command."""
-    if call.resource is not None:
+    if call.category is not Category.COMMAND:
         return {}
     return {
         parameter.name: str(value)
@@ -436,6 +491,6 @@ def _asked_of(call: Call, arguments: tuple[object, ...]) -> dict[str, str]:
     }
 
 
-def _claimed(params: tuple[Value, ...]) -> str:
+def claimed_name(params: tuple[Value, ...]) -> str:
     """Whom a call that is not understood says it is from, for the record."""
     return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

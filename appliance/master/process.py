@@ -15,6 +15,7 @@ from pathlib import Path
 import structlog
 import uvloop
 
+from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
@@ -35,27 +36,34 @@ from appliance.master.forwarded import Forwarded
 from appliance.master.host_table import HostRefusedError, HostTable
 from appliance.master.hosts import Hosts
 from appliance.master.http import listen
-from appliance.master.journal import restore
+from appliance.master.journal import StoreJournal, restore
 from appliance.master.lifeline import ControlLifeline
 from appliance.master.monitors import ALLOCATION, Monitors
 from appliance.master.places import NoPortError
 from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.recorder import Recorder
-from appliance.master.registry import Life
+from appliance.master.registry import Life, Registry
 from appliance.master.rest import RestLink
 from appliance.master.rest_place import rest_place
 from appliance.master.robot import own_address, robot_addresses
 from appliance.master.signing import Signing
+from appliance.master.spare_memory import SpareMemory
 from appliance.master.specifications import SpecificationsRefusedError
+from appliance.master.standing import HostStanding
 from appliance.master.tokens import Tokens
 from appliance.master.tunnels import Tunnels
 from appliance.ros.uris import node_uri
+from appliance.shares.pool import Standing
+from appliance.shares.table import AUDIT_RESERVE
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 
 _log = structlog.get_logger()
 _OWN, _ADMIN = "own", "admin"
+_SWITCH_SECONDS = 0.001
 _SAVE_SECONDS = 1.0
+_WARNINGS = 100  # of the policy, that a start tells
+_RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of a host, in the disk's reserve
 
 
 def main(lifeline_fd: int, config_path: Path) -> None:
@@ -63,6 +71,8 @@ def main(lifeline_fd: int, config_path: Path) -> None:
     settings = load_resolved(config_path)
     # The loop waits this long at most for a thread (audit log, store) that is in the middle of Python code.
     sys.setswitchinterval(0.0005)
+    # Large values are read and written in threads: the loop waits no longer than this for the interpreter.
+    sys.setswitchinterval(_SWITCH_SECONDS)
     uvloop.run(_Control(settings, lifeline_fd).run())
 
 
@@ -109,7 +119,8 @@ class _Control:
     async def _lay_foundation(self, restarted: bool) -> Foundation:
         self._authority = Authority()
         self._signing = Signing(self._authority)
-        self._audit = _open_audit(self._settings, self._signing, self._log_held())
+        self._standing: HostStanding | None = None
+        self._audit = _open_audit(self._settings, self._signing, self._log_held(), self._standing_of)
         audit = self._settings.audit
         recorder = Recorder(
             self._audit,
@@ -138,6 +149,8 @@ class _Control:
             allocation=Allocation(self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)),
         )
         monitors.start(restarted=restarted)
+        registry = Registry(StoreJournal(store))
+        self._standing = standing = HostStanding(lambda: policies.current, registry.registrations_of)
         return Foundation(
             settings=self._settings,
             lifeline=self._lifeline,
@@ -146,10 +159,16 @@ class _Control:
             policies=policies,
             monitors=monitors,
             hosts=hosts,
-            doors=Doors(self._settings, recorder, lambda: policies.current),
+            registry=registry,
+            standing=standing,
+            doors=Doors(self._settings, recorder, lambda: policies.current, standing),
             sockets=self._take_sockets(),
             parameters_dirty=self._parameters_dirty,
         )
+
+    def _standing_of(self, host: str) -> Standing:
+        """What is known of a host; until the policy has been read nobody is a stranger."""
+        return Standing.NAMED if self._standing is None else self._standing.of_text(host)
 
     async def _make_hosts(self, store: StateStore, recorder: Recorder) -> Hosts:
         """Before the policy, which names them: their addresses count once clear text is kept out."""
@@ -212,7 +231,9 @@ class _Control:
             queued_deliveries=lambda: parts.delivery.waiting,
             forwarded=self._forwarded.status,
         )
-        self._rest = RestLink(administration, self._tokens, base.recorder)
+        self._rest = RestLink(
+            administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof
+        )
         self._rest.served = self._served
         if _ADMIN in sockets:
             self._admin = AdminServer(administration)
@@ -243,6 +264,7 @@ class _Control:
             parts.reconciler.run(),
             parts.master.liveness.run(),
             base.doors.visitors.sweep(),
+            SpareMemory().watch(),
             self._save_parameters(),
             self._tunnels.run(),
             parts.publisher.run(parts.reconciler.ready),
@@ -275,6 +297,7 @@ class _Control:
             "inner_port": base.port(INNER),
             "token": token,
             "own_port": base.port(_OWN),
+            "warnings": [str(one) for one in base.policies.current.warnings[:_WARNINGS]],
         }
         self._lifeline.say(messages.Ready(detail))
 
@@ -343,15 +366,26 @@ async def _reload_policy(policies: Policies) -> None:
         return
 
 
-def _open_audit(settings: Settings, signing: Signing, held_by: Callable[[list[int]], None]) -> AuditLog:
+def _open_audit(
+    settings: Settings,
+    signing: Signing,
+    held_by: Callable[[list[int]], None],
+    standing: Callable[[str], Standing],
+) -> AuditLog:
     audit = settings.audit
+    reserve = AUDIT_RESERVE.bounds.sized(
+        int(audit.reserve_bytes), int(audit.reserve_bytes) // _RESERVED_SHARES
+    )
     return AuditLog(
         settings.state / "control" / "audit.db",
         durability=audit.durability,
         checkpoint_every=audit.checkpoint_records,
         checkpoint_seconds=audit.checkpoint_seconds,
         signer=signing.want,
+        removals=signing.want_removal,
         held_by=held_by,
+        budget=Budget(standing, reserve=reserve),
+        reserve=reserve.whole,
         retention=Retention(
             days=audit.retention_days,
             size=None if audit.retention_bytes is None else int(audit.retention_bytes),

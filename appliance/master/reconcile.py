@@ -4,9 +4,11 @@ Whatever happened (ROSMaster died, control died, a call was cut in its middle) i
 
 - a ROSMaster that is new is told everything again, in the original order, while calls wait at the door;
 - a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it
-  carries the key of a known incarnation (it was granted, and control died before it was written down), and
-  unregistered otherwise, as when the policy has taken it and ROSMaster is not told yet;
-- after a rebuild, or when a relay is new, every subscriber gets each of its lists once.
+  carries the key of a known incarnation and the policy in force grants it (control died before it was written down),
+  and unregistered otherwise, as when the policy has taken it and ROSMaster is not told yet: that ROSMaster has it is
+  a claim, no right;
+- after a rebuild, or when a relay is new, every subscriber gets each of its lists once; when control is new, the values
+  of its parameters.
 """
 
 import asyncio
@@ -19,11 +21,13 @@ from appliance.master.call import Answer
 from appliance.master.client import CallFailedError
 from appliance.master.faces import Faces
 from appliance.master.graph import Graph
-from appliance.master.parameters import ParameterMirror, Tree, measure
+from appliance.master.parameter_updates import settled
+from appliance.master.parameters import ParameterMirror
 from appliance.master.recorder import Recorder
 from appliance.master.registration import NO_SERVICE, stand_in
 from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.rosmaster import RosMaster
+from appliance.ros.parameter_tree import Tree, standing_at
 
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1
@@ -32,7 +36,10 @@ Seen = set[tuple[Kind, str, str]]
 
 
 class Reconciler:
-    """Runs rounds when woken and every `interval` seconds. `ready` is set after the first whole round."""
+    """Runs rounds when woken and every `interval` seconds. `ready` is set after the first whole round.
+
+    `may_have(node, kind, resource)` says whether the policy in force grants it.
+    """
 
     def __init__(  # noqa: PLR0917 - the parts it compares
         self,
@@ -44,6 +51,7 @@ class Reconciler:
         recorder: Recorder,
         *,
         own_parameters: Callable[[], Tree],
+        may_have: Callable[[Incarnation, Kind, str], bool],
         interval: float = 30.0,
     ) -> None:
         self._rosmaster = rosmaster
@@ -53,6 +61,7 @@ class Reconciler:
         self._parameters = parameters
         self._recorder = recorder
         self._own_parameters = own_parameters
+        self._may_have = may_have
         self._interval = interval
         self._pid: int | None = None
         self._woken = asyncio.Event()
@@ -92,9 +101,19 @@ class Reconciler:
                 tree = (await self._rosmaster.call_now("getParam", _NAME, "/"))[2]
                 self._parameters.replace(cast(Tree, tree))
                 await self._compare()
+                self._tell_parameters()
             else:
                 await self._rebuild()
             self._pid = cast(int, pid)
+
+    def _tell_parameters(self) -> None:
+        """Control is new: what it had not told yet, or not even heard of as done, is told."""
+        for node, registration in self._registry.in_order():
+            if registration.kind is Kind.PARAMETER:
+                value, _ = standing_at(self._parameters.tree, registration.resource)
+                self._graph.tell_parameter(
+                    node, registration.resource, {} if value is None else settled(value)
+                )
 
     # --- a new ROSMaster ---
 
@@ -143,8 +162,7 @@ class Reconciler:
                         answer = await self._register(incarnation, one)
                         if one.kind is Kind.PARAMETER and answer[0] == 1:
                             # It heard of no change in the meantime, and ROSMaster tells each change once.
-                            value = answer[2]
-                            self._graph.tell_parameter(incarnation, one.resource, value, measure(value)[0])
+                            self._graph.tell_parameter(incarnation, one.resource, answer[2])
         except CallFailedError:
             self.wake()
             raise
@@ -201,7 +219,9 @@ class Reconciler:
             incarnation is not None
             and incarnation.life is Life.LIVE
             and kind is not Kind.SERVICE
+            and incarnation.name == name
             and (kind, resource) not in incarnation.shelf
+            and self._may_have(incarnation, kind, resource)
         ):
             types = dict(
                 cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", _NAME))[2])

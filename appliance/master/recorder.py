@@ -9,6 +9,7 @@ from appliance.audit.record import Record, RuleReference, Severity
 from appliance.master.call import Caller
 from appliance.metrics import Meter
 from appliance.policy.model import Decision, Rule
+from appliance.shares.pool import Standing
 
 # What a caller is told. Where the log is and what is wrong with it is for those who operate the appliance: it is in its
 # output, in `rosrv status`, and in the log itself when that can be written again.
@@ -19,7 +20,8 @@ class Recorder:
     """Records decisions and events under the running policy revision.
 
     `strict`: an answer waits until its record is on disk. `deny_when_failed`: while the log cannot be written,
-    every request is denied.
+    every request is denied. What is refused to a host that no rule names is marked (`detail.stranger`), and what a
+    host beyond its share of the log causes without a call is counted, not recorded each time.
     """
 
     def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
@@ -37,6 +39,18 @@ class Recorder:
             return NOT_RECORDED
         return None
 
+    def shut_out(self, host: str) -> str:
+        """Why this host is granted nothing while its disk is nearly full; empty when that is no reason."""
+        return self._log.budget.shut_out(host)
+
+    def owing(self, host: str) -> str:
+        """Why this host must wait before more is recorded of it; empty when it need not."""
+        return self._log.budget.owing(host)
+
+    def pause(self, host: str) -> float:
+        """For how many seconds this host's calls wait for that, then to be asked again; 0 when they need not."""
+        return self._log.budget.pause(host)
+
     async def durable(self) -> str | None:
         """Wait until everything recorded so far is on disk; why not, when it cannot be and must be."""
         failure = await self._log.wait_durable()
@@ -49,9 +63,14 @@ class Recorder:
         category: str,
         resource: str,
         decision: Decision,
+        *,
+        reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision; its id. `asked_of` is what a command is about: a parameter, a node."""
+        """Record a decision; its id. `asked_of` is what a command is about: a parameter, a node.
+
+        `reads`: the call changes nothing, so that its repetitions are counted when it is allowed.
+        """
         record_id = self._ids.next()
         word = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
         duration = time.monotonic_ns() - caller.arrived
@@ -59,6 +78,7 @@ class Recorder:
         detail: dict[str, Any] = {"call": method, **asked_of}
         if caller.target is not None:
             detail["node"] = caller.target.name
+        stranger = self._marked(caller.peer.text, word, detail)
         self._log.record(
             Record(
                 id=record_id,
@@ -75,6 +95,8 @@ class Recorder:
                 reason=decision.reason,
                 duration_us=duration // 1000,
                 detail=detail,
+                stranger=stranger,
+                folds=reads and word == "allow",
             )
         )
         return record_id
@@ -92,10 +114,16 @@ class Recorder:
         rule: Rule | None = None,
         decision: str | None = None,
         more: Mapping[str, Any] | None = None,
+        reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is no decision; its id. `more` is detail whose names others choose."""
+        """Record an event that is no decision; its id. `more` is detail whose names others choose.
+
+        `reads`: it changed nothing, so that its repetitions are counted.
+        """
         record_id = self._ids.next()
+        detail = {**(more or {}), **detail}
+        stranger = self._marked(host, decision, detail)
         self._log.record(
             Record(
                 id=record_id,
@@ -110,10 +138,21 @@ class Recorder:
                 rule=rule_reference(rule),
                 revision=self.revision,
                 reason=reason,
-                detail={**(more or {}), **detail},
+                detail=detail,
+                stranger=stranger,
+                folds=reads or (decision is None and host is not None and bool(self.owing(host))),
             )
         )
         return record_id
+
+    def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
+        """Whether this is about a stranger whom something is refused; the detail says so then."""
+        stranger = (
+            host is not None and decision == "deny" and self._log.budget.standing(host) is Standing.STRANGER
+        )
+        if stranger:
+            detail["stranger"] = True
+        return stranger
 
 
 def rule_reference(rule: Rule | None) -> RuleReference | None:

@@ -4,11 +4,12 @@ A registration outlasts control before its node is told of it (the store writes 
 twice, and ROSMaster, which knows the rest, can die in the same moment as control.
 """
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import AsyncIterator, Iterable
 from typing import TYPE_CHECKING, cast
 
 from appliance.master.arguments import ApiUri
-from appliance.master.call import Answer, Caller
+from appliance.master.call import Answer, Call, Caller
 from appliance.master.registry import Incarnation, Kind, Life, Registration
 from appliance.ros.uris import service_uri
 
@@ -19,39 +20,39 @@ if TYPE_CHECKING:
 async def register_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
     topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await incarnation_of(master, caller, api)
-    inner = master.faces.inner_uri(incarnation)
-    answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
-    if answer[0] == 1:
-        master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
-        hidden = master.mediation.hides_publishers(topic)
-        answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
-    return answer
+    async with registering(master, caller, api) as incarnation:
+        inner = master.faces.inner_uri(incarnation)
+        answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
+        if answer[0] == 1:
+            master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
+            hidden = master.mediation.hides_publishers(topic)
+            answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
+        return answer
 
 
 async def register_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
     topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await incarnation_of(master, caller, api)
-    inner = master.faces.inner_uri(incarnation)
-    answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
-    if answer[0] == 1:
-        master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
-        answer[2] = list(master.graph.list_for(incarnation, topic))
-    return answer
+    async with registering(master, caller, api) as incarnation:
+        inner = master.faces.inner_uri(incarnation)
+        answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
+        if answer[0] == 1:
+            master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
+            answer[2] = list(master.graph.list_for(incarnation, topic))
+        return answer
 
 
 async def register_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`registerService(caller_id, service, service_api, caller_api)`."""
     service, service_api, api = str(arguments[0]), cast(ApiUri, arguments[1]), cast(ApiUri, arguments[2])
-    incarnation = await incarnation_of(master, caller, api)
-    inner = master.faces.inner_uri(incarnation)
-    answer = await master.rosmaster.call(
-        "registerService", caller.caller_id, service, stand_in(incarnation), inner
-    )
-    if answer[0] == 1:
-        master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
-    return answer
+    async with registering(master, caller, api) as incarnation:
+        inner = master.faces.inner_uri(incarnation)
+        answer = await master.rosmaster.call(
+            "registerService", caller.caller_id, service, stand_in(incarnation), inner
+        )
+        if answer[0] == 1:
+            master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
+        return answer
 
 
 async def unregister_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
@@ -67,12 +68,17 @@ async def unregister_subscriber(master: "Master", caller: Caller, arguments: tup
 async def unregister_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
     """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
     service, service_api = str(arguments[0]), cast(ApiUri, arguments[1])
+    port = service_api.uri.port
     provider = next(
         (
             one
             for one in master.registry.registered(Kind.SERVICE, service)
             if one.name == caller.caller_id
-            and one.registrations[Kind.SERVICE, service].detail == str(service_api.uri.port)
+            # By its own port, or as `rosnode cleanup` does, by the one that lookupService told.
+            and (
+                one.registrations[Kind.SERVICE, service].detail == str(port)
+                or master.relay.port(one, Kind.SERVICE, service) == port
+            )
         ),
         None,
     )
@@ -84,34 +90,27 @@ async def unregister_service(master: "Master", caller: Caller, arguments: tuple[
     return answer
 
 
-def given_up(master: "Master", caller: Caller, method: str, arguments: tuple[object, ...]) -> None:
+def given_up(master: "Master", caller: Caller, call: Call, arguments: tuple[object, ...]) -> None:
     """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
-    match method:
-        case "unregisterPublisher":
-            kind, (resource, api) = Kind.PUBLICATION, arguments
-        case "unregisterSubscriber":
-            kind, (resource, api) = Kind.SUBSCRIPTION, arguments
-        case "unsubscribeParam":
-            kind, (api, resource) = Kind.PARAMETER, arguments
-        case "unregisterService":
-            kind, (resource, api) = Kind.SERVICE, arguments
-        case _:
-            return
-    asked = cast(ApiUri, api)
+    kind = call.gives_up
+    if kind is None or call.resource is None:
+        return
+    resource = str(arguments[call.resource])
+    asked = next(one for one in arguments if isinstance(one, ApiUri))
     for one in master.registry.all():
-        shelved = one.shelf.get((kind, str(resource)))
+        shelved = one.shelf.get((kind, resource))
         if shelved is None or (one.name, one.host) != (caller.caller_id, caller.peer.host):
             continue
         by_port = kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
         if by_port or one.api_text == asked.text:
-            master.registry.unshelve(one, kind, str(resource))
+            master.registry.unshelve(one, kind, resource)
 
 
 async def _unregister(
     master: "Master", caller: Caller, method: str, kind: Kind, arguments: tuple[object, ...]
 ) -> Answer:
     resource, api = str(arguments[0]), cast(ApiUri, arguments[1])
-    incarnation = master.faces.known(caller, api)
+    incarnation = master.faces.known(caller, api) or _told_as(master, caller, api)
     inner = master.faces.inner_uri(incarnation) if incarnation is not None else master.faces.nobody()
     answer = await master.rosmaster.call(method, caller.caller_id, resource, inner)
     _speak_as_asked(answer, inner, api)
@@ -120,12 +119,30 @@ async def _unregister(
     return answer
 
 
-async def incarnation_of(master: "Master", caller: Caller, api: ApiUri) -> Incarnation:
-    """The incarnation that registers; a new one takes the room of one of its host's that is gone."""
+def _told_as(master: "Master", caller: Caller, api: ApiUri) -> Incarnation | None:
+    """The node that the caller speaks for by the URI that lookupNode told, as `rosnode cleanup` does on its host."""
+    holder = master.registry.holder(caller.caller_id)
+    meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
+    return holder if meant else None
+
+
+@contextlib.asynccontextmanager
+async def registering(master: "Master", caller: Caller, api: ApiUri) -> AsyncIterator[Incarnation]:
+    """The incarnation that registers, which makes room for nobody meanwhile.
+
+    A new one takes the room of one of its host's that has nothing or is gone.
+    """
     spare = master.gate.to_make_room(caller, api)
     if spare is not None:
         master.graph.forgotten(spare)
-    return await master.faces.incarnation_for(caller, api)
+    incarnation = await master.faces.incarnation_for(caller, api)
+    while master.registry.by_key(incarnation.key) is not incarnation:  # it made room before this went on
+        incarnation = await master.faces.incarnation_for(caller, api)
+    incarnation.calls += 1
+    try:
+        yield incarnation
+    finally:
+        incarnation.calls -= 1
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:

@@ -16,11 +16,13 @@ Invariants:
 
 import enum
 import secrets
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from appliance.channel import own_node
 from appliance.policy.model import Address
 from appliance.ros.uris import NodeUri, node_uri
 
@@ -80,6 +82,12 @@ class Incarnation:
     shelf: dict[tuple[Kind, str], Registration] = field(default_factory=dict)  # what the policy took back
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
     more_relay_ports: tuple[int, ...] = ()
+    calls: int = 0  # registering calls of it that are under way
+
+    @property
+    def spare(self) -> bool:
+        """Whether it has nothing, was taken nothing from, and asks for nothing now."""
+        return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
     @property
     def of_monitors(self) -> bool:
@@ -103,12 +111,17 @@ class Incarnation:
 
     @property
     def call_uri(self) -> NodeUri:
-        """Where the appliance calls the node: at its peer address, whatever host it claimed."""
-        return NodeUri("http", str(self.host), self.api.port, self.api.path)
+        """Where the appliance calls the node: at its peer address, whatever host it claimed; our own at `own_node`."""
+        host = own_node.ADDRESS if self.own and not self.of_monitors else str(self.host)
+        return NodeUri("http", host, self.api.port, self.api.path)
 
     def outer_uri(self, told: str) -> str:
         """The URI other nodes know this one by, as seen by somebody who reaches the appliance at `told`."""
         return node_uri(told, self.outer_port)
+
+    def uri_for(self, told: str, *, hidden: bool) -> str:
+        """The outer URI when `hidden`, else the real one; the appliance's own nodes have no other for anybody."""
+        return self.outer_uri(told) if hidden or self.own else self.real_uri
 
     def resources(self, kind: Kind) -> list[str]:
         """What it registered of that kind, in order."""
@@ -146,6 +159,7 @@ class Registry:
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
+        self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
         self._nodes_of: Counter[Address] = Counter()
         self._registrations_of: Counter[Address] = Counter()
         self._order = 0
@@ -183,14 +197,37 @@ class Registry:
         """Live incarnations that registered this resource, in the order of registration."""
         return self._topics.get((kind, resource), {}).values()
 
+    def subscribed_below(self, key: str) -> list[str]:
+        """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
+        keys, above = self._subscribed_keys, key.rstrip("/")
+        # Those that begin with `above/` stand together, before `above0`: '0' follows '/'.
+        return [
+            one for one in keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")] if one != "/"
+        ]
+
     def nodes_of(self, host: Address) -> int:
         """How many incarnations of a host are known (for the limit per host)."""
         return self._nodes_of[host]
 
     def spare_of(self, host: Address) -> Incarnation | None:
-        """The incarnation of a host that was lost or replaced first: who is dropped when there is no room."""
-        spare = [one for one in self._by_key.values() if one.host == host and one.life is not Life.LIVE]
-        return min(spare, key=lambda one: one.changed, default=None)
+        """The incarnation of a host that makes room first: one that has nothing, else the one that was lost first."""
+        mine = [one for one in self._by_key.values() if one.host == host]
+        idle = next((one for one in mine if one.spare), None)
+        gone = (one for one in mine if one.life is not Life.LIVE)
+        return idle or min(gone, key=lambda one: one.changed, default=None)
+
+    def spare(self, host: Address) -> Incarnation | None:
+        """The incarnation that makes room for one of this host: of it, or of another host one that has nothing."""
+        return self.spare_of(host) or next((one for one in self._by_key.values() if one.spare), None)
+
+    @property
+    def registrations(self) -> int:
+        """How many registrations all hosts have."""
+        return self._registrations_of.total()
+
+    def registrations_by_host(self) -> Iterable[tuple[Address, int]]:
+        """How many registrations each host has."""
+        return self._registrations_of.items()
 
     def registrations_of(self, host: Address) -> int:
         """How many registrations a host has (for the limit per host)."""
@@ -204,10 +241,11 @@ class Registry:
     def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
         """The URIs of a topic's publishers or subscribers as `reader` is told them.
 
-        Its own entry is its own real URI, as it gave it; the others' are their outer ones when `hidden`.
+        Its own entry is its own real URI, as it gave it; the others' are as `Incarnation.uri_for` has them. The
+        appliance's own nodes reach others through the appliance only.
         """
         return tuple(
-            one.api_text if one is reader else one.outer_uri(reader.told) if hidden else one.real_uri
+            one.api_text if one is reader else one.uri_for(reader.told, hidden=hidden or reader.own)
             for one in self.registered(kind, topic)
         )
 
@@ -322,7 +360,10 @@ class Registry:
         self._journal.incarnation_saved(incarnation)
 
     def _index(self, incarnation: Incarnation, registration: Registration) -> None:
-        self._topics.setdefault((registration.kind, registration.resource), {})[incarnation.key] = incarnation
+        holders = self._topics.setdefault((registration.kind, registration.resource), {})
+        if not holders and registration.kind is Kind.PARAMETER:
+            insort(self._subscribed_keys, registration.resource)
+        holders[incarnation.key] = incarnation
 
     def _unindex(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         holders = self._topics.get((kind, resource))
@@ -330,6 +371,8 @@ class Registry:
             holders.pop(incarnation.key, None)
             if not holders:
                 del self._topics[kind, resource]
+                if kind is Kind.PARAMETER:
+                    del self._subscribed_keys[bisect_left(self._subscribed_keys, resource)]
 
 
 def new_key() -> str:

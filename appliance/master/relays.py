@@ -7,6 +7,7 @@ stated afresh between `StateBegan` and `StateEnded`; what is not said again is g
 """
 
 import asyncio
+import ipaddress
 from collections.abc import Callable, Iterable
 
 from appliance.channel import messages
@@ -19,12 +20,15 @@ from appliance.master.places import Places
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Incarnation, Kind, Registry
 from appliance.master.relay_post import RelayPost
+from appliance.policy import Policy
+from appliance.policy.limits import Part, Rate
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Value
+from appliance.shares.pool import Bounds
+from appliance.shares.table import GRANTS
 from appliance.store.state import PermissionRow, StateStore
 
 RELAY_NAME = "/rosrv"
-_GRANTS_PER_HOST = 20_000
 _CLEARED_AT_ONCE = 1000
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
@@ -42,23 +46,28 @@ class RelayControl:
         recorder: Recorder,
         *,
         allocation: Allocation,
+        policy: Callable[[], Policy],
         broken: Callable[[Incarnation], None],
+        grants: Bounds = GRANTS.bounds,
     ) -> None:
         self._registry = registry
+        self._grants = grants
         self._places = places
         self._store = store
         self._delivery = delivery
         self._broken = broken
         self._allocation = allocation
+        self._policy = policy
         self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
         self._permissions: dict[str, set[PermissionRow]] = {}
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
+        self._granted = 0
         self._asking: set[asyncio.Task[None]] = set()
         self.statement: Callable[[int], messages.Message | None] = lambda relay: None  # noqa: ARG005 - set when wired
         self.heard: Callable[[messages.Message, int], None] = lambda message, relay: None  # noqa: ARG005 - the same
         self.lost: Callable[[int], None] = lambda relay: None  # noqa: ARG005 - the same
         self.own_header: messages.OwnHeaderStated | None = None  # of what control publishes itself
-        self.carried = Carried(recorder, self._known_name, allocation.relays)
+        self.carried = Carried(recorder, self._known_name, allocation.relays, is_own=self._is_own)
 
     @property
     def presence(self) -> str:
@@ -91,8 +100,12 @@ class RelayControl:
     def load(self) -> None:
         """Read the kept grants."""
         for row in self._store.permissions():
+            if not row.caller_id:  # of an earlier version, for every name of the host: it looks up again
+                self._store.remove_permission(row)
+                continue
             self._permissions.setdefault(row.key, set()).add(row)
             self._of_host.setdefault(row.host, {})[row] = None
+            self._granted += 1
 
     def attach(self, index: int, channel: Channel) -> None:
         """A relay is there: serve its link and state everything that it is to carry."""
@@ -162,16 +175,16 @@ class RelayControl:
                 (listening.fileno(),),
             )
         if kind is Kind.PUBLICATION:
-            post.send(messages.PublicationPlaced(incarnation.key, resource, detail))
+            post.send(self._publication(self._policy(), incarnation, resource, detail))
         else:
             post.send(messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail)))
 
     def _state(self, row: PermissionRow) -> None:
         post = self._post(row.kind, row.resource)
         if row.kind == TOPIC:
-            post.send(messages.GrantInstalled(row.key, row.resource, row.host, row.caller_id))
+            post.send(_grant(self._policy(), row))
         else:
-            post.send(messages.ClientGranted(row.key, row.resource, row.host))
+            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id))
 
     def placed(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
         """The incarnation registered a publication or a service."""
@@ -228,6 +241,33 @@ class RelayControl:
             self._drop(row)
         self.carried.forgotten(incarnation.key)
 
+    def policy_changed(self, before: Policy, now: Policy) -> None:
+        """Another policy is in force: the relays are told of limits that are others now."""
+        if not before.limits_anything and not now.limits_anything:
+            return
+        for incarnation in self._registry.live():
+            for registration in incarnation.registrations.values():
+                if registration.kind is not Kind.PUBLICATION:
+                    continue
+                topic, detail = registration.resource, registration.detail
+                was, is_now = (self._publication(one, incarnation, topic, detail) for one in (before, now))
+                if was != is_now:
+                    self._post(TOPIC, topic).send(is_now)
+            for row in self._permissions.get(incarnation.key, ()):
+                if row.kind == TOPIC and _grant(before, row) != _grant(now, row):
+                    self._state(row)
+
+    def _publication(
+        self, policy: Policy, incarnation: Incarnation, topic: str, detail: str
+    ) -> messages.PublicationPlaced:
+        return messages.PublicationPlaced(
+            incarnation.key,
+            topic,
+            detail,
+            _flow(policy.limit(Part.PUBLISHER, topic, incarnation.host)),
+            _flow(policy.limit(Part.TOPIC, topic)),
+        )
+
     def unconnected(self) -> list[PermissionRow]:
         """Grants for topics of live publishers whose subscriber is not connected."""
         there = {
@@ -252,28 +292,35 @@ class RelayControl:
         """This subscriber may have this topic of that publisher."""
         self._grant(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
-    def grant_service(self, provider: Incarnation, service: str, host: Address) -> None:
-        """This host may call this service of that provider."""
-        self._grant(PermissionRow(provider.key, SERVICE, service, str(host), ""))
+    def grant_service(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
+        """This client may call this service of that provider. Nobody calls without a name."""
+        if caller_id:
+            self._grant(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
 
     def _grant(self, row: PermissionRow) -> None:
         rows = self._permissions.setdefault(row.key, set())
+        mine = self._of_host.setdefault(row.host, {})
+        mine[row] = mine.pop(row, None)  # it is the newest, whenever it was granted first
         if row not in rows:
             rows.add(row)
             self._store.save_permission(row)
-            mine = self._of_host.setdefault(row.host, {})
-            mine[row] = None
-            if len(mine) > _GRANTS_PER_HOST:
-                self._clear_unused(row)
+            self._granted += 1
+            if len(mine) > self._grants.host:
+                self._clear_unused(row.host, row)
+            elif self._granted > self._grants.whole:
+                self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
         self._state(row)
 
-    def _clear_unused(self, newest: PermissionRow) -> None:
-        """A host that asks for topics under ever new names loses its oldest grants that nobody is connected by."""
-        used = {(one.key, one.kind, one.resource, one.host) for one in self.carried.connections.values()}
+    def _clear_unused(self, host: str, newest: PermissionRow) -> None:
+        """A host that has too many grants loses its oldest ones that nobody is connected by."""
+        used = {
+            (one.key, one.kind, one.resource, one.host, one.caller_id)
+            for one in self.carried.connections.values()
+        }
         unused = [
             row
-            for row in self._of_host[newest.host]
-            if row != newest and (row.key, row.kind, row.resource, row.host) not in used
+            for row in self._of_host[host]
+            if row != newest and (row.key, row.kind, row.resource, row.host, row.caller_id) not in used
         ]
         for row in unused[:_CLEARED_AT_ONCE]:
             self.revoke(row)
@@ -281,7 +328,9 @@ class RelayControl:
     def _drop(self, row: PermissionRow) -> None:
         self._store.remove_permission(row)
         mine = self._of_host.get(row.host, {})
-        mine.pop(row, None)
+        if row in mine:
+            del mine[row]
+            self._granted -= 1
         if not mine:
             self._of_host.pop(row.host, None)
 
@@ -313,9 +362,12 @@ class RelayControl:
                 if incarnation is not None:
                     self.carried.upstream_lost(message, str(incarnation.host))
                     self._broken(incarnation)
+            case messages.LatchRefused() | messages.MessagesLimited():
+                self._held_back(message)
             case messages.TrafficReported():
                 self.carried.reported(message.rows, message.over)
                 self.carried.unrecorded(message.unrecorded)
+                self.carried.memory[post.index] = message.memory
             case messages.ConnectionOpened():
                 self.carried.opened(post.index, message)
             case messages.ConnectionClosed():
@@ -326,6 +378,16 @@ class RelayControl:
                 self.carried.publication_refused(message)
             case _:
                 self.heard(message, post.index)
+
+    def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
+        """Messages were not kept or not passed on."""
+        if isinstance(message, messages.MessagesLimited):
+            for row in message.rows:
+                self.carried.limited(row, self._policy().limit_rule(row.topic) if row.topic else None)
+        else:
+            incarnation = self._registry.by_key(message.key)
+            if incarnation is not None:
+                self.carried.latch_refused(message, str(incarnation.host))
 
     async def _find_upstream(self, post: RelayPost, key: str, topic: str) -> None:
         incarnation = self._registry.by_key(key)
@@ -347,6 +409,25 @@ class RelayControl:
         incarnation = self._registry.by_key(key)
         return incarnation.name if incarnation is not None else None
 
+    def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
+        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
+        holder = self._registry.holder(caller_id)
+        return (
+            holder is not None
+            and holder.own
+            and host in (str(holder.host), holder.told)
+            and (Kind.SUBSCRIPTION, topic) in holder.registrations
+        )
+
+
+def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
+    limit = policy.limit(Part.SUBSCRIBER, row.resource, ipaddress.ip_address(row.host))
+    return messages.GrantInstalled(row.key, row.resource, row.host, row.caller_id, _flow(limit))
+
+
+def _flow(rate: Rate) -> messages.FlowLimit:
+    return messages.FlowLimit(rate.messages, rate.bytes)
+
 
 def _withdraw(post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str) -> None:
     if kind is Kind.PUBLICATION:
@@ -359,7 +440,7 @@ def _revoke(post: RelayPost, row: PermissionRow) -> None:
     if row.kind == TOPIC:
         post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
     else:
-        post.send(messages.ClientRevoked(row.key, row.resource, row.host))
+        post.send(messages.ClientRevoked(row.key, row.resource, row.host, row.caller_id))
 
 
 def tcpros_port(answer: Value) -> int:

@@ -6,7 +6,8 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
    nodes. Those that wait for charon or the signer (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
-4. A change is made only in the name of a token that can be used now and whose role may (`rest_rights.py`).
+4. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
+   with its proof (`rest_proof.py`). What is not is refused and recorded, by control itself.
 """
 
 import asyncio
@@ -19,33 +20,28 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
+    ChallengeWanted,
     HostAdd,
     HostEnrol,
-    HostPorts,
     HostRenew,
     HostRenewed,
     HostRenewItself,
-    HostsReload,
     HostToken,
-    MonitorChange,
-    PolicyConfirm,
-    PolicyLoad,
-    PolicyReload,
-    PolicyRollback,
+    RestChange,
+    verb_of,
 )
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.master.administration import Administration
 from appliance.master.recorder import Recorder
-from appliance.master.rest_rights import obstacle
+from appliance.master.rest_proof import Askers, UnprovenError
 from appliance.master.tokens import Tokens
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
-_CHANGES = (
-    PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange | HostAdd | HostToken | HostEnrol
-    | HostRenew | HostRenewItself | HostRenewed | HostPorts | HostsReload
-)  # fmt: skip
+_DENIED = (401, 403, 421, 429)
+_ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
+_CHANGES = RestChange | HostEnrol | HostRenewItself | HostRenewed
 _SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself
 _MOST_SLOW = 16
 
@@ -53,9 +49,13 @@ _MOST_SLOW = 16
 class RestLink:
     """Serves whichever api is there."""
 
-    def __init__(self, administration: Administration, tokens: Tokens, recorder: Recorder) -> None:
+    def __init__(
+        self, administration: Administration, tokens: Tokens, recorder: Recorder, *, require_proof: bool
+    ) -> None:
+        """`require_proof`: a change is made for a signed request only, not for a bare token."""
         self._administration = administration
         self._tokens = tokens
+        self._askers = Askers(tokens, require_proof=require_proof)
         self._recorder = recorder
         self._channel: Channel | None = None
         self._waiting: deque[messages.RequestMade] = deque()
@@ -130,17 +130,34 @@ class RestLink:
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
         if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
             return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
-        wrong = obstacle(made.request, made.who, self._tokens.usable())
-        if wrong is not None:
-            return AdminAnswer(False, error=wrong, trouble="forbidden")
         try:
-            return await self._administration.carry_out(made.request, who=made.who)
+            who = await self._askers.asker(made)
+            if isinstance(made.request, ChallengeWanted):
+                return AdminAnswer(True, self._askers.challenge())
+            return await self._administration.carry_out(made.request, who=who)
+        except UnprovenError as error:
+            self._refused(made, error)
+            return AdminAnswer(False, error=str(error), trouble="forbidden")
         except Exception as error:  # noqa: BLE001  a defect of one request is that request's failure
             _log.exception("a request of the api failed", request=type(made.request).__name__)
             return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
 
+    def _refused(self, made: messages.RequestMade, error: UnprovenError) -> None:
+        asked = made.asked
+        self._recorder.happened(
+            "order refused",
+            str(error)[:_TEXT],
+            severity=error.severity,
+            decision="deny",
+            host=asked.host[:_TEXT] if asked is not None else None,
+            category="rest",
+            resource=asked.target.partition("?")[0][:_TEXT] if asked is not None else "",
+            who=error.who or None,
+            verb=verb_of(made.request),
+        )
+
     def _record(self, call: messages.RestCalled) -> None:
-        denied = call.status in (401, 403, 421, 429)
+        denied = call.status in _DENIED or (call.method in _ORDERS and call.status >= 400 and not call.dry)
         self._recorder.happened(
             "rest call",
             call.reason[:_TEXT],
@@ -151,6 +168,7 @@ class RestLink:
             resource=call.path[:_TEXT],
             who=call.who or None,
             method=call.method[:_TEXT],
+            more={"dry_run": True} if call.dry else None,
             status=call.status,
             took_us=call.duration_us,
             count=call.count,

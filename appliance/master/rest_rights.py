@@ -1,36 +1,33 @@
-"""What the api may ask in whose name: held against the tokens that control itself keeps.
-
-The api has recognised the token already. It is asked again here by name and role, because the api is the process that
-browsers talk to: one that has fallen to a stranger can say any name, but no change is made in a name that no token
-has, or for a role that no token has.
-"""
-
-from collections.abc import Iterable
+"""The role that each request over REST needs. What changes something is `admin.RestChange`."""
 
 from appliance.channel import admin
-from appliance.channel.messages import TokenKept
 
-_RANKS = {"viewer": 1, "operator": 2, "admin": 3}
+RANKS = {"viewer": 1, "operator": 2, "admin": 3}
 _ADMINS = (
-    admin.PolicyLoad, admin.MonitorLoad, admin.MonitorRemove, admin.HostAdd, admin.HostToken, admin.HostRenew,
-    admin.HostRevoke, admin.TokenList, admin.TokenRevoke,
+    admin.PolicyLoad, admin.MonitorLoad, admin.MonitorReplace, admin.MonitorRemove, admin.HostAdd, admin.HostToken,
+    admin.HostRenew, admin.HostRevoke, admin.TokenList, admin.TokenRevoke,
 )  # fmt: skip
 _OPERATORS = (
     admin.PolicyReload, admin.PolicyRollback, admin.PolicyConfirm, admin.MonitorReload, admin.MonitorSwitch,
     admin.MonitorResume, admin.HostKit, admin.HostPorts, admin.HostsReload,
 )  # fmt: skip
+_VIEWERS = (
+    admin.StatusWanted, admin.PolicyWanted, admin.PolicyRevisions, admin.RegistrationsWanted, admin.GraphWanted,
+    admin.MonitorsWanted, admin.HostList, admin.HostEndpoint, admin.ChallengeWanted,
+)  # fmt: skip
+# What the api counts by itself; what a host asks with its one-time token or its key; what is public.
+_NOBODYS = (
+    admin.MetricsWanted, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed, admin.RevocationsWanted,
+    admin.AuthorityWanted,
+)  # fmt: skip
 
 
-def obstacle(request: admin.RestRequest, who: str, tokens: Iterable[TokenKept]) -> str | None:
-    """Why this is not done in the name of `who`; None when a token that can be used may ask it.
-
-    Looking, and what a host asks for itself with its one-time token or its key, need no token here.
-    """
-    role = (
-        "admin" if isinstance(request, _ADMINS) else "operator" if isinstance(request, _OPERATORS) else None
-    )
-    if role is None:
+def role_for(request: admin.RestRequest) -> str | None:
+    """The least role of a token that may ask this; None where no token is needed."""
+    if isinstance(request, admin.MonitorReload) and request.prune:
+        return "admin"  # removes what an admin loaded
+    if isinstance(request, _NOBODYS):
         return None
-    if any(one.name == who and _RANKS[one.role] >= _RANKS[role] for one in tokens):
-        return None
-    return f"no token {who[:80]!r} that can be used is {'an' if role[0] in 'ao' else 'a'} {role}'s"
+    if isinstance(request, _VIEWERS):
+        return "viewer"
+    return "operator" if isinstance(request, _OPERATORS) else "admin"

@@ -13,20 +13,17 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.master.allocation import TOPIC
+from appliance.master.calls import MASTER_CALLS
 from appliance.master.client import CallFailedError
 from appliance.master.core import Master
-from appliance.master.parameters import holds_others, standing_at
+from appliance.master.own_node import OWN, ROSOUT
 from appliance.master.registration import withdraw
 from appliance.master.registry import Incarnation, Kind, Life, Registration
-from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.model import Address, Decision
 from appliance.store.state import PermissionRow
 
 _log = structlog.get_logger()
-_CATEGORIES = {
-    Kind.PUBLICATION: Category.PUBLISH,
-    Kind.SUBSCRIPTION: Category.SUBSCRIBE,
-    Kind.SERVICE: Category.OFFER,
-}
+_GAVE = {call.registers: call.name for call in MASTER_CALLS.values() if call.registers is not None}
 
 
 class Revocation:
@@ -58,7 +55,7 @@ class Revocation:
             [
                 row
                 for row in self._master.relay.permissions()
-                if row.host == str(host) and row.caller_id in {caller_id, ""}
+                if (row.host, row.caller_id) == (str(host), caller_id)
             ],
         )
 
@@ -67,7 +64,7 @@ class Revocation:
     ) -> int:
         count = 0
         for incarnation, registration in registrations:
-            decision = self._decide(incarnation, registration)
+            decision = self._decide(incarnation, registration.kind, registration.resource)
             if not decision.allowed:
                 self._take_back(incarnation, registration, decision)
                 count += 1
@@ -120,7 +117,9 @@ class Revocation:
 
     def _give_back(self, incarnation: Incarnation) -> None:
         """The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn."""
-        allowed = [one for one in incarnation.shelf.values() if self._decide(incarnation, one).allowed]
+        allowed = [
+            one for one in incarnation.shelf.values() if self.may_have(incarnation, one.kind, one.resource)
+        ]
         back = [
             one
             for one in sorted(allowed, key=lambda one: one.order)
@@ -129,32 +128,25 @@ class Revocation:
         if back:
             self._in_background(self._told(self._put_back(incarnation, back), incarnation))
 
-    def _decide(self, incarnation: Incarnation, registration: Registration) -> Decision:
+    def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
+        """Whether the policy in force grants a node what it has, had, or seems to have."""
+        return self._decide(incarnation, kind, resource).allowed
+
+    def _decide(self, incarnation: Incarnation, kind: Kind, resource: str) -> Decision:
         if incarnation.own:
-            return Decision(True, None, "the appliance's own node")
-        gate, policy = self._master.gate, self._master.policy()
-        name, host = incarnation.name, incarnation.host
-        if registration.kind is Kind.PARAMETER:
-            decision = gate.may_be_node(Request(host, name, Category.COMMAND, "subscribeParam"))
-            if decision.allowed and policy.has_section(Category.READ):
-                there, _ = standing_at(self._master.parameters.tree, registration.resource)
-                decision = policy.decide_parameter(
-                    Request(host, name, Category.READ, registration.resource), namespace=holds_others(there)
-                )
-            return decision
-        return gate.may_be_node(Request(host, name, _CATEGORIES[registration.kind], registration.resource))
+            known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
+            return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
+        return self._may_have(_GAVE[kind], incarnation.host, incarnation.name, resource)
 
     def _decide_permission(self, row: PermissionRow) -> Decision:
-        gate, host = self._master.gate, ipaddress.ip_address(row.host)
-        if row.kind == TOPIC:
-            holder = self._master.registry.holder(row.caller_id)
-            if holder is not None and holder.own:
-                return Decision(True, None, "the appliance's own node")
-            return gate.may_be_node(Request(host, row.caller_id, Category.SUBSCRIBE, row.resource))
-        decision = gate.may(Request(host, row.caller_id, Category.CALL, row.resource))
-        if decision.allowed:
-            decision = gate.may(Request(host, row.caller_id, Category.COMMAND, "lookupService"))
-        return decision
+        holder = self._master.registry.holder(row.caller_id)
+        if row.kind == TOPIC and holder is not None and holder.own:
+            return Decision(True, None, OWN)
+        call = "requestTopic" if row.kind == TOPIC else "lookupService"
+        return self._may_have(call, ipaddress.ip_address(row.host), row.caller_id, row.resource)
+
+    def _may_have(self, call: str, host: Address, caller_id: str, resource: str) -> Decision:
+        return self._master.gate.may_have(call, host, caller_id, resource, self._master.parameters.tree)
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
         self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import structlog
 
-from appliance.master.parameters import Tree
+from appliance.ros.parameter_tree import Tree
 
 _PACKAGE = Path("/usr/share/rosmaster/package.xml")
 

@@ -1,4 +1,4 @@
-"""Control's link to the signer: checkpoints of the audit log are signed there, and certificates made.
+"""Control's link to the signer: checkpoints of the audit log and removals from it are signed there, certificates made.
 
 Unsigned checkpoints are asked for again whenever a signer appears.
 """
@@ -13,7 +13,7 @@ from appliance.master.authority import Authority
 
 
 class Signing:
-    """The link to the signer; `want` may be called on any thread."""
+    """The link to the signer; `want` and `want_removal` may be called on any thread."""
 
     def __init__(self, authority: Authority) -> None:
         self._authority = authority
@@ -22,10 +22,16 @@ class Signing:
 
     def want(self, number: int, text: bytes) -> None:
         """Have a checkpoint signed. Called on the log's thread."""
+        self._ask(messages.SignatureWanted(number, text))
 
+    def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
+        """Have the removal of the records up to a checkpoint signed. Called on the log's thread."""
+        self._ask(messages.RemovalWanted(number, checkpoint, newest))
+
+    def _ask(self, message: messages.Message) -> None:
         def ask() -> None:
             if self._channel is not None:
-                self._channel.send(messages.SignatureWanted(number, text))
+                self._channel.send(message)
 
         self._loop.call_soon_threadsafe(ask)
 
@@ -42,6 +48,10 @@ class Signing:
                 audit.signed(message.number, message.signature, message.public_key)
             elif isinstance(message, messages.SignatureRefused):
                 audit.refused(message.number, message.reason)
+            elif isinstance(message, messages.RemovalApproved):
+                audit.removal_approved(message.number, message.text, message.signature, message.public_key)
+            elif isinstance(message, messages.RemovalRefused):
+                audit.removal_refused(message.number, message.reason)
 
         def closed() -> None:
             if self._channel is channel:

@@ -6,6 +6,7 @@ recorded.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from appliance.audit.record import Severity
 from appliance.channel.messages import TokenKept
@@ -42,10 +43,23 @@ class Tokens:
         """What the api recognises tokens by; it looks at `expires` itself."""
         now = time.time()
         return [
-            TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+            TokenKept(
+                row.id,
+                row.name,
+                row.role,
+                row.salt,
+                row.hash,
+                row.expires,
+                row.keys.reading if row.keys is not None else b"",
+            )
             for row in self._rows.values()
             if row.usable(now)
         ]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """The token with this id, if it can be used now."""
+        row = self._rows.get(token_id)
+        return row if row is not None and row.usable(time.time()) else None
 
     async def first(self) -> str | None:
         """The text of the first token, if there never was one; of another, if nobody was told that one (`told`)."""
@@ -101,9 +115,7 @@ class Tokens:
         if row is None:
             known = ", ".join(sorted(one.name for one in self._rows.values() if one.usable(now))) or "none"
             raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
-        revoked = TokenRow(
-            row.id, row.name, row.role, row.salt, row.hash, row.created, row.expires, revoked=now
-        )
+        revoked = replace(row, revoked=now)
         self._keep(revoked)
         self._recorder.happened(
             "token revoked",

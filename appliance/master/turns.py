@@ -1,70 +1,112 @@
 """Whose request is served next: hosts take turns, so that one host's flood costs the others little.
 
-One host has at most its share of the slots; when all are busy, the next goes to the host that waited longest since
-its last turn, however many requests another has waiting and however long each of them takes.
+Slots are a pool of `appliance/shares`; when none is left for a host, it waits, and the next goes to the host that
+waited longest since its last turn, however many requests another has waiting and however long each of them takes.
+Hosts that are alike (that the policy names as one network) take their turns as one and have half of the slots together:
+nobody comes first more often by having many addresses.
 """
 
 import asyncio
 from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Hashable
 
 from appliance.policy.model import Address
+from appliance.shares.pool import Bounds, Pool, Standing
+
+Queue = deque[asyncio.Future[None]]
+
+
+def itself(host: Address) -> Hashable:
+    """Of hosts that are like no other."""
+    return host
 
 
 class Turns:
-    """Slots for requests being served, at most `per_host` of them for one host; who gets none waits in turn.
+    """Slots for requests being served, within the shares of `bounds`; who gets none waits in turn.
 
-    Whenever a slot is free, everybody who waits does so because of his own host's share.
+    Whenever a slot is free, everybody who waits does so because of his host's share, or that of hosts like it.
+    `alike(host)` is the same for hosts that take their turns as one.
     """
 
-    def __init__(self, slots: int, per_host: int) -> None:
-        self._free = slots
-        self._per_host = per_host
-        self._taken: Counter[Address] = Counter()
-        self._waiting: OrderedDict[Address, deque[asyncio.Future[None]]] = OrderedDict()
+    def __init__(
+        self,
+        bounds: Bounds,
+        standing: Callable[[Address], Standing],
+        alike: Callable[[Address], Hashable] = itself,
+    ) -> None:
+        self._slots: Pool[Address] = Pool("requests being served", bounds, standing)
+        self._alike = alike
+        self._together = max(bounds.host, bounds.whole // 2)
+        self._taken: Counter[Hashable] = Counter()  # by hosts that are alike
+        self._taken_as: dict[Address, Hashable] = {}
+        self._waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
         """Take a slot, waiting for this host's turn when there is none."""
-        if self._free and self._taken[host] < self._per_host:
-            self._take(host)
+        kind = self._alike(host)
+        if self._take(host, kind):
             return
         turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(host, deque()).append(turn)
+        self._waiting.setdefault(kind, OrderedDict()).setdefault(host, deque()).append(turn)
         try:
             await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled():
                 self.leave(host)
             else:
-                self._give_up(host, turn)
+                self._give_up(kind, host, turn)
             raise
 
     def leave(self, host: Address) -> None:
-        """Give the slot back: the host that waited longest and is within its share gets it."""
-        self._free += 1
-        self._taken[host] -= 1
-        if not self._taken[host]:
-            del self._taken[host]
+        """Give the slot back: of the hosts that may have one, that which waited longest gets it."""
+        self._give_back(host)
         while (following := self._next()) is not None:
-            queue = self._waiting.pop(following)
+            kind, host = following
+            hosts = self._waiting.pop(kind)
+            queue = hosts.pop(host)
             turn = queue.popleft()
             if queue:
-                self._waiting[following] = queue  # to the end of the line: its next request waits a round
-            if not turn.done():  # else its task was cancelled, and has not run since to give up its place
-                self._take(following)
+                hosts[host] = queue  # to the end of the line: its next request waits a round
+            if hosts:
+                self._waiting[kind] = hosts
+            if turn.done():  # its task was cancelled, and has not run since to give up its place
+                self._give_back(host)
+            else:
                 turn.set_result(None)
-                return
 
-    def _next(self) -> Address | None:
-        return next((one for one in self._waiting if self._taken[one] < self._per_host), None)
+    def _next(self) -> tuple[Hashable, Address] | None:
+        """The host whose turn it is, and its kind; its slot is taken."""
+        for kind, hosts in self._waiting.items():
+            if self._taken[kind] < self._together:
+                for host in hosts:
+                    if self._take(host, kind):
+                        return kind, host
+        return None
 
-    def _take(self, host: Address) -> None:
-        self._free -= 1
-        self._taken[host] += 1
+    def _take(self, host: Address, kind: Hashable) -> bool:
+        kind = self._taken_as.get(host, kind)  # as whose its other slots count
+        if self._taken[kind] >= self._together or self._slots.take(host):
+            return False
+        self._taken[kind] += 1
+        self._taken_as[host] = kind
+        return True
 
-    def _give_up(self, host: Address, turn: asyncio.Future[None]) -> None:
-        queue = self._waiting.get(host)
+    def _give_back(self, host: Address) -> None:
+        self._slots.give_back(host)
+        kind = self._taken_as[host]
+        self._taken[kind] -= 1
+        if not self._taken[kind]:
+            del self._taken[kind]
+        if not self._slots.held(host):
+            del self._taken_as[host]
+
+    def _give_up(self, kind: Hashable, host: Address, turn: asyncio.Future[None]) -> None:
+        hosts = self._waiting.get(kind, OrderedDict())
+        queue = hosts.get(host)
         if queue is None or turn not in queue:
             return
         queue.remove(turn)
         if not queue:
-            del self._waiting[host]
+            del hosts[host]
+        if not hosts:
+            self._waiting.pop(kind, None)

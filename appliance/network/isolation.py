@@ -13,12 +13,18 @@ Invariants:
 1. What arrives on an address of the host for a forwarded port goes to the namespace with its source address
    kept; the host's own processes reach it by any address of the host and by 127.0.0.1 (::1 stays refused, for
    it cannot leave a host). What the appliance opens bears the host's address on the network.
-2. Nothing else of the namespace can be reached through the host, and a host that was no router does not
+2. A connection reaches the appliance under the address of the machine that made it. Rules of others that translate
+   addresses (of containers, virtual machines, clients of a hotspot) do not apply to the appliance's link: a
+   connection takes the first translation that it is given, and ROSRV-KEEP stands before all others and gives it its own
+   source. Should a forwarded packet bear an address of this machine all the same, ROSRV-POST drops it. While the
+   rules are not there (somebody flushed them) the appliance itself knows such a packet by its TTL: the host's own
+   have 255 on that link, and no router can pass a packet on with that.
+3. Nothing else of the namespace can be reached through the host, and a host that was no router does not
    become one: forwarding is on, but the chain ROSRV-FWD lets only the appliance's packets pass.
-3. Whatever is changed is recorded first, so that `down`, or `up` after a crash, puts it back. Nothing
+4. Whatever is changed is recorded first, so that `down`, or `up` after a crash, puts it back. Nothing
    without a record is taken for ours: a namespace or interface of the same name is an error, not a
    leftover.
-4. One appliance on a host: a lock that the kernel releases with the process says whether a record is a
+5. One appliance on a host: a lock that the kernel releases with the process says whether a record is a
    leftover.
 """
 
@@ -36,9 +42,19 @@ from typing import Literal
 from appliance.network import links
 from appliance.network.endings import end_processes
 from appliance.network.endpoint import Endpoint, outward_address
+from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import RuleStatus, statuses
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.firewall.rules import Chain, Family, Interface, PortRange, Rule, Verdict, family_of
+from appliance.network.firewall.rules import (
+    LOOPBACK,
+    Chain,
+    Family,
+    Interface,
+    PortRange,
+    Rule,
+    Verdict,
+    family_of,
+)
 from appliance.network.forwarding import Forwarding
 from appliance.network.listeners import listening_ports, udp_ports_in_use
 from appliance.network.namespaces import Namespace, NetworkError, require_privileges
@@ -153,8 +169,18 @@ class Isolation:
         link = self.settings.link
         return tuple(
             f"{chain} drops what is forwarded by default: let interface {link} pass in it, both ways"
-            for chain in self._backend.foreign_forward_drops()
+            for chain in (
+                *self._backend.foreign_forward_drops(),
+                *iptables.foreign_forward_drops(self._host),
+            )
         )
+
+    def translations(self) -> tuple[str, ...]:
+        """Name chains of others on the host that translate the addresses of other machines or containers.
+
+        They do not apply to connections to the appliance, which sees those hosts as they are.
+        """
+        return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
         """Forward IKE and ESP (UDP 500 and 4500) too from now on. Raises: NetworkError if the host uses them itself."""
@@ -187,6 +213,7 @@ class Isolation:
         for family, ends in self.ends.items():
             links.add_address(self._host, settings.link, f"{ends.host}/{ends.length}")
             links.add_address(inside, INSIDE, f"{ends.appliance}/{ends.length}")
+            links.add_near_route(self._host, settings.link, ends.appliance, source=ends.host, hop_limit=255)
             links.add_route(inside, "default", ends.host)
             if family == 4:  # so that packets the host sends from 127.0.0.1 may leave on this link
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
@@ -318,7 +345,29 @@ def isolation_rules(
             purpose="no other way to the appliance",
             verdict=Verdict.DROP,
             leaves_on=inward,
-            new_connection=True,
+            unknown=True,
+        ),
+        Rule(
+            chain=Chain.ARRIVING,
+            purpose="the host's own loopback",
+            verdict=Verdict.RETURN,
+            arrives_on=LOOPBACK,
+        ),
+        Rule(
+            chain=Chain.LEAVING,
+            purpose="no packet of others under an address of the host",
+            verdict=Verdict.DROP,
+            arrives_on=outward,  # neighbour discovery is made here, and is said to arrive where it leaves
+            leaves_on=inward,
+            local_source=True,
+            forwarded=True,
+        ),
+        Rule(
+            chain=Chain.LEAVING,
+            purpose="the host's own packets: full TTL",
+            verdict=Verdict.FULL_HOPS,
+            leaves_on=inward,
+            forwarded=False,
         ),
     ]
     for family, end in ends.items():
@@ -333,7 +382,7 @@ def isolation_rules(
                     leaves_on=outward,
                 )
             )
-        rules.append(_loopback(family, inward))
+        rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
         rules += [_forward("UDP", ports, end, outward) for ports in udp]
         rules.append(
@@ -348,11 +397,31 @@ def isolation_rules(
     return tuple(rules)
 
 
+def _true_sources(family: Family, end: Ends, inward: Interface) -> tuple[Rule, ...]:
+    """Nobody has an address of the link but its two ends, and what enters it has the source it came with."""
+    return (
+        Rule(
+            chain=Chain.ARRIVING,
+            purpose=f"IPv{family} addresses of the appliance's link, from elsewhere",
+            verdict=Verdict.DROP,
+            arrives_on=Interface(inward.name, other=True),
+            source=end.network,
+        ),
+        Rule(
+            chain=Chain.KEPT_SOURCE,
+            purpose=f"to the appliance: nobody else translates IPv{family} sources",
+            verdict=Verdict.KEEP_SOURCE,
+            family=family,
+            leaves_on=inward,
+        ),
+    )
+
+
 def _loopback(family: Family, inward: Interface) -> Rule:
     """127.0.0.1 is forwarded under the veth's address; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
         return Rule(
-            chain=Chain.SOURCE_NAT,
+            chain=Chain.KEPT_SOURCE,
             purpose="from the host's own loopback",
             verdict=Verdict.MASQUERADE,
             source="127.0.0.0/8",

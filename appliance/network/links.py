@@ -20,6 +20,7 @@ from appliance.network.namespaces import Namespace, NetworkError
 IFNAMSIZ = 15  # characters
 _IFA_F_NODAD = 0x02
 _MAIN_TABLE, _UNICAST = 254, 1  # RT_TABLE_MAIN, RTN_UNICAST
+_LINK_SCOPE = 253  # RT_SCOPE_LINK
 
 T = TypeVar("T")
 
@@ -126,6 +127,24 @@ def add_route(namespace: Namespace, destination: str, via: str) -> None:
         namespace,
         f"routing {destination} via {via}",
         lambda route: route.route("add", family=family, dst=where, gateway=via),
+    )
+
+
+def add_near_route(namespace: Namespace, name: str, destination: str, *, source: str, hop_limit: int) -> None:
+    """Route the address `destination` out of the interface `name`; packets leave with `source` and this TTL."""
+    length = 128 if _family(destination) == socket.AF_INET6 else 32
+    _netlink(
+        namespace,
+        f"routing {destination} to {name}",
+        lambda route: route.route(
+            "add",
+            family=_family(destination),
+            dst=f"{destination}/{length}",
+            oif=_index(route, name),
+            prefsrc=source,
+            scope=_LINK_SCOPE if length == 32 else 0,
+            metrics={"hoplimit": hop_limit},
+        ),
     )
 
 

@@ -182,6 +182,13 @@ class Namespace:
         except OSError as error:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
+    def lacks_syn_cookies(self) -> bool:
+        """Tell whether half-open connections can use up a listener's places here: forged first packets keep all out."""
+        try:
+            return self.sysctl("net.ipv4.tcp_syncookies") == "0"
+        except NetworkError:  # a kernel that was built without them
+            return True
+
     def processes(self) -> list[int]:
         """Return the ids of the processes that live in the namespace, this one never among them."""
         if not self.exists():

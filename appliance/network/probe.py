@@ -15,10 +15,10 @@ from enum import StrEnum
 
 from appliance.network.listeners import listening_addresses
 from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.progress import communicate
 
 PROBE_UID = 61099  # nobody's: neither root nor one of the appliance's users
 _CONNECT_SECONDS = 1.0
-_CHILD_SECONDS = 20.0
 
 _CHILD = """
 import errno, json, socket, sys
@@ -113,7 +113,7 @@ def _run_child(namespace: Namespace, port: int, uid: int) -> str:
             extra_groups=[],
             cwd="/",
             env={},
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -125,12 +125,9 @@ def _run_child(namespace: Namespace, port: int, uid: int) -> str:
         ) from error
     with process:
         try:
-            output, errors = process.communicate(timeout=_CHILD_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise NetworkError(
-                f"the probe of port {port} did not end within {_CHILD_SECONDS:.0f} s"
-            ) from None
+            output, errors = communicate(process, "", f"the probe of port {port}")
+        except TimeoutError as error:
+            raise NetworkError(str(error)) from None
     if process.returncode != 0:
         raise NetworkError(f"the probe of port {port} as uid {uid} failed: {errors.strip()[-300:]}")
     return str(output)

@@ -2,14 +2,16 @@
 
 A ROS node listens, for its API and for TCPROS and UDPROS, on ports that the kernel picks from the local
 port range. The appliance hides where they are, but a port scanner finds them. The file closes that range
-to all but loopback and the
-appliance:
+to all but loopback and the appliance:
 
 1. A TCP connection is refused at its SYN, without the connection tracker: connections that are older than
    the file, and all that the machine itself opens, go on.
 2. A UDP packet is dropped if the connection tracker sees a new conversation in it: answers to what this
    machine asked (DNS, NTP, DHCP) pass.
-3. All of it is in one table, `inet rosrv_protect`, replaced in one transaction; rules of others are not
+3. A connection to the appliance that this machine only forwards (for a container, a virtual machine, a client of its
+   hotspot) is dropped if it bears an address of this machine after all translation: the policy would take
+   it for the machine. Where a packet came in is known there from Linux 5.7 on; before, the rule never matches.
+4. All of it is in one table, `inet rosrv_protect`, replaced in one transaction; rules of others are not
    touched, and nothing that they refuse is opened.
 """
 
@@ -19,16 +21,17 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from appliance.network.firewall.rules import PortRange
 from appliance.network.namespaces import NetworkError
+from appliance.network.progress import communicate
 
 TABLE = "rosrv_protect"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
-_NFT_SECONDS = 20.0
 # ESP in the kernel; ESP in user space, where strongSwan's TUN device has this name. join.sh looks for both.
 _THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
+_SYN = "tcp flags & (syn | ack) == syn"
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 
@@ -92,32 +95,41 @@ def protection(
     """
     if not appliances:
         raise ValueError("the address of at least one appliance is needed")
-    rules = ['iifname "lo" accept']
+    rules, leaving = ['iifname "lo" accept'], []
     for keyword, version in (("ip", 4), ("ip6", 6)):
         found = [text for text in appliances if ipaddress.ip_address(text).version == version]
         if found:
-            source = f"{keyword} saddr {{ {', '.join(sorted(set(found)))} }} accept"
+            addresses = f"{{ {', '.join(sorted(set(found)))} }}"
+            source = f"{keyword} saddr {addresses} accept"
             rules += [f"{through}{source}" for through in (_THROUGH_IPSEC if tunnelled else ("",))]
+            leaving.append(f"{keyword} daddr {addresses} {_SYN} iif != 0 fib saddr type local counter drop")
     rules += [f"{one.protocol} dport {one.ports} accept" for one in dict.fromkeys(services)]
     rules += [
-        f"tcp dport {ports} tcp flags & (syn | ack) == syn counter reject with tcp reset",
+        f"tcp dport {ports} {_SYN} counter reject with tcp reset",
         f"udp dport {ports} ct state {{ new, invalid }} counter drop",
     ]
-    body = "\n".join(f"        {rule}" for rule in rules)
     return (
         "#!/usr/sbin/nft -f\n"
         f"# Closes the ROS ports of this machine ({ports}) to all but loopback and the appliance\n"
-        f"# ({', '.join(appliances)}).\n"
+        f"# ({', '.join(appliances)}), which nobody behind this machine reaches under its address.\n"
         "# Made by `rosrv protect`; `rosrv protect --remove` takes it away.\n"
         f"table inet {TABLE}\n"
         f"delete table inet {TABLE}\n"
         f"table inet {TABLE} {{\n"
         "    chain input {\n"
         "        type filter hook input priority filter; policy accept;\n"
-        f"{body}\n"
+        f"{_indented(rules)}"
+        "    }\n"
+        "    chain leaving {\n"
+        "        type filter hook postrouting priority 300; policy accept;\n"
+        f"{_indented(leaving)}"
         "    }\n"
         "}\n"
     )
+
+
+def _indented(rules: Sequence[str]) -> str:
+    return "".join(f"        {rule}\n" for rule in rules)
 
 
 def apply(text: str) -> None:
@@ -147,16 +159,16 @@ def _service(text: str) -> Service:
 
 
 def _nft(arguments: list[str], text: str) -> str:
+    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     try:
-        done = subprocess.run(
-            ["nft", *arguments], input=text, capture_output=True, text=True, timeout=_NFT_SECONDS, check=False
-        )
+        with subprocess.Popen(["nft", *arguments], text=True, **pipes) as process:
+            said, complaint = communicate(process, text, "nft")
     except FileNotFoundError:
         raise NetworkError("the program `nft` is not here: sudo apt install nftables") from None
-    except subprocess.TimeoutExpired:
-        raise NetworkError(f"nft did not answer within {_NFT_SECONDS:.0f} seconds") from None
-    if done.returncode != 0:
-        reason = " ".join(done.stderr.split())[:400]
+    except TimeoutError as error:
+        raise NetworkError(str(error)) from None
+    if process.returncode != 0:
+        reason = " ".join(complaint.split())[:400]
         hint = " (run it as root: sudo rosrv protect …)" if "not permitted" in reason else ""
         raise NetworkError(f"nft: {reason}{hint}")
-    return done.stdout
+    return said

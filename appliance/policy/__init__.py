@@ -5,11 +5,11 @@ No I/O and no clock: that is what makes a decision testable, explainable and pro
 
 from appliance.policy.cases import CaseResult, run_cases
 from appliance.policy.compiler import compile_policy
-from appliance.policy.diff import Difference, diff
+from appliance.policy.diff import Difference, Ending, diff, endings
 from appliance.policy.explain import Explanation, explain
 from appliance.policy.findings import Finding, PolicyError, Severity
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.policy import Policy, needs_node_rule
+from appliance.policy.policy import Policy
 
 __all__ = [
     "Address",
@@ -17,6 +17,7 @@ __all__ = [
     "Category",
     "Decision",
     "Difference",
+    "Ending",
     "Explanation",
     "Finding",
     "Policy",
@@ -26,7 +27,7 @@ __all__ = [
     "Severity",
     "compile_policy",
     "diff",
+    "endings",
     "explain",
-    "needs_node_rule",
     "run_cases",
 ]

@@ -23,7 +23,8 @@ from appliance.policy.compiler import compile_policy
 from appliance.policy.findings import Findings, meant, quoted
 from appliance.policy.hosts import canonical_address
 from appliance.policy.model import Address, Decision, Request
-from appliance.policy.policy import Policy, needs_node_rule
+from appliance.policy.policy import Policy
+from appliance.policy.rights import decide, needs_node, rights_of
 from appliance.ros.names import is_global_name
 
 MAXIMUM_CHARACTERS = 1024 * 1024
@@ -165,10 +166,10 @@ class _CaseReader:
                 self._error(node, f"more than {MAXIMUM_CHECKS} checks in one file")
                 return
             request = Request(host, caller_id, category, resource)
-            if needs_node_rule(request) and not caller_id:
+            if needs_node(request) and not caller_id:
                 self._error(node, f"{quoted(text)} makes a node part of the graph: the case needs node:")
                 return
-            decision = self._policy.decide_with_node(request)
+            decision = decide(self._policy, rights_of(request))
             line, column = node.start_mark.line + 1, node.start_mark.column + 1
             yield CaseResult(self._findings.file, line, column, request, expected, decision)
 

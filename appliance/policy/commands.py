@@ -45,9 +45,6 @@ COMMANDS = frozenset(
 NAMED_ONLY = frozenset({"getRVState", "shutdownMaster"})
 """Granted by their own key only, never by `default`: they end the appliance or tell what it hides."""
 
-NODE_RULE_COMMANDS = frozenset({"subscribeParam", "unsubscribeParam"})
-"""Commands that make a node part of the graph: they need the `[Nodes]` right as well."""
-
 STARTING_COMMANDS = {
     "getParam": "rospy and roscpp read /use_sim_time with it when they start",
     "hasParam": "roscpp looks for /use_sim_time with it when it starts",

@@ -10,6 +10,7 @@ from appliance.policy import sections
 from appliance.policy.findings import Findings, meant, nearest, quoted
 from appliance.policy.groups import Groups
 from appliance.policy.hosts import HostTable, Network
+from appliance.policy.limits import read_limits
 from appliance.policy.lint import lint
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy, PolicyParts
@@ -39,6 +40,7 @@ def compile_policy(
     options = read_options(written.get(sections.OPTIONS), findings)
     ports = read_ports(written.get(sections.PORTS), findings)
     monitor = read_monitor(written.get(sections.MONITOR), findings)
+    limits = read_limits(written.get(sections.LIMITS), file, groups, findings)
     compiler = RuleCompiler(file, groups, findings)
     present: set[Category] = set()
     for decider in sections.DECIDERS:
@@ -63,7 +65,9 @@ def compile_policy(
             ports=ports,
             monitored_topics=monitor.topics,
             monitored_services=monitor.services,
+            limits=limits,
             takeover=options.takeover,
+            tell=options.tell,
             enrolled=dict(hosts or {}),
             robot=groups.robot,
         )

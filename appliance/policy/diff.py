@@ -1,10 +1,11 @@
-"""What would be decided differently by another policy: the question before every reload."""
+"""What would be decided or limited differently by another policy: the question before every reload."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from appliance.policy.model import Decision, Request
+from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
+from appliance.policy.rights import decide, rights_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,11 +16,52 @@ class Difference:
     old: Decision
     new: Decision
     count: int
+    limited: int = 0
+    """Below 0 if the answer is the same and the new policy lets less of it pass, above if it lets more."""
 
     @property
     def granted(self) -> bool:
-        """Whether the new policy gives what the old one denied."""
-        return _answer(self.new) > _answer(self.old)
+        """Whether the new policy gives what the old one denied, or more of it."""
+        return _answer(self.new) > _answer(self.old) or self.limited > 0
+
+    @property
+    def word(self) -> str:
+        """What the new policy does: granted, denied, limited, or limited less."""
+        if self.limited:
+            return "limited" if self.limited < 0 else "limited less"
+        return "granted" if self.granted else "denied"
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """Something live that a policy would end: `what` of the caller, about `resource` (empty: all of that kind)."""
+
+    host: str
+    caller_id: str
+    what: str
+    resource: str
+    reason: str
+
+
+_LIVE = {
+    Category.PUBLISH: "publication", Category.SUBSCRIBE: "subscription", Category.OFFER: "service",
+    Category.CALL: "call", Category.READ: "parameter",
+}  # fmt: skip
+_LIVE_BY_COMMAND = {"subscribeParam": "parameter"}
+
+
+def endings(differences: Iterable["Difference"]) -> list[Ending]:
+    """What ends, where the requests that the differences are of stand for what is live."""
+    return [
+        Ending(
+            str(request.host), request.caller_id, what, "" if command else request.resource, one.new.reason
+        )
+        for one in differences
+        if one.old.allowed and not one.new.allowed
+        for request, command in [(one.request, one.request.category is Category.COMMAND)]
+        for what in [_LIVE_BY_COMMAND.get(request.resource) if command else _LIVE.get(request.category)]
+        if what is not None
+    ]
 
 
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
@@ -30,11 +72,22 @@ def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Differen
     counts: dict[Request, int] = {}
     for request in requests:
         counts[request] = counts.get(request, 0) + 1
-    differences = (
-        Difference(request, old.decide_with_node(request), new.decide_with_node(request), count)
-        for request, count in counts.items()
+    differences = (_difference(old, new, request, count) for request, count in counts.items())
+    return [one for one in differences if _answer(one.old) != _answer(one.new) or one.limited]
+
+
+def _difference(old: Policy, new: Policy, request: Request, count: int) -> Difference:
+    before, after = decide(old, rights_of(request)), decide(new, rights_of(request))
+    was, now = old.limit_on(request), new.limit_on(request)
+    if was == now or not (before.allowed and after.allowed):
+        return Difference(request, before, after, count)
+    return Difference(
+        request,
+        replace(before, reason=f"{before.reason}; {was} in [Limits]"),
+        replace(after, reason=f"{after.reason}; {now} in [Limits]"),
+        count,
+        1 if was == was.strictest(now) else -1,
     )
-    return [difference for difference in differences if _answer(difference.old) != _answer(difference.new)]
 
 
 def _answer(decision: Decision) -> int:

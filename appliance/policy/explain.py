@@ -1,11 +1,13 @@
 """Why a request is decided as it is: the rule that decides, how it means the host, the rules that lost."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.policy import commands
-from appliance.policy.model import Category, Decision, Request, Rule
-from appliance.policy.policy import CompiledRule, Policy, needs_node_rule, node_request
+from appliance.policy.limits import NO_LIMIT, Part
+from appliance.policy.model import Category, Decision, Request, Rule, told_of
+from appliance.policy.policy import CompiledRule, Policy
+from appliance.policy.rights import Right, decide_right, rights_of
 from appliance.policy.sections import PARAMETERS
 
 
@@ -22,29 +24,51 @@ class LostRule:
 class Explanation:
     """The decision on one category of a request.
 
-    `through` are the words of the deciding rule's value that mean the host (empty for a denial). `node`
-    explains the `[Nodes]` right where the call needs that too; `allowed` is the answer to the whole call.
+    `through` are the words of the deciding rule's value that mean the host (empty for a denial). `also` explains what
+    else the request needs (`policy/rights`); `allowed` is the answer to the whole call.
     `namespace` is the denial of a parameter that is allowed, should it hold other parameters: that is known when
-    the call comes.
+    the call comes. `told` is what the host is told of a denial, by `[Options] tell`.
     """
 
     request: Request
     decision: Decision
     through: tuple[str, ...]
     lost: tuple[LostRule, ...]
-    node: "Explanation | None" = None
+    also: "tuple[Explanation, ...]" = ()
     namespace: Decision | None = None
+    told: str | None = None
+    limit: str = ""
+    """How much of what is allowed may pass, and by which line of `[Limits]`."""
 
     @property
     def allowed(self) -> bool:
         """Whether the whole call passes."""
-        return self.decision.allowed and (self.node is None or self.node.allowed)
+        return self.decision.allowed and all(one.allowed for one in self.also)
+
+    @property
+    def node(self) -> "Explanation | None":
+        """The `[Nodes]` right, where the request needs that too."""
+        return self._also(Category.NODE)
+
+    @property
+    def command(self) -> "Explanation | None":
+        """The `[Commands]` right, where the request needs that too."""
+        return self._also(Category.COMMAND)
+
+    def _also(self, category: Category) -> "Explanation | None":
+        return next((one for one in self.also if one.request.category is category), None)
 
 
 def explain(policy: Policy, request: Request) -> Explanation:
-    """Explain `policy.decide_with_node(request)`; the name must be resolved, as for `decide`."""
+    """Explain each right that the request needs; the name must be resolved, as for `decide`."""
+    first, *others = (_explain(policy, right) for right in rights_of(request))
+    return replace(first, also=tuple(others))
+
+
+def _explain(policy: Policy, right: Right) -> Explanation:
+    request = right.request
     parameter = request.category in PARAMETERS
-    decision = policy.decide_parameter(request) if parameter else policy.decide(request)
+    decision = decide_right(policy, right)
     atoms = policy.atoms_of(request.host)
     matching = _matching(policy, request)
     winner = next((rule for rule in matching if rule.rule == decision.rule), None)
@@ -54,20 +78,24 @@ def explain(policy: Policy, request: Request) -> Explanation:
         for rule in matching
         if rule is not winner
     )
-    node = explain(policy, node_request(request)) if needs_node_rule(request) else None
     namespace = policy.decide_parameter(request, namespace=True) if parameter and decision.allowed else None
     if namespace is not None and namespace.allowed:
         namespace = None
-    return Explanation(request, decision, through, lost, node, namespace)
+    told = None if decision.allowed else told_of(decision, policy.tell)
+    limit = _limit(policy, request) if decision.allowed else ""
+    return Explanation(request, decision, through, lost, (), namespace, told, limit)
 
 
 def render(explanation: Explanation) -> Iterator[str]:
     """The explanation as lines of text for a person."""
     yield from _render_one(explanation)
-    node = explanation.node
-    if node is not None:
-        yield "and the node rule, because this call makes a node part of the graph:"
-        yield from ("  " + line for line in _render_one(node))
+    for one in explanation.also:
+        if one.request.category is Category.NODE:
+            yield "and the node rule, because this call makes a node part of the graph:"
+        else:
+            yield f"and the rule for {one.request.resource}, with which a client learns where the service is:"
+        yield from ("  " + line for line in _render_one(one))
+    if explanation.also:
         yield f"together: {'allowed' if explanation.allowed else 'denied'}"
 
 
@@ -76,12 +104,27 @@ def _render_one(explanation: Explanation) -> Iterator[str]:
     verdict = "allowed" if decision.allowed else "denied"
     yield f"{'would be denied (audit-only: passes)' if decision.would_deny else verdict}: {decision.reason}"
     yield f"  rule: {decision.rule or 'no rule'}"
+    if explanation.told is not None:
+        yield f"  the host is told: {explanation.told}"
     if explanation.through:
         yield f"  the host is in: {', '.join(explanation.through)}"
+    if explanation.limit:
+        yield f"  limit: {explanation.limit}"
     if explanation.namespace is not None:
         yield f"  but denied while it is a namespace: {explanation.namespace.reason}"
     for lost in explanation.lost:
         yield f"  lost: {lost.rule}, which would {'allow' if lost.grants else 'deny'}: {lost.why}"
+
+
+def _limit(policy: Policy, request: Request) -> str:
+    rule, rate = policy.limit_rule(request.resource), policy.limit_on(request)
+    together = (
+        policy.limit(Part.TOPIC, request.resource) if request.category is Category.PUBLISH else NO_LIMIT
+    )
+    parts = [str(rate)] if rate else []
+    if together:
+        parts.append(f"{together} for all publishers together")
+    return f"{'; '.join(parts)}, by {rule.rule}" if rule is not None and parts else ""
 
 
 def _matching(policy: Policy, request: Request) -> list[CompiledRule]:

@@ -117,12 +117,19 @@ class Groups:
         if network is None or "%" in text:
             self._findings.error(word.line, word.column, _address_fault(text))
             return None
-        if network.is_loopback and self.robot and not self._warned_loopback and not self._robot_is_loopback():
+        if network.is_loopback and not self._warned_loopback and not self._robot_is_loopback():
             self._warned_loopback = True
-            robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
-            fault = f"{text} is the appliance itself here; the robot is {robot}: write robot if you mean it"
-            self._findings.warn(word.line, word.column, fault)
+            self._findings.warn(
+                word.line, word.column, f"{text} is the appliance itself {self._robot_instead()}"
+            )
         return network
+
+    def _robot_instead(self) -> str:
+        """Where loopback is the appliance, and what to write for the robot's own nodes."""
+        if not self.robot:
+            return "(unless isolation is none): write robot if you mean the nodes of its machine"
+        robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
+        return f"here; the robot is {robot}: write robot if you mean it"
 
     def _robot_is_loopback(self) -> bool:
         return any(member.is_loopback for member in self.robot)

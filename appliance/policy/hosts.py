@@ -103,6 +103,15 @@ class HostTable:
                 waiting.append(atom)
         return self.above(waiting)
 
+    def narrowest(self, address: Address) -> Network:
+        """The smallest network of the policy that holds the address; the address alone where none does."""
+        plain = canonical_address(address)
+        bits, number = _BITS[plain.version], int(plain)
+        shift = min(
+            (shift for shift, table in self._lengths[plain.version] if number >> shift in table), default=0
+        )
+        return ipaddress.ip_network((number >> shift << shift if shift else number, bits - shift))
+
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
         """The atoms and every group that contains one of them, at any depth."""
         waiting = list(atoms)

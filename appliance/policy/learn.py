@@ -19,12 +19,10 @@ from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
 from appliance.policy.hosts import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
-from appliance.policy.policy import needs_node_rule, node_request
+from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS
 from appliance.ros.names import is_global_name
 
-_READING = frozenset({"getParam", "hasParam", "subscribeParam", "unsubscribeParam"})
-_WRITING = frozenset({"setParam", "deleteParam"})
 # What rospy appends (process id and milliseconds) and what roscpp appends (nanoseconds).
 _ANONYMOUS = re.compile(r"_[0-9]+_[0-9]{10,}$|_[0-9]{15,}$")
 _SHOWN_NODES = 3
@@ -60,7 +58,7 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
     requests = left_out = 0
     for observation in observations:
         try:
-            needed = list(rights_of(observation))
+            needed = list(_needed(observation))
         except BadWordError:
             left_out += 1
             continue
@@ -74,27 +72,11 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
     return Learned("".join(_text(rights, robot)), requests, left_out)
 
 
-def rights_of(observation: Observation) -> Iterator[Request]:
+def _needed(observation: Observation) -> Iterator[Request]:
     """Everything that must be granted for this request to pass. Raises `BadWordError` where no rule can."""
-    request = observation.request
-    check_resource(request.category, request.resource)
-    yield request
-    if needs_node_rule(request):
-        yield _checked(node_request(request))
-    if observation.call == "lookupService":
-        yield _of(request, Category.COMMAND, observation.call)
-    if observation.call in _READING | _WRITING and observation.key:
-        category = Category.READ if observation.call in _READING else Category.WRITE
-        yield _checked(_of(request, category, observation.key))
-
-
-def _of(request: Request, category: Category, resource: str) -> Request:
-    return Request(request.host, request.caller_id, category, resource)
-
-
-def _checked(request: Request) -> Request:
-    check_resource(request.category, request.resource)
-    return request
+    for right in rights_of_call(observation.request, observation.call, observation.key or None):
+        check_resource(right.request.category, right.request.resource)
+        yield right.request
 
 
 def _key(request: Request) -> str:

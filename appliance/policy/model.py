@@ -57,12 +57,24 @@ class Decision:
     """The answer to a `Request`.
 
     `rule` is the rule that decided, or None when no rule speaks of the request. `reason` is a sentence for a
-    person; the same text is in the answer to the node, the audit record, `rosrv policy explain` and the
-    console. `would_deny` is set when the section is in audit-only mode: `allowed` is then True although the
-    rules say no.
+    person, which is in the audit record, `rosrv policy explain` and the console. `told` is the same without other
+    hosts' names and addresses, for the answer to the caller; None where the reason has none (`told_of`).
+    `would_deny` is set when the section is in audit-only mode: `allowed` is then True although the rules say no.
     """
 
     allowed: bool
     rule: Rule | None
     reason: str
     would_deny: bool = False
+    told: str | None = None
+
+
+TELLS = ("rule", "full", "id")
+"""What a denied caller may be told, by `[Options] tell`: the first is the default."""
+
+
+def told_of(decision: Decision, tell: str) -> str:
+    """What a caller is told of a denial: all (`full`), without who else may (`rule`), or only that (`id`)."""
+    if tell == "full":
+        return decision.reason
+    return "refused" if tell == "id" else decision.told or decision.reason

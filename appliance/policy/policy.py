@@ -16,6 +16,7 @@ from appliance.policy import commands
 from appliance.policy.findings import Finding, quoted
 from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
 from appliance.policy.keys import Key, is_parameter_key
+from appliance.policy.limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS, PHRASES
 from appliance.policy.tree import KeyTree
@@ -23,6 +24,7 @@ from appliance.ros.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 21001)
 
+_LIMITED = {Category.PUBLISH: Part.PUBLISHER, Category.SUBSCRIBE: Part.SUBSCRIBER}
 _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
 _LONGEST_REASON = 299
@@ -77,7 +79,9 @@ class PolicyParts:
     ports: range
     monitored_topics: frozenset[str]
     monitored_services: frozenset[str]
+    limits: LimitTable
     takeover: str
+    tell: str
     enrolled: Mapping[str, Address]
     robot: tuple[Network, ...]
 
@@ -98,9 +102,11 @@ class Policy:
         self.monitored_topics = parts.monitored_topics
         self.monitored_services = parts.monitored_services
         self.takeover = parts.takeover
+        self.tell = parts.tell
         self.enrolled = parts.enrolled
         self.robot = parts.robot
         self._hosts = parts.hosts
+        self._limits = parts.limits
         self._named = parts.named
         self._tables = parts.tables
         self._present = parts.present
@@ -111,8 +117,7 @@ class Policy:
     def decide(self, request: Request) -> Decision:
         """Whether the rules of the request's own category let its host touch its resource.
 
-        For calls that make a node part of the graph the `[Nodes]` right is a second question:
-        `decide_with_node` asks both.
+        What else a call needs, and the decision on all of it, is `policy/rights`.
         """
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
@@ -124,19 +129,6 @@ class Policy:
                     self._kept.clear()
                 self._kept[key] = decision
         return decision
-
-    def decide_with_node(self, request: Request) -> Decision:
-        """The decision on the whole call: its category, then `[Nodes]` where `needs_node_rule` says so.
-
-        For parameters, also what is below the key (`decide_parameter`).
-        """
-        if request.category in PARAMETERS:
-            return self.decide_parameter(request)
-        decision = self.decide(request)
-        if not decision.allowed or not needs_node_rule(request):
-            return decision
-        node = self.decide(node_request(request))
-        return node if not node.allowed or (node.would_deny and not decision.would_deny) else decision
 
     def decide_parameter(
         self, request: Request, *, subtree: bool = True, namespace: bool = False
@@ -180,8 +172,29 @@ class Policy:
         for rule in deciding:
             if not rule.grants(atoms):
                 what = f"{_what(request, 'may not')} with what is below it"
-                return _decided(False, rule.rule, _sentence(what, rule), table.audit_only)
+                return _by_rule(what, rule, table.audit_only)
         return None
+
+    @property
+    def limits_anything(self) -> bool:
+        """Whether there is a limit on any topic."""
+        return bool(self._limits.rules)
+
+    def limit_rule(self, topic: str) -> LimitRule | None:
+        """The line of `[Limits]` that speaks of a topic."""
+        return self._limits.find(topic)
+
+    def limit(self, part: Part, topic: str, host: Address | None = None) -> Rate:
+        """How much may pass for a publisher or subscriber on `host`, or for all publishers of a topic together."""
+        rule = self._limits.find(topic)
+        if rule is None:
+            return NO_LIMIT
+        return rule.rate(part, self._hosts.atoms_of(host) if host is not None else frozenset())
+
+    def limit_on(self, request: Request) -> Rate:
+        """How much of what a request asks for may pass."""
+        part = _LIMITED.get(request.category)
+        return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def knows(self, address: Address) -> bool:
         """Whether any rule names this address: if not, its requests need not even be read.
@@ -189,6 +202,10 @@ class Policy:
         With a section in audit-only mode every address is known, because its requests pass.
         """
         return self._any_audit_only or not self._named.isdisjoint(self._hosts.atoms_of(address))
+
+    def named_as(self, address: Address) -> Network:
+        """By what the policy names an address: itself, or the smallest network whose every address it means as well."""
+        return self._hosts.narrowest(address)
 
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
@@ -239,7 +256,7 @@ class Policy:
         if found.grants(self._hosts.atoms_of(request.host)):
             return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
         what = _what(request, "is not among the hosts that may")
-        return _decided(False, found.rule, _sentence(what, found), table.audit_only)
+        return _by_rule(what, found, table.audit_only)
 
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
@@ -250,23 +267,11 @@ class Policy:
         return _decided(False, None, reason, table.audit_only)
 
 
-def needs_node_rule(request: Request) -> bool:
-    """Whether the request makes a node part of the graph, so that `[Nodes]` decides as well."""
-    if request.category is Category.COMMAND:
-        return request.resource in commands.NODE_RULE_COMMANDS
-    return request.category in {Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER}
-
-
 def _not_a_command(name: str) -> str:
     elsewhere = commands.DECIDED_ELSEWHERE.get(name)
     if elsewhere is not None:
         return f"{name} is decided by {elsewhere}"
     return f"{quoted(name)} is not a call that the appliance knows"
-
-
-def node_request(request: Request) -> Request:
-    """The question whether `[Nodes]` lets the host of a request use its `caller_id`."""
-    return replace(request, category=Category.NODE, resource=request.caller_id)
 
 
 def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) -> Decision:
@@ -280,10 +285,12 @@ def _what(request: Request, may: str) -> str:
     return f"{canonical_address(request.host)} {may} {phrase} {_shortened(request.resource)}"
 
 
-def _sentence(what: str, rule: CompiledRule) -> str:
-    """The reason of a denial by a rule; who may instead is left out where it would make it too long."""
+def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
+    """A denial by a rule; who may instead is left out of the reason where it would make it too long."""
+    told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
-    return reason if len(reason) <= _LONGEST_REASON else f"{what}, by {rule.place}"
+    decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
+    return replace(decision, told=told)
 
 
 def _shortened(text: str, limit: int = 60) -> str:

@@ -7,9 +7,8 @@ from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable, place_of
 from appliance.policy.reader import Entry, SectionText, Word
-from appliance.policy.sections import PARAMETERS, Decider
+from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
 
-DEFAULT = "default"
 MAXIMUM_INNER_STARS = 1000
 """Keys with a star before the end, in all sections: they make looking up a name branch."""
 

@@ -33,9 +33,12 @@ BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
 """The categories whose resources are keys of parameters."""
 
-GROUPS, PORTS, MONITOR, OPTIONS = "Groups", "Ports", "Monitor", "Options"
+DEFAULT = "default"
+"""The key for what no other key of a section matches."""
 
-NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), OPTIONS)
+GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
+
+NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, OPTIONS)
 
 PHRASES = {
     Category.NODE: "use the node name",

@@ -1,10 +1,11 @@
 """The sections that decide nothing: `[Ports]`, `[Monitor]` and `[Options]`."""
 
 import re
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.reader import Entry, SectionText
 from appliance.policy.sections import DECIDERS
@@ -17,10 +18,11 @@ _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What `[Options]` says: when another host may take a node name over; the sections in audit-only mode."""
+    """What `[Options]` says: when another host may take a node name over, sections in audit-only mode, what is told."""
 
     takeover: str = TAKEOVERS[0]
     audit_only: frozenset[str] = frozenset()
+    tell: str = TELLS[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,21 +75,23 @@ def read_monitor(section: SectionText | None, findings: Findings) -> Monitor:
 
 def read_options(section: SectionText | None, findings: Findings) -> Options:
     """The options; what the file does not set keeps its default."""
-    takeover = TAKEOVERS[0]
-    audit_only: frozenset[str] = frozenset()
-    for entry in _entries(section, ("takeover", "audit-only"), findings):
-        if entry.key.text == "takeover":
-            takeover = _takeover(entry, findings)
-        else:
-            audit_only = _audit_only(entry, findings)
-    return Options(takeover, audit_only)
+    options = Options()
+    for entry in _entries(section, ("takeover", "audit-only", "tell"), findings):
+        match entry.key.text:
+            case "takeover":
+                options = replace(options, takeover=_one_of(entry, TAKEOVERS, findings))
+            case "tell":
+                options = replace(options, tell=_one_of(entry, TELLS, findings))
+            case _:
+                options = replace(options, audit_only=_audit_only(entry, findings))
+    return options
 
 
-def _takeover(entry: Entry, findings: Findings) -> str:
+def _one_of(entry: Entry, words: Sequence[str], findings: Findings) -> str:
     text = " ".join(word.text for word in entry.values)
-    if text not in TAKEOVERS:
+    if text not in words:
         word = entry.values[0] if entry.values else entry.key
-        shown = f"takeover is {' or '.join(TAKEOVERS)}, not {quoted(text)}{meant(text, TAKEOVERS)}"
+        shown = f"{entry.key.text} is {' or '.join(words)}, not {quoted(text)}{meant(text, words)}"
         findings.error(word.line, word.column, shown)
     return text
 

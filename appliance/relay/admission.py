@@ -9,13 +9,19 @@ roscpp never tries again after an error header, so such a peer is kept waiting f
 from collections.abc import Mapping
 
 from appliance.relay.grants import StatedTable
+from appliance.relay.headers import switched_on, too_long
+from appliance.ros.errors import InvalidNameError
+from appliance.ros.names import check_tool_id
 
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 
+NOTHING = ("", "")
+"""What a header asks for that names neither a topic nor a service, or is not there."""
 
-def asked_for(fields: Mapping[str, str]) -> str:
-    """The topic or service a header names; empty when it names neither."""
-    return fields.get("topic") or fields.get("service", "")
+
+def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
+    """The kind and the name of the topic or service a header names; both empty when it names neither."""
+    return next(((kind, fields[kind]) for kind in _REQUIRED if fields.get(kind)), NOTHING)
 
 
 def flaw(fields: Mapping[str, str], rest: bytes) -> str:
@@ -27,9 +33,13 @@ def flaw(fields: Mapping[str, str], rest: bytes) -> str:
             for field in required:
                 if field not in fields:
                     return f"Missing required '{field}' field"
+            try:
+                check_tool_id(fields["callerid"])
+            except InvalidNameError as error:
+                return str(error)
             if kind == "topic" and rest:
                 return "sent data after its header; a connection is for one topic"
-            return ""
+            return too_long(fields)
     return "its header names neither a topic nor a service"
 
 
@@ -48,6 +58,18 @@ def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) 
     service = fields["service"]
     if table.service(key, service) is None:
         return f"[{name}] is not a provider of [{service}]"
-    if not table.may_call(key, service, host):
-        return f"no grant for {host} to call [{service}]; lookupService comes first"
+    if bound_name(table, key, host, fields) is None:
+        return f"no grant for [{caller_id}] at {host} to call [{service}]; lookupService comes first"
     return ""
+
+
+def bound_name(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
+    """The name under which a client may call a service: its own, which it has looked the service up by.
+
+    Who only probes calls nothing. The tools that do may have looked the service up by another name (roswtf probes as
+    `/rosservice`): the service sees that one.
+    """
+    caller_id, service = fields["callerid"], fields["service"]
+    if table.may_call(key, service, host, caller_id):
+        return caller_id
+    return table.client_of(key, service, host) if switched_on(fields, "probe") else None

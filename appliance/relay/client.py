@@ -1,30 +1,33 @@
 """A service client's connection and the one made for it to the service.
 
 The client's header has been checked against the grants; the service is connected to, gets the client's header
-written afresh (`persistent`, `probe`, `md5sum=*` and a session's own fields included), and its answer goes
-back the same way. Then requests and replies alternate (`exchange`).
+written afresh (`persistent`, `probe` and `md5sum=*` included, a session's own fields left out), and its answer goes
+back the same way (`headers`). Then requests and replies alternate (`exchange`).
 
 A service that never answers holds this client and nobody else. One that cannot be reached, or dies before its
 header, is answered with an error header, as rospy and roscpp expect; one that dies later ends the client's
 connection, as it would without the appliance.
 """
 
+import errno
 import socket
 from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import PublicationRefused, TopicTraffic
 from appliance.relay.context import RelayContext
 from appliance.relay.exchange import ServiceExchange
+from appliance.relay.frames import SMALL
 from appliance.relay.grants import Service
+from appliance.relay.headers import size_of, switched_on, to_client, to_service
 from appliance.relay.loop import Timer
-from appliance.relay.memory import Stall
+from appliance.relay.memory import Stall, Weight
 from appliance.relay.middle import Judged
+from appliance.relay.places import Place
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.ros.errors import PeerError
 from appliance.ros.tcpros import HeaderParser, encode_header
 
-_TRUE = frozenset({"1", "true", "True"})
-_ALWAYS_HELD = 1 << 20
+_PATIENT = 1 << 20  # so much may wait for ever, as long as its host has memory
 
 
 class ServiceTraffic:
@@ -58,7 +61,7 @@ class ServiceTraffic:
 
 
 class ServiceClient:
-    """One client of one service.
+    """One client of one service; `caller_id` is the name it is bound to.
 
     Either `ended()` is called once, when both connections are closed, or `refuse(sock, reason)`, which takes
     the client's socket over.
@@ -72,12 +75,14 @@ class ServiceClient:
         host: str,
         fields: Mapping[str, str],
         *,
+        caller_id: str,
         traffic: ServiceTraffic,
         refuse: Callable[[socket.socket, str], None],
         ended: Callable[[], None],
     ) -> None:
         self.service = service
         self.host = host
+        self.caller_id = caller_id
         self._context = context
         self._fields = fields
         self._traffic = traffic
@@ -85,8 +90,12 @@ class ServiceClient:
         self._ended = ended
         self._number = 0
         self._live = True
-        self._weight = 0
-        self._share = context.shares.of(host)
+        memory = context.memory
+        self._weights = (
+            Weight(memory.frames.of(host)),
+            Weight(memory.frames.of(service.host)),
+            Weight(memory.queues.of(host)),
+        )
         self._stall = Stall(context.limits.stall_seconds)
         self._server: Stream | None = None
         self._timer: Timer | None = None
@@ -95,7 +104,7 @@ class ServiceClient:
         self._header: dict[str, str] = {}
         self._exchange = ServiceExchange(
             context.limits.message_bytes,
-            persistent=fields.get("persistent", "") in _TRUE,
+            persistent=switched_on(fields, "persistent"),
             to_service=self._to_service,
             to_client=self._to_client,
             count=traffic.count,
@@ -108,12 +117,11 @@ class ServiceClient:
 
     def start(self, rest: bytes) -> None:
         """Connect to the service; `rest` is what the client has sent after its header."""
-        where = f"{self.service.host}:{self.service.port}"
         try:
             self._exchange.from_client(rest)
             sock = begin_connect(self.service.host, self.service.port)
         except (OSError, OverflowError) as error:
-            self._turn_away(f"cannot connect to the service at {where}: {error}")
+            self._turn_away(f"cannot connect to the service: {_why(error)}")
             return
         except PeerError as error:
             self._turn_away(str(error))
@@ -121,10 +129,8 @@ class ServiceClient:
         self._server = Stream(
             self._context.loop, sock, self._server_received, self._server_broken, opened=self._connected
         )
-        seconds = self._context.limits.connect_seconds
-        self._timer = self._context.loop.after(
-            seconds, lambda: self._turn_away(f"the service at {where} does not answer within {seconds:g} s")
-        )
+        self._patience(self._context.limits.connect_seconds)
+        self._weigh()
 
     def judge_again(self) -> None:
         """Other specifications are in force: a service that does not fit them is carried no longer."""
@@ -138,7 +144,8 @@ class ServiceClient:
         held = (
             self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
         )
-        if self._stall.seen(held if held > _ALWAYS_HELD else 0, self._context.loop.clock()):
+        patience = SMALL if any(one.share.exhausted for one in self._weights) else _PATIENT
+        if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
             self._close(
                 f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s"
@@ -148,8 +155,17 @@ class ServiceClient:
         """Close both connections: what they stand on is gone."""
         self._close(reason)
 
+    def _patience(self, seconds: float) -> None:
+        """From now on the service has so long."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._context.loop.after(
+            seconds, lambda: self._turn_away(f"the service does not answer within {seconds:g} s")
+        )
+
     def _connected(self) -> None:
-        self._to_service(encode_header(self._fields))
+        self._patience(self._context.limits.service_seconds)
+        self._to_service(encode_header(to_service(self._fields, self.caller_id)))
 
     def _server_received(self, data: bytes) -> None:
         if not data:
@@ -180,20 +196,18 @@ class ServiceClient:
         if self._timer is not None:
             self._timer.cancel()
         self._number = self._context.reporter.opened(
-            self.service.key, self.service.service, "service", self.host, self._fields["callerid"]
+            self.service.key, self.service.service, "service", self.host, self.caller_id
         )
         self._traffic.connected(1)
-        self._to_client(encode_header(header))
+        self._to_client(encode_header(to_client(header, self.service.node)))
         self._guard(self._exchange.from_service, self._parser.rest)
 
     def _judge(self, part: str, body: bytes) -> Judged:
         """What the monitors make of a request or a reply. They may be others than when the client came."""
         middle, service = self._context.middle, self.service
-        return (
-            middle.request(service.key, service.service, body)
-            if part == "request"
-            else middle.response(service.key, service.service, body)
-        )
+        if part == "request":
+            return middle.request(Place(service.key, service.service, self.host, self.caller_id), body)
+        return middle.response(Place(service.key, service.service, service.host, service.node), body)
 
     def _client_received(self, data: bytes) -> None:
         if not data:
@@ -226,12 +240,15 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
-        """Count what this connection holds in memory; too much for the process ends it."""
-        weight = self._exchange.held + self._client.backlog + (self._server.backlog if self._server else 0)
-        self._share.used += weight - self._weight
-        self._weight = weight
-        if weight > _ALWAYS_HELD and self._share.exhausted:
-            self._close("the relay has no memory left for this message")
+        """Count what this connection holds in memory; too much for a host ends it."""
+        waiting = self._client.backlog + (self._server.backlog if self._server else 0)
+        of_service = self._exchange.held_replies + size_of(self._header)
+        parts = (self._exchange.held, of_service, waiting)
+        for weight, size in zip(self._weights, parts, strict=True):
+            weight.set(size)
+            if size > SMALL and weight.share.exhausted:
+                self._close("the relay has no memory left for messages of this host")
+                return
 
     def _to_service(self, data: bytes) -> None:
         if self._server is not None:
@@ -280,6 +297,12 @@ class ServiceClient:
             self._timer.cancel()
         if self._server is not None:
             self._server.close()
-        self._share.used -= self._weight
+        for weight in self._weights:
+            weight.set(0)
         if self._greeted:
             self._traffic.connected(-1)
+
+
+def _why(error: Exception) -> str:
+    """The error without the address of the service's node, which is not the client's to know."""
+    return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no address that can be called")

@@ -2,26 +2,20 @@
 
 from dataclasses import dataclass
 
-from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.memory import HostShares
+from appliance.relay.memory import Memory
 from appliance.relay.middle import Middle
 from appliance.relay.report import Reporter
 
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """Loop, bounds, the voice to control, the memory in use, the area small frames are received into, monitors.
-
-    `shares` are those of each host in the memory, `headers` in that for headers of peers that nobody knows yet.
-    """
+    """Loop, bounds, the voice to control, what hosts hold of the memory, where small frames come in, monitors."""
 
     loop: Loop
     limits: Limits
     reporter: Reporter
-    budget: MemoryBudget
+    memory: Memory
     scratch: memoryview
     middle: Middle
-    shares: HostShares
-    headers: HostShares

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from appliance.relay.places import Place
 from appliance.rosmop.batch import Walked, Walker
 
 
@@ -14,9 +15,9 @@ class Count(NamedTuple):
 
 
 class Counts:
-    """What walks at one place (key of an incarnation, topic) have done since it was last taken."""
+    """What walks at one place have done since it was last taken."""
 
-    def __init__(self, walker: Walker, place: tuple[str, str]) -> None:
+    def __init__(self, walker: Walker, place: Place) -> None:
         self.walker = walker
         self.place = place
         self.begun = False

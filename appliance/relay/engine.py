@@ -14,10 +14,11 @@ Invariants:
 import os
 import socket
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from appliance.channel.messages import (
     ClientRevoked,
+    GrantInstalled,
     GrantRevoked,
     Message,
     MonitorResumed,
@@ -36,17 +37,21 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamRefused,
 )
-from appliance.relay.admission import asked_for, flaw, missing
+from appliance.relay.admission import NOTHING, asked_for, bound_name, flaw, missing
+from appliance.relay.anteroom import Anteroom
 from appliance.relay.client import ServiceClient, ServiceTraffic
 from appliance.relay.context import RelayContext
-from appliance.relay.frames import SCRATCH, MemoryBudget
+from appliance.relay.flow import Flows
+from appliance.relay.frames import SCRATCH
 from appliance.relay.grants import StatedTable, Statement
+from appliance.relay.headers import kept
 from appliance.relay.limits import Limits
 from appliance.relay.links import Link
 from appliance.relay.loop import Loop
-from appliance.relay.memory import HostShares
+from appliance.relay.memory import Memory
 from appliance.relay.middle import Middle
 from appliance.relay.own import OwnPublisher
+from appliance.relay.places import Place
 from appliance.relay.ports import Ports
 from appliance.relay.report import Reporter
 from appliance.relay.sockets import tune
@@ -54,6 +59,7 @@ from appliance.relay.subscriber import Subscriber
 from appliance.relay.topic import RelayedTopic
 from appliance.relay.upstream import Publisher
 from appliance.relay.visitor import Farewell, Visitor
+from appliance.shares.pool import Standing
 
 
 class Engine:
@@ -67,13 +73,18 @@ class Engine:
         self._middle = Middle(loop, self._reporter)
         self._middle.publish = lambda published: self._publish(published.topic, published.data)
         self._middle.changed = self._monitors_changed
-        budget = MemoryBudget(limits.memory_bytes)
-        headers = HostShares(MemoryBudget(limits.header_memory_bytes))
-        self._context = RelayContext(
-            loop, limits, self._reporter, budget, scratch, self._middle, HostShares(budget), headers
-        )
         self._table = StatedTable()
-        self._ports = Ports(loop, limits, self._arrived, self._turned_away)
+        self._memory = Memory.of(limits, self._table.standing)
+        self._context = RelayContext(loop, limits, self._reporter, self._memory, scratch, self._middle)
+        self._anteroom = Anteroom(loop.clock, self._table.standing, self._memory.headers)
+        self._ports = Ports(
+            loop,
+            limits,
+            standing=self._table.standing,
+            arrived=self._arrived,
+            turned_away=self._turned_away,
+            make_room=self._make_place,
+        )
         self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
         self._own: dict[str, OwnPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
@@ -84,6 +95,7 @@ class Engine:
         self._farewells: set[Farewell] = set()
         self._link: Link | None = None
         self._last_rows: list[TopicTraffic] = []
+        self._flows = Flows(loop.clock)
         self._later: deque[tuple[Message, tuple[int, ...]]] = deque()
         loop.after(limits.report_every, self._tick)
 
@@ -150,6 +162,9 @@ class Engine:
             self._ports.open(message.key, descriptors[0])
         elif isinstance(message, PublicationPlaced):
             self._place_topic(message.key, message.topic)
+            self._limit_topic(message)
+        elif isinstance(message, GrantInstalled):
+            self._limit_subscriber(message)
         if self._waiting and message.key in self._waiting:
             self._judge_waiting(message.key)
 
@@ -157,8 +172,9 @@ class Engine:
         for message in self._table.end(epoch):
             self._withdrawn(message)
         self._reporter.repeat_connections()
-        for _topic, publisher in self._topics.values():
+        for topic, publisher in self._topics.values():
             publisher.ask_again()
+            topic.repeat()
         self._middle.observations.repeat()
 
     def _withdrawn(self, message: Message) -> None:
@@ -178,14 +194,16 @@ class Engine:
             self._cut_clients("the service is offered no longer", message.key, message.service)
             self._forget_services(message.key, message.service)
         elif isinstance(message, ClientRevoked):
-            self._cut_clients("its grant is revoked", message.key, message.service, message.host)
+            client = message.host, message.caller_id
+            self._cut_clients("its grant is revoked", message.key, message.service, client)
 
     def _cut_clients(
-        self, reason: str, key: str, service: str | None = None, host: str | None = None
+        self, reason: str, key: str, service: str | None = None, of: tuple[str, str] | None = None
     ) -> None:
         for client in list(self._clients):
             placed = client.service
-            if placed.key == key and service in {None, placed.service} and host in {None, client.host}:
+            who = client.host, client.caller_id
+            if placed.key == key and service in {None, placed.service} and of in {None, who}:
                 client.cut(reason)
 
     def _forget_services(self, key: str, service: str | None = None) -> None:
@@ -198,14 +216,21 @@ class Engine:
         if (key, topic) in self._topics:
             return
         node = self._table.node(key)
-        name = key if node is None else node.name
+        name, host = (key, "") if node is None else (node.name, node.host)
         relayed = RelayedTopic(
             key,
             topic,
             name,
+            host,
             grace=self._limits.queue_grace,
             clock=self._loop.clock,
-            budget=self._context.budget,
+            share=self._memory.latched.of(host),
+            fresh=not self._table.restating,
+            limited=lambda part, messages, size: self._reporter.limited(
+                (key, topic, part, host, name), messages, size
+            ),
+            make_room=lambda size: self._make_room(host, size),
+            refused=self._reporter.send,
         )
         publisher: Publisher | OwnPublisher
         if node is not None and node.monitors:
@@ -220,10 +245,38 @@ class Engine:
             self._let_monitor(relayed)
         self._topics[key, topic] = (relayed, publisher)
 
+    def _limit_topic(self, message: PublicationPlaced) -> None:
+        relayed, _publisher = self._topics[message.key, message.topic]
+        together = self._flows.of(message.together, message.topic)
+        relayed.flow.set(message.limit, together, self._loop.clock())
+
+    def _limit_subscriber(self, message: GrantInstalled) -> None:
+        """Those that are connected by this grant are limited so from now on."""
+        placed = self._topics.get((message.key, message.topic))
+        flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
+        for member in placed[0].members if placed is not None else ():
+            if isinstance(member, Subscriber) and (member.host, member.caller_id) == (
+                message.host,
+                message.caller_id,
+            ):
+                member.flow = flow
+
+    def _make_room(self, host: str, size: int) -> None:
+        """A host wants to have a message latched: those that have more than it would have make room."""
+        latched, share = self._memory.latched, self._memory.latched.of(host)
+        while share.refusal(size):
+            greatest, held = max(latched.pool.holders(), key=lambda one: one[1], default=("", 0))
+            of_greatest = (topic for topic, _publisher in self._topics.values() if topic.host == greatest)
+            largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
+            if held <= share.used + size or largest is None or not largest.latched:
+                return
+            largest.give_up_latched()
+
     def _let_monitor(self, relayed: RelayedTopic) -> None:
         """Messages of a topic go through the monitors if one stands there, and past them otherwise."""
-        middle, key, topic = self._middle, relayed.key, relayed.topic
-        through = middle.lane(key, topic).through if middle.stands(topic) else None
+        middle, topic = self._middle, relayed.topic
+        place = Place(relayed.key, topic, relayed.host, relayed.name)
+        through = middle.lane(place).through if middle.stands(topic) else None
         relayed.monitor(through, wanted=middle.wants(topic))
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
@@ -245,7 +298,7 @@ class Engine:
         for relayed, publisher in list(self._topics.values()):
             concerned = topics is None or relayed.topic in topics
             if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
-                publisher.connect_anew()
+                publisher.give_again()
 
     def _state_header(self, message: OwnHeaderStated) -> None:
         self._own_headers[message.topic] = {
@@ -308,19 +361,46 @@ class Engine:
             self._ports.left(host)
             return
         visitor = Visitor(
-            self._context, sock, key, host, introduced=self._introduced, failed=self._visitor_failed
+            self._context,
+            sock,
+            key,
+            host,
+            anteroom=self._anteroom,
+            introduced=self._introduced,
+            failed=self._visitor_failed,
         )
         self._visitors.add(visitor)
 
+    def _make_place(self, host: str) -> bool:
+        """End a connection so that one of this host has room: of a peer that waits, else of the host that has most."""
+        if self._anteroom.make_room(host):
+            return True
+        pool = self._ports.connected
+        if self._table.standing(host) is not Standing.REGISTERED:
+            return False
+        largest, most = max(pool.holders(), key=lambda holder: holder[1], default=("", 0))
+        if most <= pool.held(host) + 1:
+            return False
+        for member in self._served():
+            if member.host == largest:
+                member.cut("its host has most connections, and there was no room for others")
+                return True
+        return False
+
+    def _served(self) -> Iterator[Subscriber | ServiceClient]:
+        yield from list(self._clients)
+        for relayed, _publisher in self._topics.values():
+            yield from [member for member in relayed.members if isinstance(member, Subscriber)]
+
     def _turned_away(self, key: str, host: str, reason: str) -> None:
-        self._reporter.refused(key, "", host, "", reason)
+        self._reporter.refused(key, NOTHING, host, "", reason)
 
     def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
         visitor.close()
         self._forget_visitor(visitor)
         self._ports.left(visitor.host)
         if reason:
-            self._reporter.refused(visitor.key, "", visitor.host, "", reason)
+            self._reporter.refused(visitor.key, NOTHING, visitor.host, "", reason)
 
     def _introduced(self, visitor: Visitor) -> None:
         if self._link is not None:
@@ -343,9 +423,9 @@ class Engine:
         if reason:
             self._refuse(visitor, asked_for(fields), fields.get("callerid", ""), sock, reason)
         elif "topic" in fields:
-            self._subscribe(visitor, sock, fields)
+            self._subscribe(visitor, sock, kept(fields))
         else:
-            self._serve_client(visitor, sock, fields, rest)
+            self._serve_client(visitor, sock, kept(fields), rest)
 
     def _judge_waiting(self, key: str) -> None:
         """Something new is stated of this incarnation: who can be served now is served."""
@@ -365,20 +445,29 @@ class Engine:
         self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str], rest: bytes
     ) -> None:
         service = self._table.service(visitor.key, fields["service"])
-        if service is None:
+        caller_id = bound_name(self._table, visitor.key, visitor.host, fields)
+        if service is None or caller_id is None:  # `missing` has looked
             return
         traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
 
         def refuse(sock: socket.socket, reason: str) -> None:
             self._clients.discard(client)
-            self._refuse(visitor, service.service, fields["callerid"], sock, reason)
+            self._refuse(visitor, ("service", service.service), caller_id, sock, reason)
 
         def ended() -> None:
             self._clients.discard(client)
             self._ports.left(visitor.host)
 
         client = ServiceClient(
-            self._context, sock, service, visitor.host, fields, traffic=traffic, refuse=refuse, ended=ended
+            self._context,
+            sock,
+            service,
+            visitor.host,
+            fields,
+            caller_id=caller_id,
+            traffic=traffic,
+            refuse=refuse,
+            ended=ended,
         )
         self._clients.add(client)
         client.start(rest)
@@ -387,28 +476,34 @@ class Engine:
         relayed, _publisher = self._topics[visitor.key, fields["topic"]]
 
         def refuse(sock: socket.socket, reason: str) -> None:
-            self._refuse(visitor, relayed.topic, fields["callerid"], sock, reason)
+            self._refuse(visitor, ("topic", relayed.topic), fields["callerid"], sock, reason)
 
         def ended() -> None:
             self._ports.left(visitor.host)
 
-        relayed.join(
-            Subscriber(self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended)
+        subscriber = Subscriber(
+            self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended
         )
+        grant = self._table.grant(visitor.key, relayed.topic, visitor.host, subscriber.caller_id)
+        if grant is not None:
+            subscriber.flow = self._flows.of(grant.limit, relayed.topic, grant.host, grant.caller_id)
+        relayed.join(subscriber)
 
     def _refuse(
-        self, visitor: Visitor, resource: str, caller_id: str, sock: socket.socket, reason: str
+        self, visitor: Visitor, asked: tuple[str, str], caller_id: str, sock: socket.socket, reason: str
     ) -> None:
         """Tell the peer why and close; it counts for its host until then."""
-        self._reporter.refused(visitor.key, resource, visitor.host, caller_id, reason)
+        self._reporter.refused(visitor.key, asked, visitor.host, caller_id, reason)
 
         def ended(farewell: Farewell) -> None:
             self._farewells.discard(farewell)
+            self._anteroom.leave(farewell)
             self._ports.left(visitor.host)
 
         farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended)
         if farewell.live:
             self._farewells.add(farewell)
+            self._anteroom.enter(farewell, visitor.host)
 
     def _rows(self) -> list[TopicTraffic]:
         """What went through since the last call."""
@@ -427,5 +522,5 @@ class Engine:
         for client in list(self._clients):
             client.look()
         self._middle.tick()
-        self._reporter.tick(self._rows)
+        self._reporter.tick(self._rows, self._memory.held())
         self._loop.after(self._limits.report_every, self._tick)

@@ -31,8 +31,9 @@ _REPLY_HEAD = 5  # bytes before the body of a reply
 class ServiceExchange:
     """Requests one way, replies the other: `to_service(data)` and `to_client(data)` write.
 
-    `count(size)` is called for each request and reply; `held` is the bytes of what is not whole or has to
-    wait. `judge(part, body)` is where monitors stand: it says what becomes of a `request` or `response`.
+    `count(size)` is called for each request and reply. `held` is the bytes of requests that are not whole or have to
+    wait, `held_replies` those of replies that are not whole. `judge(part, body)` is where monitors stand: it says what
+    becomes of a `request` or `response`.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ServiceExchange:
         self._busy = False
         self.done = False
         self.held = 0
+        self.held_replies = 0
 
     @property
     def may_read(self) -> bool:
@@ -70,7 +72,7 @@ class ServiceExchange:
     @property
     def unfinished(self) -> int:
         """The bytes of a request or reply that is not whole; 0 while whole requests wait for their turn."""
-        return 0 if self._waiting else self.held
+        return self.held_replies + (0 if self._waiting else self.held)
 
     def from_client(self, data: bytes) -> None:
         """Bytes from the client. Raises `PeerError` when they are no request."""
@@ -79,7 +81,7 @@ class ServiceExchange:
 
     def from_service(self, data: bytes) -> None:
         """Bytes from the service. Raises `PeerError` when they are no reply, or one that nobody asked for."""
-        self.held += len(data)
+        self.held_replies += len(data)
         for reply in self._replies.feed(data):
             if not self._busy:
                 raise ProtocolError("the service sent a reply without a request")
@@ -111,7 +113,7 @@ class ServiceExchange:
         self._to_client(data)
 
     def _reply(self, reply: ServiceReply) -> None:
-        self.held -= len(reply.body) + _REPLY_HEAD
+        self.held_replies -= len(reply.body) + _REPLY_HEAD
         if reply.ok and self._judge is not None:
             judged = self._judge("response", reply.body)
             reply = (

@@ -7,7 +7,7 @@ into and returns all frames that are whole after each read as one `Batch`, walke
   at the end of a read, if there is one, is set aside until the rest arrives.
 - A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 8 MiB is used again
   for the next large frame unless a queue has kept it; a larger one is anonymous memory, so that a length which
-  is declared and never sent costs address space only.
+  is declared and never sent costs address space only. While memory is short no area is kept.
 
 Frames are passed on whole, so a publisher that dies in the middle of one tears nobody's stream: what its
 subscribers have been sent always ends with a frame.
@@ -18,6 +18,9 @@ import struct
 from typing import Protocol
 
 from appliance.ros.errors import LimitExceededError
+
+SMALL = 4 << 10
+"""So much of what is unfinished on a connection is never refused."""
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
@@ -30,36 +33,29 @@ _unpack_length = _LENGTH.unpack_from
 
 
 class Memory(Protocol):
-    """Where waiting bytes are counted: of the whole process, or of one host."""
+    """Where the bytes of one host that wait are counted."""
 
-    used: int
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether nothing more should be kept."""
-
-
-class MemoryBudget:
-    """Counts the bytes that wait in the process: unfinished large frames and queues."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.used = 0
+    def add(self, size: int) -> None:
+        """So many bytes more are there; fewer, where `size` is below 0."""
 
     @property
     def exhausted(self) -> bool:
         """Whether nothing more should be kept."""
-        return self.used >= self.limit
+
+    @property
+    def plenty(self) -> bool:
+        """Whether there is so much that memory may be kept for use again."""
 
 
 class Batch:
     """Whole frames, one after the other, in a buffer that is used again unless they are kept.
 
     `last` is where the last of the `messages` frames begins, None if that has to be looked for; `stride` the bytes of
-    each of the frames if they are known to be equally long, else 0.
+    each of the frames if they are known to be equally long, else 0. `first` is the number of the first frame among
+    those of its publication.
     """
 
-    __slots__ = ("_kept", "_owned", "last", "messages", "stride", "view")
+    __slots__ = ("_kept", "_owned", "first", "last", "messages", "stride", "view")
 
     def __init__(
         self, view: memoryview, messages: int, last: int | None, *, owned: bool = False, stride: int = 0
@@ -68,6 +64,7 @@ class Batch:
         self.messages = messages
         self.last = last
         self.stride = stride
+        self.first = 1
         self._owned = owned
         self._kept: memoryview | None = None
 
@@ -82,35 +79,64 @@ class Batch:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
 
+    def within(self, size: float, most: int) -> int:
+        """How many of the first `most` frames begin within so many bytes."""
+        if size <= 0:
+            return 0
+        if len(self.view) <= size or most == 1:
+            return most
+        if self.stride:
+            return min(most, -int(-size // self.stride))
+        return min(most, boundary_at(self.view, int(-(-size // 1)))[0] + 1)
+
+    def head(self, count: int) -> "Batch":
+        """The first frames."""
+        end = last = 0
+        if self.stride:
+            end, last = count * self.stride, (count - 1) * self.stride
+        else:
+            for _ in range(count):
+                last, end = end, end + 4 + _unpack_length(self.view, end)[0]
+        head = Batch(self.view[:end], count, last, owned=self._owned, stride=self.stride)
+        head.first = self.first
+        return head
+
+    def find_last(self) -> int:
+        """Where the last frame begins."""
+        if self.last is None:
+            self.last = last_frame(self.view)
+        return self.last
+
     def keep_last(self) -> "Batch":
         """The last frame as a batch of its own, in memory that stays as it is."""
         if self._owned and self.messages == 1:
             self.keep()
             return self
-        if self.last is None:
-            self.last = last_frame(self.view)
-        last = memoryview(bytes(self.view[self.last :]))
+        last = memoryview(bytes(self.view[self.find_last() :]))
         return Batch(last, 1, 0, owned=True)
 
 
 class FrameReceiver:
     """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
 
-    def __init__(self, scratch: memoryview, limit: int, budget: Memory) -> None:
+    def __init__(self, scratch: memoryview, limit: int, share: Memory) -> None:
         self._scratch = scratch
         self._limit = limit
-        self._budget = budget
+        self._share = share
+        self._counted = 0
         self._torn = b""
         self._area: memoryview | None = None
         self._filled = 0
         self._target = 0
         self._delivered: Batch | None = None
+        self._idle = True
 
     def buffer(self) -> memoryview:
         """Where the next bytes of the connection go."""
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
+                self._count(0)  # who keeps it counts it
             self._delivered = None
             return self._area[self._filled : self._target]
         torn = self._torn
@@ -123,27 +149,34 @@ class FrameReceiver:
         """The frames that are whole now that `count` more bytes are in the buffer.
 
         The batch is good until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
-        and when the process has no memory left for an unfinished one.
+        and when the publisher's host has no memory left for an unfinished one.
         """
+        self._idle = False
         if self._area is not None:
             return self._received_in_area(self._area, count)
         return self._walk(self._scratch, len(self._torn) + count, owned=False)
-
-    def charge(self, budget: Memory) -> None:
-        """Count there from now on."""
-        budget.used += self._filled
-        self._budget.used -= self._filled
-        self._budget = budget
 
     @property
     def unfinished(self) -> int:
         """The bytes that have come of a large frame that is not whole."""
         return self._filled
 
+    def rest(self) -> None:
+        """A second is over: an area that no large frame has come into since the last call is given up."""
+        if self._idle and not self._filled and self._area is not None:
+            self.abandon()
+        self._idle = True
+
     def abandon(self) -> None:
         """The connection is gone: nothing unfinished counts any more."""
-        self._budget.used -= self._filled
+        self._count(0)
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
+
+    def _count(self, size: int) -> None:
+        """So many bytes are held for this connection."""
+        if size != self._counted:
+            self._share.add(size - self._counted)
+            self._counted = size
 
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
         """All whole frames in `buffer[:end]`; the torn one after them is set aside."""
@@ -168,6 +201,10 @@ class FrameReceiver:
                 self._begin_area(need, buffer[position:end])
             else:
                 self._torn = bytes(buffer[position:end])
+        if self._area is None:
+            self._count(len(self._torn))
+            if len(self._torn) > SMALL and self._share.exhausted:
+                raise _no_memory()
         if not messages:
             return None
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
@@ -176,31 +213,31 @@ class FrameReceiver:
         """Go on with a frame of `need` bytes, of which `start` has come, in an area of its own."""
         area = _new_area(need)
         area[: len(start)] = start
-        self._budget.used += len(start) - self._filled
         self._area, self._target, self._filled = area, need, len(start)
+        self._count(len(start))
 
     def _received_in_area(self, area: memoryview, count: int) -> Batch | None:
         """One frame at a time: reads end where the frame ends, or where one as long as the last would."""
         self._filled += count
-        self._budget.used += count
+        if self._filled > self._counted:  # what has been filled once stays there with the area
+            self._count(self._filled)
         if self._filled < 4:
             return None
         need = _unpack_length(area, 0)[0] + 4
         if self._filled < need:
             if need - 4 > self._limit:
                 raise _too_long(need - 4, self._limit)
-            if self._budget.exhausted:
-                raise LimitExceededError("the relay has no memory left for the rest of this message")
+            if self._share.exhausted:
+                raise _no_memory()
             if need > len(area):
                 self._begin_area(need, area[: self._filled])
             else:
                 self._target = need
             return None
-        if self._filled > need or need <= LARGE or need > _KEEP_AREA:
+        if self._filled > need or need <= LARGE or need > _KEEP_AREA or not self._share.plenty:
             end = self._filled
             self.abandon()
             return self._walk(area, end, owned=True)
-        self._budget.used -= need
         self._filled, self._target = 0, need
         self._delivered = Batch(area[:need], 1, 0, owned=True)
         return self._delivered
@@ -251,6 +288,10 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 def _new_area(size: int) -> memoryview:
     """Memory for one large frame: from the heap, which is warm, or, beyond `_KEEP_AREA`, not there until filled."""
     return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
+
+
+def _no_memory() -> LimitExceededError:
+    return LimitExceededError("the relay has no memory left for unfinished messages of this host")
 
 
 def _too_long(length: int, limit: int) -> LimitExceededError:

@@ -11,6 +11,7 @@ Invariants:
 - An incarnation that is withdrawn takes its publications, services and grants with it.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 from appliance.channel.messages import (
@@ -26,6 +27,7 @@ from appliance.channel.messages import (
     ServicePlaced,
     ServiceWithdrawn,
 )
+from appliance.shares.pool import Standing
 
 Statement = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
 _Fact = tuple[str, ...]
@@ -33,12 +35,14 @@ _Fact = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Service:
-    """Where a service really is."""
+    """Where a service really is, and the node that offers it."""
 
     key: str
     service: str
     host: str
     port: int
+    node: str
+    """The name of the node that offers it."""
 
 
 class StatedTable:
@@ -46,6 +50,8 @@ class StatedTable:
 
     def __init__(self) -> None:
         self._facts: dict[_Fact, Message] = {}
+        self._hosts: Counter[str] = Counter()
+        self._clients: dict[_Fact, dict[str, None]] = {}  # names, by service and host
         self._restated: set[_Fact] | None = None
         self._epoch = 0
 
@@ -74,7 +80,11 @@ class StatedTable:
     def state(self, message: Statement) -> None:
         """Control says that something is so."""
         fact = _fact(message)
+        self._take_out(fact)
         self._facts[fact] = message
+        self._hosts[_host(fact, message)] += 1
+        if isinstance(message, ClientGranted):
+            self._clients.setdefault(fact[:4], {})[message.caller_id] = None
         if self._restated is not None:
             self._restated.add(fact)
 
@@ -85,6 +95,10 @@ class StatedTable:
                 self._forget(fact)
         else:
             self._forget(_withdrawn_fact(message))
+
+    def standing(self, host: str) -> Standing:
+        """A host with a node or a grant has a registration; what the policy says of others is not known here."""
+        return Standing.REGISTERED if host in self._hosts else Standing.STRANGER
 
     def node(self, key: str) -> NodePlaced | None:
         """The incarnation behind a key."""
@@ -101,20 +115,43 @@ class StatedTable:
         placed = self._facts.get(("service", key, service))
         if not isinstance(placed, ServicePlaced):
             return None
-        return Service(key, service, placed.host, placed.port)
+        node = self.node(key)
+        return Service(key, service, placed.host, placed.port, key if node is None else node.name)
 
     def may_subscribe(self, key: str, topic: str, host: str, caller_id: str) -> bool:
         """Whether this subscriber may have this topic of that incarnation."""
         return ("grant", key, topic, host, caller_id) in self._facts
 
-    def may_call(self, key: str, service: str, host: str) -> bool:
-        """Whether this host may call this service of that incarnation."""
-        return ("client", key, service, host) in self._facts
+    def grant(self, key: str, topic: str, host: str, caller_id: str) -> GrantInstalled | None:
+        """The grant of this subscriber for this topic of that incarnation."""
+        grant = self._facts.get(("grant", key, topic, host, caller_id))
+        return grant if isinstance(grant, GrantInstalled) else None
+
+    def may_call(self, key: str, service: str, host: str, caller_id: str) -> bool:
+        """Whether this client may call this service of that incarnation."""
+        return ("client", key, service, host, caller_id) in self._facts
+
+    def client_of(self, key: str, service: str, host: str) -> str | None:
+        """A name under which this host may call this service; None when it may not."""
+        return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
     def _forget(self, fact: _Fact) -> None:
-        self._facts.pop(fact, None)
+        self._take_out(fact)
         if self._restated is not None:
             self._restated.discard(fact)
+
+    def _take_out(self, fact: _Fact) -> None:
+        message = self._facts.pop(fact, None)
+        if message is not None:
+            host = _host(fact, message)
+            self._hosts[host] -= 1
+            if not self._hosts[host]:
+                del self._hosts[host]
+        if isinstance(message, ClientGranted):
+            names = self._clients[fact[:4]]
+            del names[fact[4]]
+            if not names:
+                del self._clients[fact[:4]]
 
 
 def _fact(message: Statement) -> _Fact:
@@ -127,8 +164,13 @@ def _fact(message: Statement) -> _Fact:
             return ("service", key, service)
         case GrantInstalled(key=key, topic=topic, host=host, caller_id=caller_id):
             return ("grant", key, topic, host, caller_id)
-        case ClientGranted(key=key, service=service, host=host):
-            return ("client", key, service, host)
+        case ClientGranted(key=key, service=service, host=host, caller_id=caller_id):
+            return ("client", key, service, host, caller_id)
+
+
+def _host(fact: _Fact, message: Message) -> str:
+    """The host that a statement is about; empty where it names none of its own."""
+    return message.host if isinstance(message, NodePlaced) else fact[3] if len(fact) > 3 else ""
 
 
 def _withdrawn_fact(message: Message) -> _Fact:
@@ -139,8 +181,8 @@ def _withdrawn_fact(message: Message) -> _Fact:
             return ("service", key, service)
         case GrantRevoked(key=key, topic=topic, host=host, caller_id=caller_id):
             return ("grant", key, topic, host, caller_id)
-        case ClientRevoked(key=key, service=service, host=host):
-            return ("client", key, service, host)
+        case ClientRevoked(key=key, service=service, host=host, caller_id=caller_id):
+            return ("client", key, service, host, caller_id)
     raise TypeError(f"{type(message).__name__} withdraws nothing")
 
 
@@ -154,6 +196,6 @@ def _withdrawal(fact: _Fact) -> Message:
             return ServiceWithdrawn(key, service)
         case ("grant", key, topic, host, caller_id):
             return GrantRevoked(key, topic, host, caller_id)
-        case ("client", key, service, host):
-            return ClientRevoked(key, service, host)
+        case ("client", key, service, host, caller_id):
+            return ClientRevoked(key, service, host, caller_id)
     raise TypeError(f"no withdrawal for {fact}")

@@ -17,7 +17,8 @@ from appliance.relay.counts import Counts
 from appliance.relay.frames import Batch
 from appliance.relay.observations import SHOWN
 from appliance.relay.passage import Passage
-from appliance.relay.telling import Place, Telling
+from appliance.relay.places import HEAD, Place, Sighting
+from appliance.relay.telling import Telling
 from appliance.rosmop.batch import Prepared, Walker
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
@@ -81,7 +82,7 @@ class Lane:
         middle = self._middle
         now = middle.now()
         if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:
-            return self._through(batch, Passage(batch, self._place, now))
+            return self._through(batch, Passage(batch, now))
         assert self._walker is not None  # noqa: S101  `_prepare` has found one
         assert self._prepared is not None  # noqa: S101  and prepared it
         assert self._counts is not None  # noqa: S101  and counts for it
@@ -90,13 +91,13 @@ class Lane:
             walked = self._walker.walk(batch.view, 0, 0, pieces, batch.stride, now, self._prepared)
         except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
             self._failed(error, self._walker, now)
-            return self._through(batch, Passage(batch, self._place, now))
+            return self._through(batch, Passage(batch, now))
         if not self._counts.begun:
             middle.telling.owe(self._counts)
         gone = self._counts.add(walked, now)
         if walked.position == len(batch.view) and not gone:
             return batch
-        passage = Passage(batch, self._place, now)
+        passage = Passage(batch, now)
         passage.pieces = pieces
         passage.walked(walked.position, walked.run, gone)
         return self._through(batch, passage)
@@ -169,6 +170,7 @@ class Lane:
         process, topic = monitors.process, place[1]
         shows = telling.shows(place)
         contexts = monitors.contexts(topic)
+        head = HEAD if monitors.stamped(topic) else 0
         looked = 0
         middle.look_again()
         spent = middle.spent - time.thread_time()
@@ -177,23 +179,24 @@ class Lane:
             following = first + _unpack_length(view, position)[0]
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
+            sighting = Sighting(passage, position, bytes(body[:head]))
             try:
                 outcome = (
                     process(topic, body, now) if middle.spent <= LONGEST else dropped(body, now, TOO_LONG)
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = dropped(body, now, telling.defect(error, place, now))
+                outcome = dropped(body, now, telling.defect(error, place, now, sighting))
             if outcome.events or outcome.log or outcome.faults or outcome.before:
-                telling.told(outcome, place)
+                telling.told(outcome, place, sighting)
             result = outcome.result
             if result == "dropped":
                 if outcome.overwritten:
                     outcome.restore(body)  # it is told as it was received
-                telling.dropped(outcome, place, body)
+                telling.dropped(outcome, place, body, sighting)
                 passage.cut(position, following)
             elif result == "changed":
                 if shows:
-                    telling.changed(outcome, place, before, len(body))
+                    telling.changed(outcome, place, before, len(body), sighting)
                     shows = telling.shows(place)
                 else:
                     telling.changed_again(outcome, place)
@@ -218,7 +221,7 @@ class Lane:
             following = position + 4 + _unpack_length(passage.view, position)[0]
             body = passage.view[position + 4 : following]
             outcome = dropped(body, passage.time, self._middle.blocked)
-            self._middle.telling.dropped(outcome, self._place, body)
+            self._middle.telling.dropped(outcome, self._place, body, Sighting(passage, position, b""))
             position = following
         return None
 

@@ -24,7 +24,7 @@ class Limits:
     header_seconds: float = 10.0
     """From accepting a connection to its whole header."""
 
-    grant_seconds: float = 0.5
+    grant_seconds: float = 2.0
     """A peer whose grant is not there yet is kept waiting so long before it is refused."""
 
     message_bytes: int = 256 * MIB
@@ -40,16 +40,19 @@ class Limits:
     """While *every* subscriber of a topic is behind, and for no longer, its publisher is not read."""
 
     memory_bytes: int = 1024 * MIB
-    """Queues and unfinished messages of the whole process."""
+    """Of the whole process: half for unfinished messages, a quarter each for queues and latched ones."""
 
     header_memory_bytes: int = 64 * MIB
-    """Headers that are not whole, or wait for a grant, of the whole process."""
+    """Headers that are not whole, or wait for a grant, of the whole process; the first 4 KiB of each do not count."""
 
     stall_seconds: float = 10.0
     """A connection in the middle of a large message, of which nothing comes (or goes) for so long, is cut."""
 
     connect_seconds: float = 3.0
-    """To connect to a publisher or a service, and from there to its header."""
+    """To connect to a publisher or a service, and from there to a publisher's header."""
+
+    service_seconds: float = 30.0
+    """From connecting to a service to its header: a server that is busy may let its clients wait, as in plain ROS."""
 
     answer_seconds: float = 10.0
     """For control's answer to `UpstreamWanted`; then it is asked again."""

@@ -1,51 +1,126 @@
-"""How much of the relay's memory each host may have waiting.
+"""How much of the relay's memory each host may have waiting, and how much of it latched.
 
-Invariant: a host that has a quarter of it gets no more while half of it is in use; so no host alone can take what the
-others need, and one that is alone has half.
+Four pools: what is not whole yet (frames, requests, replies), what waits for slow subscribers and clients, what is
+latched, and connection headers. Each is counted by host: what comes by its publisher's or service's (a request: its
+client's), what waits by that of whoever it waits for. A queue cannot take the memory that frames need.
+
+Invariants, besides those of `Pool`:
+
+1. A host gets no more while it holds as much as is free. So one that is alone has half, *n* that take all they can
+   have a part of *n* + 1 each, and as much is free for the next: no number of hosts takes everything.
+2. What is beyond a host's share is given up when something of that host moves, or at the next look (once a second);
+   latched messages, when a host that has less wants one kept. Nothing stays refused when what it was refused for is
+   gone.
 """
 
-from weakref import WeakValueDictionary
+from collections.abc import Callable
+from dataclasses import dataclass
 
-from appliance.relay.frames import MemoryBudget
+from appliance.relay.limits import Limits
+from appliance.shares.pool import Pool, Standing
+from appliance.shares.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, Share
 
 
 class HostShare:
-    """The bytes of one host that wait, counted in the budget of all."""
+    """The part of one host in a pool of bytes."""
 
-    def __init__(self, budget: MemoryBudget) -> None:
-        self._budget = budget
-        self._own = 0
+    __slots__ = ("_host", "_pool")
+
+    def __init__(self, pool: Pool[str], host: str) -> None:
+        self._pool = pool
+        self._host = host
 
     @property
     def used(self) -> int:
         """The bytes of this host."""
-        return self._own
+        return self._pool.held(self._host)
 
-    @used.setter
-    def used(self, size: int) -> None:
-        self._budget.used += size - self._own
-        self._own = size
+    def add(self, size: int) -> None:
+        """So many bytes more of this host are there; fewer, where `size` is below 0."""
+        if size > 0:
+            self._pool.charge(self._host, size)
+        elif size:
+            self._pool.give_back(self._host, -size)
+
+    def refusal(self, size: int = 1) -> str:
+        """Why so many bytes more of this host should not be kept; empty when they may be."""
+        pool = self._pool
+        held, left = pool.held(self._host) + size, pool.bounds.whole - pool.total - size
+        if held > left:
+            return (
+                f"{self._host} would have {held} {pool.what}, and {max(left, 0)} would be left for all others;"
+                " a host may have as many as are left"
+            )
+        return pool.refusal(self._host, size)
 
     @property
     def exhausted(self) -> bool:
         """Whether nothing more of this host should be kept."""
-        budget = self._budget
-        return budget.exhausted or (self._own * 4 >= budget.limit and budget.used * 2 >= budget.limit)
+        return bool(self.refusal())
+
+    @property
+    def plenty(self) -> bool:
+        """Whether less than half of the pool is in use."""
+        return self._pool.total * 2 < self._pool.bounds.whole
 
 
 class HostShares:
-    """The share of each host that has connections."""
+    """The share of each host in a pool."""
 
-    def __init__(self, budget: MemoryBudget) -> None:
-        self._budget = budget
-        self._shares: WeakValueDictionary[str, HostShare] = WeakValueDictionary()
+    def __init__(self, pool: Pool[str]) -> None:
+        self.pool = pool
 
     def of(self, host: str) -> HostShare:
-        """The share of the host with this address; kept by whoever counts in it."""
-        share = self._shares.get(host)
-        if share is None:
-            share = self._shares[host] = HostShare(self._budget)
-        return share
+        """The share of the host with this address."""
+        return HostShare(self.pool, host)
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """The shares of all hosts in the four pools."""
+
+    frames: HostShares
+    queues: HostShares
+    latched: HostShares
+    headers: HostShares
+
+    @classmethod
+    def of(cls, limits: Limits, standing: Callable[[str], Standing]) -> "Memory":
+        """The pools of one relay: `memory_bytes` is parted as the defaults of the table are."""
+        rows = (RELAY_FRAMES, RELAY_QUEUES, RELAY_LATCHED)
+        together = sum(row.bounds.whole for row in rows)
+
+        def shares(row: Share, whole: int) -> HostShares:
+            noun = row.thing.partition(" in ")[0]
+            bounds = row.bounds.sized(whole, row.bounds.host * whole // row.bounds.whole)
+            return HostShares(Pool(noun, bounds, standing))
+
+        frames, queues, latched = (
+            shares(row, row.bounds.whole * limits.memory_bytes // together) for row in rows
+        )
+        return cls(frames, queues, latched, shares(RELAY_HEADERS, limits.header_memory_bytes))
+
+    def held(self) -> dict[str, int]:
+        """The bytes in each pool."""
+        return {
+            "frames": self.frames.pool.total,
+            "queues": self.queues.pool.total,
+            "latched": self.latched.pool.total,
+            "headers": self.headers.pool.total,
+        }
+
+
+class Weight:
+    """What one connection holds of a share."""
+
+    def __init__(self, share: HostShare) -> None:
+        self.share = share
+        self._size = 0
+
+    def set(self, size: int) -> None:
+        """So many bytes now."""
+        self.share.add(size - self._size)
+        self._size = size
 
 
 class Stall:

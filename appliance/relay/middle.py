@@ -29,6 +29,7 @@ from appliance.relay.compiling import Compiler, Result
 from appliance.relay.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.observations import SHOWN, Observations
+from appliance.relay.places import NOWHERE, Place
 from appliance.relay.report import Reporter
 from appliance.relay.telling import Telling, refusal
 from appliance.rosmop.engine import MonitorSet
@@ -108,7 +109,7 @@ class Middle:
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
             )
         self.telling.keep([one.name for one in result.monitors], began, now)
-        self.telling.told(outcome, ("", ""))
+        self.telling.told(outcome, NOWHERE)
         anew = None if before is None or blocked else _topics(_replaced(before, result))
         self._taken(message, began, anew)
 
@@ -195,21 +196,21 @@ class Middle:
 
     # --- messages ---
 
-    def lane(self, key: str, topic: str) -> Lane:
-        """Where the messages of this topic of this incarnation go through."""
-        return Lane(self, (key, topic))
+    def lane(self, place: Place) -> Lane:
+        """Where the messages of this publication go through."""
+        return Lane(self, place)
 
     def look_again(self) -> None:
         """Something has happened that may change what lanes have prepared."""
         self.sight = object()
 
-    def request(self, key: str, service: str, body: bytes) -> Judged:
-        """What becomes of a request."""
-        return self._service(key, service, "request", body)
+    def request(self, place: Place, body: bytes) -> Judged:
+        """What becomes of a client's request to a service."""
+        return self._service(place, "request", body)
 
-    def response(self, key: str, service: str, body: bytes) -> Judged:
-        """What becomes of the reply to a request."""
-        return self._service(key, service, "response", body)
+    def response(self, place: Place, body: bytes) -> Judged:
+        """What becomes of a service's reply to a request."""
+        return self._service(place, "response", body)
 
     def tick(self) -> None:
         """A second is over."""
@@ -229,7 +230,8 @@ class Middle:
     def _rows(self) -> list[MonitorRow]:
         return self.telling.rows(self.monitors.monitors, self.now()) if self.monitors is not None else []
 
-    def _service(self, key: str, service: str, part: str, body: bytes) -> Judged:
+    def _service(self, place: Place, part: str, body: bytes) -> Judged:
+        service = place.resource
         if self.blocked:
             return Judged(b"", self.blocked)
         if self.monitors is None or self.monitors.service_type_of(service) is None:
@@ -237,7 +239,7 @@ class Middle:
         if self.spent > LONGEST:
             return Judged(b"", TOO_LONG)
         self.look_again()
-        place, now, began = (key, service), self.now(), time.thread_time()
+        now, began = self.now(), time.thread_time()
         view = memoryview(body)
         try:
             outcome = self.monitors.process_service(service, part, bytearray(body), now)
@@ -278,10 +280,10 @@ class Middle:
         began = time.thread_time()
         try:
             for outcome in self.monitors.advance(self.now()):
-                self.telling.told(outcome, ("", ""))
+                self.telling.told(outcome, NOWHERE)
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             now = self.now()
-            self.telling.defect(error, ("", ""), now)
+            self.telling.defect(error, NOWHERE, now)
             self._due = now + int(_AFTER_DEFECT * 1e9)
             self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
             return

@@ -4,6 +4,7 @@ Invariants:
 - Of each monitor, kind and distinction (the category of a verdict, the text of a log line) one event a second is
   told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
   happened is left out of the counts.
+- Each is told with who said the message: caller id and host, and which message of the publication it was.
 - Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
 - Counters follow the events that they count, and once a second those of which no event was told.
 - While there is no control, at most `_KEPT` events wait; how many more there were is said.
@@ -16,6 +17,7 @@ from typing import Any
 
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
 from appliance.relay.loop import Loop, Timer
+from appliance.relay.places import Place, Sighting
 from appliance.relay.report import Reporter
 
 SHOWN = 1024
@@ -31,7 +33,8 @@ _INTEGERS = range(-(1 << 63), 1 << 64)
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
-_Key = tuple[str, str, str, str, str]
+_Key = tuple[str, str, str, str, str, str]
+"""Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are folded together."""
 
 
 class Observations:
@@ -43,6 +46,7 @@ class Observations:
         self._rows = rows
         self._told: dict[_Key, int] = {}
         self._distinct: dict[tuple[str, str], int] = {}
+        self._callers: dict[_Key, str] = {}
         self._last: dict[_Key, int] = {}
         self._shared: dict[_Key, Mapping[str, Any]] = {}
         self._waiting: deque[MonitorEvent] = deque()
@@ -54,7 +58,7 @@ class Observations:
         self,
         kind: str,
         monitor: str,
-        place: tuple[str, str],
+        place: Place,
         time: int,
         text: str,
         *,
@@ -64,21 +68,35 @@ class Observations:
         before: bytes = b"",
         after: bytes = b"",
         size: int = 0,
+        sighting: Sighting | None = None,
     ) -> None:
-        """Something happened at `place` (key of the incarnation, topic or service).
+        """Something happened at `place`, to the message that was sighted.
 
         `shared` is the detail of the count of all that have this distinction.
         """
         text = text[:_TEXT]
         key = self._key(kind, monitor, place, distinction, shared)
+        self._said(key, place)
         if key in self._told:
             self._told[key] += 1
             self._last[key] = time
             return
         self._told[key] = 0
+        plain = _plain({**(detail or {}), **(sighting.detail() if sighting is not None else {})})
         self._add(
             MonitorEvent(
-                kind, monitor, place[0], place[1], time, text, _plain(detail or {}), before, after, size
+                kind,
+                monitor,
+                place.key,
+                place.resource,
+                time,
+                text,
+                plain,
+                before,
+                after,
+                size,
+                host=place.host,
+                caller_id=place.caller_id,
             )
         )
 
@@ -86,7 +104,7 @@ class Observations:
         self,
         kind: str,
         monitor: str,
-        place: tuple[str, str],
+        place: Place,
         time: int,
         count: int,
         *,
@@ -95,25 +113,21 @@ class Observations:
     ) -> None:
         """So many more happened at `place`, the last at this time; they are told as a count."""
         key = self._key(kind, monitor, place, distinction, shared)
+        self._said(key, place)
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
-    def told(self, kind: str, monitor: str, place: tuple[str, str]) -> bool:
+    def told(self, kind: str, monitor: str, place: Place) -> bool:
         """Whether this has been told in this second, so that the next is only counted."""
-        return (kind, monitor, *place, "") in self._told
+        return (kind, monitor, *place[:3], "") in self._told
 
     def tick(self) -> None:
         """A second is over: tell the counts, and the state of the monitors if it changed."""
         for key, count in self._told.items():
             if count:
-                kind, monitor, owner, resource, distinction = key
-                shared = _plain(self._shared.get(key, _NOTHING))
-                self._add(
-                    MonitorEvent(
-                        kind, monitor, owner, resource, self._last[key], distinction, shared, count=count
-                    )
-                )
+                self._add(self._count_of(key, count))
         self._told.clear()
+        self._callers.clear()
         self._last.clear()
         self._shared.clear()
         self._distinct.clear()
@@ -124,15 +138,35 @@ class Observations:
         self._counted = []
         self._flush()
 
+    def _count_of(self, key: _Key, count: int) -> MonitorEvent:
+        kind, monitor, owner, resource, host, distinction = key
+        return MonitorEvent(
+            kind,
+            monitor,
+            owner,
+            resource,
+            self._last[key],
+            distinction,
+            _plain(self._shared.get(key, _NOTHING)),
+            count=count,
+            host=host,
+            caller_id=self._callers[key],
+        )
+
+    def _said(self, key: _Key, place: Place) -> None:
+        """Who said it; of several clients of a host no one is named in the count."""
+        if self._callers.setdefault(key, place.caller_id) != place.caller_id:
+            self._callers[key] = ""
+
     def _key(
-        self, kind: str, monitor: str, place: tuple[str, str], distinction: str, shared: Mapping[str, Any]
+        self, kind: str, monitor: str, place: Place, distinction: str, shared: Mapping[str, Any]
     ) -> _Key:
-        key = (kind, monitor, *place, distinction[:_TEXT])
+        key = (kind, monitor, *place[:3], distinction[:_TEXT])
         if key in self._told or not distinction:
             return key
         known = self._distinct.get((kind, monitor), 0)
         if known >= _DISTINCT:
-            return (kind, monitor, *place, "")
+            return (kind, monitor, *place[:3], "")
         self._distinct[kind, monitor] = known + 1
         if shared:
             self._shared[key] = shared

@@ -21,10 +21,10 @@ _BEHIND = 1 << 20
 class Outbox:
     """Frames on their way to one subscriber."""
 
-    def __init__(self, limits: Limits, budget: Memory) -> None:
+    def __init__(self, limits: Limits, share: Memory) -> None:
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
-        self._budget = budget
+        self._share = share
         self._started: memoryview | None = None
         self._waiting: deque[tuple[memoryview, int]] = deque()
         self._messages = 0
@@ -49,12 +49,22 @@ class Outbox:
         return self._size >= _BEHIND or self.full
 
     @property
+    def begun(self) -> int:
+        """The bytes that are left of a message in the middle of being sent."""
+        return 0 if self._started is None else len(self._started)
+
+    @property
+    def short(self) -> bool:
+        """Whether it holds memory, and its host has no more of it."""
+        return bool(self) and self._share.exhausted
+
+    @property
     def full(self) -> bool:
-        """Whether another message would be one too many, for this queue or for the process."""
+        """Whether another message would be one too many, for this queue or for the host."""
         return (
             self._messages >= self._limit_messages
             or self._size >= self._limit_size
-            or (self._messages > 0 and self._budget.exhausted)
+            or (self._messages > 0 and self._share.exhausted)
         )
 
     def append(self, view: memoryview, messages: int, sent: int = 0) -> None:
@@ -73,7 +83,7 @@ class Outbox:
         """Something has been sent in part (a frame, or the connection header): `rest` goes before all
         else."""
         self._started = rest
-        self._budget.used += len(rest)
+        self._share.add(len(rest))
 
     def vectors(self) -> list[memoryview]:
         """What to send next, in order."""
@@ -88,7 +98,7 @@ class Outbox:
         """The socket took the first `sent` bytes of `vectors()`."""
         if self._started is not None:
             taken = min(sent, len(self._started))
-            self._budget.used -= taken
+            self._share.add(-taken)
             sent -= taken
             rest = self._started[taken:]
             self._started = rest if len(rest) else None
@@ -108,10 +118,10 @@ class Outbox:
             sent = 0
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the bounds, or all when the process is out of memory; how many."""
+        """Drop the oldest frames beyond the bounds, or all when the host has no memory left; how many."""
         before = self._messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
-        if self._budget.exhausted:
+        if self._share.exhausted:
             limit_messages = limit_size = 0
         while self._messages > limit_messages or self._size > limit_size:
             view, messages = self._waiting.popleft()
@@ -130,7 +140,7 @@ class Outbox:
 
     def clear(self) -> None:
         """Forget everything; the subscriber is gone."""
-        self._budget.used -= self._size + (0 if self._started is None else len(self._started))
+        self._share.add(-self._size - (0 if self._started is None else len(self._started)))
         self._started = None
         self._waiting.clear()
         self._messages = self._size = 0
@@ -138,4 +148,4 @@ class Outbox:
     def _count(self, messages: int, size: int) -> None:
         self._messages += messages
         self._size += size
-        self._budget.used += size
+        self._share.add(size)

@@ -61,6 +61,9 @@ class OwnPublisher:
     def announce(self, names: frozenset[str], type_name: str) -> None:
         """Nobody looks for subscribers by name."""
 
+    def give_again(self) -> None:
+        """What monitors publish is not latched."""
+
     def ask_again(self) -> None:
         """Nothing is asked of control."""
 

@@ -13,26 +13,35 @@ _MOST_TURNS = 64
 
 
 class Passage:
-    """A batch of an incarnation's topic (`place`), received at `time` (nanoseconds)."""
+    """A batch of a publication, received at `time` (nanoseconds)."""
 
     __slots__ = (
-        "_batch", "_gone", "_turns", "end", "messages", "pieces", "place", "position", "run", "stride", "time",
+        "_batch", "_gone", "_turns", "end", "messages", "pieces", "position", "run", "stride", "time",
         "view",
     )  # fmt: skip
 
-    def __init__(self, batch: Batch, place: tuple[str, str], time: int) -> None:
+    def __init__(self, batch: Batch, time: int) -> None:
         self._batch = batch
         self._gone = 0
         self.view = batch.view
         self.end = len(batch.view)
         self.messages = batch.messages
         self.stride = batch.stride
-        self.place = place
         self.time = time
         self.position = 0
         self.run = 0
         self.pieces: list[memoryview | bytes | bytearray] = []
         self._turns = 1
+
+    def number_at(self, position: int) -> int:
+        """The number of the message at a position among those of its publication."""
+        if self.stride:
+            return self._batch.first + position // self.stride
+        number, walked = self._batch.first, 0
+        while walked < position:
+            walked += 4 + _LENGTH.unpack_from(self.view, walked)[0]
+            number += 1
+        return number
 
     def turns(self) -> int:
         """How many messages to take one by one: the more, the longer none could be taken together."""

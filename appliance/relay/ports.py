@@ -1,19 +1,21 @@
 """The relay's listening sockets, one per incarnation, and the bounds on who may come in.
 
 Invariants:
-- There are never more than `connections` peers, nor more than `connections_per_host` of one host, in whatever
-  stage.
+- There are never more than `connections` peers, nor more than `connections_per_host` of one host, nor more of
+  strangers together than is theirs (`RELAY_CONNECTIONS` of the table of shares), in whatever stage. Who is within
+  his share and finds no room is let in if `make_room` finds somebody who has to go.
 - A flood of connections is accepted in slices, so that relayed messages go on between them; when the process
   has no descriptor left, listening pauses instead of spinning.
 """
 
 import errno
 import socket
-from collections import Counter
 from collections.abc import Callable
 
 from appliance.relay.limits import Limits
 from appliance.relay.loop import READ, Loop
+from appliance.shares.pool import Pool, Standing
+from appliance.shares.table import RELAY_CONNECTIONS
 
 _ACCEPTS_PER_TURN = 32
 _NO_DESCRIPTOR_PAUSE = 0.2
@@ -21,22 +23,29 @@ _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 
 
 class Ports:
-    """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room."""
+    """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room.
+
+    `standing(host)` is what the table knows of a host; `make_room(host)` ends a connection for one of this host and
+    says whether there was one.
+    """
 
     def __init__(
         self,
         loop: Loop,
         limits: Limits,
+        *,
+        standing: Callable[[str], Standing],
         arrived: Callable[[str, socket.socket, str], None],
         turned_away: Callable[[str, str, str], None],
+        make_room: Callable[[str], bool],
     ) -> None:
         self._loop = loop
-        self._limits = limits
         self._arrived = arrived
         self._turned_away = turned_away
         self._listening: dict[str, socket.socket] = {}
-        self._hosts: Counter[str] = Counter()
-        self._total = 0
+        self._make_room = make_room
+        bounds = RELAY_CONNECTIONS.bounds.sized(limits.connections, limits.connections_per_host)
+        self.connected: Pool[str] = Pool("connections to the relay", bounds, standing)
 
     def open(self, key: str, descriptor: int) -> None:
         """Listen on this socket for the incarnation; an earlier socket of it is closed after the new one
@@ -62,10 +71,7 @@ class Ports:
 
     def left(self, host: str) -> None:
         """A peer that arrived is gone."""
-        self._total -= 1
-        self._hosts[host] -= 1
-        if not self._hosts[host]:
-            del self._hosts[host]
+        self.connected.give_back(host)
 
     def _watch(self, key: str, sock: socket.socket) -> None:
         self._loop.watch(sock.fileno(), READ, lambda _events: self._accept(key, sock))
@@ -82,13 +88,11 @@ class Ports:
                     return
                 continue  # this peer is gone already; the next may be well
             host = address[0].removeprefix("::ffff:")
-            reason = self._no_room(host)
+            reason = self._take(host)
             if reason:
                 sock.close()
                 self._turned_away(key, host, reason)
             else:
-                self._total += 1
-                self._hosts[host] += 1
                 self._arrived(key, sock, host)
 
     def _pause(self, key: str, listening: socket.socket) -> None:
@@ -100,9 +104,10 @@ class Ports:
 
         self._loop.after(_NO_DESCRIPTOR_PAUSE, resume)
 
-    def _no_room(self, host: str) -> str:
-        if self._total >= self._limits.connections:
-            return f"the relay has {self._total} connections, which is its limit"
-        if self._hosts[host] >= self._limits.connections_per_host:
-            return f"{host} has {self._hosts[host]} connections to the relay, which is the limit for one host"
-        return ""
+    def _take(self, host: str) -> str:
+        """Count one more of this host; why not, when there is no room and nobody makes it."""
+        pool = self.connected
+        reason = pool.take(host)
+        while reason and pool.held(host) < pool.bounds.host and self._make_room(host):
+            reason = pool.take(host)
+        return reason

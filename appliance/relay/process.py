@@ -8,6 +8,7 @@ import contextlib
 import logging
 import resource
 import socket
+from dataclasses import replace
 from typing import Any
 
 from appliance.channel.channel import Channel
@@ -31,7 +32,8 @@ class RelayProcess:
 
     def __init__(self, lifeline: socket.socket, index: int, limits: Limits) -> None:
         self._index = index
-        self._limits = limits
+        self._descriptors = _raise_descriptor_limit(descriptors_for(limits.connections))
+        self._limits = limits = fitted(limits, self._descriptors)
         self._loop = Loop()
         self._engine = Engine(self._loop, limits)
         self._lifeline = Link(self._loop, Channel(lifeline, Lifeline), self._obey, self._supervisor_gone)
@@ -43,7 +45,7 @@ class RelayProcess:
             "index": self._index,
             "congestion": congestion_control(),
             "connections": self._limits.connections,
-            "descriptors": _raise_descriptor_limit(2 * self._limits.connections + _DESCRIPTORS_BESIDE),
+            "descriptors": self._descriptors,
         }
         level = logging.INFO if detail["congestion"] == "cubic" else logging.WARNING
         said = ", ".join(f"{name} {value}" for name, value in detail.items() if name != "index")
@@ -80,6 +82,21 @@ class RelayProcess:
         logging.getLogger(__name__).warning("relay %s: no control (%s); grants stay", self._index, reason)
         self._control = None
         self._engine.attach(None)
+
+
+def descriptors_for(connections: int) -> int:
+    """How many descriptors a relay needs: a client's connection may have one to its service or publisher."""
+    return 2 * connections + _DESCRIPTORS_BESIDE
+
+
+def fitted(limits: Limits, descriptors: int) -> Limits:
+    """The limits, with no more connections than there are descriptors for: one too many is told so, and none hangs."""
+    possible = max(1, (descriptors - _DESCRIPTORS_BESIDE) // 2)
+    if possible >= limits.connections:
+        return limits
+    return replace(
+        limits, connections=possible, connections_per_host=min(limits.connections_per_host, possible)
+    )
 
 
 def _raise_descriptor_limit(wanted: int) -> int:

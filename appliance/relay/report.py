@@ -7,23 +7,30 @@ Invariants:
 - `TrafficReported` is sent at most once per `report_every`.
 - Equal refusals within that time are one message with a count, and there are at most `refusals` different
   ones; what a flood of strangers sends cannot grow the relay or fill the link.
+- What limits dropped is counted for at most `_KEPT` parts; beyond, for all others together.
 - Of the connections that end without a link, `_KEPT` are kept to be told; the others are counted.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import (
     ConnectionClosed,
     ConnectionOpened,
     ConnectionRefused,
+    LimitedRow,
     Message,
+    MessagesLimited,
     TopicTraffic,
     TrafficReported,
 )
+from appliance.relay.flow import Part
 from appliance.relay.limits import Limits
 from appliance.relay.links import Link
 
-_Refusal = tuple[str, str, str, str, str]
+_Refusal = tuple[str, str, str, str, str, str]
+_Limited = tuple[str, str, Part, str, str]
+"""Key of the incarnation, topic, whose limit, host and caller id of the publisher or subscriber."""
+
 _TEXT = 300
 _KEPT = 1000
 
@@ -40,6 +47,8 @@ class Reporter:
         self._ended: list[tuple[ConnectionOpened, str]] = []  # without a link
         self._unrecorded = 0
         self._silent = 0  # ticks without a link
+        self._memory: dict[str, int] = {}  # as told last
+        self._limited: dict[_Limited, list[int]] = {}
 
     def attach(self, link: Link | None) -> None:
         """Speak to this control from now on."""
@@ -58,6 +67,7 @@ class Reporter:
             self.send(ConnectionClosed(opened.number, reason))
         for message in list(self._open.values()):
             self.send(message)
+        self._memory = {}
 
     def send(self, message: Message) -> None:
         """Tell control, if there is one."""
@@ -84,20 +94,35 @@ class Reporter:
         else:
             self._unrecorded += 1
 
-    def refused(self, key: str, resource: str, host: str, caller_id: str, reason: str) -> None:
-        """A connection is refused: told at once the first time, then counted until the next `tick`."""
-        refusal = (key, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
+    def refused(self, key: str, asked: tuple[str, str], host: str, caller_id: str, reason: str) -> None:
+        """A connection is refused: told at once the first time, then counted until the next `tick`.
+
+        `asked` is the kind and the name of what its header asked for.
+        """
+        kind, resource = asked
+        refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
         if refusal in self._refused:
             self._refused[refusal] += 1
         elif len(self._refused) < self._limits.refusals:
             self._refused[refusal] = int(self._link is None)
             self.send(ConnectionRefused(*refusal, 1))
         else:
-            folded = ("", "", "", "", "further refusals of other peers, not told one by one")
+            folded = ("", "", "", "", "", "further refusals of other peers, not told one by one")
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
-    def tick(self, traffic: Callable[[], list[TopicTraffic]]) -> None:
-        """Send the counts since the last tick; without a link they stay (`traffic` takes them) for the next."""
+    def limited(self, what: _Limited, messages: int, size: int) -> None:
+        """A limit dropped messages: told with the next tick, one row for each part that was limited."""
+        if what not in self._limited and len(self._limited) >= _KEPT:
+            what = ("", "", what[2], "", "")
+        row = self._limited.setdefault(what, [0, 0])
+        row[0] += messages
+        row[1] += size
+
+    def tick(self, traffic: Callable[[], list[TopicTraffic]], memory: Mapping[str, int]) -> None:
+        """Send the counts since the last tick; without a link they stay (`traffic` takes them) for the next.
+
+        `memory` has the bytes that are held now.
+        """
         if self._link is None:
             self._silent += 1
             return
@@ -106,7 +131,11 @@ class Reporter:
                 self.send(ConnectionRefused(*refusal, count))
         self._refused.clear()
         rows = traffic()
-        if rows or self._unrecorded:
+        if rows or self._unrecorded or memory != self._memory:
+            self._memory = dict(memory)
             over = (1 + self._silent) * self._limits.report_every
-            self.send(TrafficReported(rows, over, self._unrecorded))
+            self.send(TrafficReported(rows, over, self._unrecorded, self._memory))
+        if self._limited:
+            self.send(MessagesLimited([LimitedRow(*what, *row) for what, row in self._limited.items()]))
+            self._limited.clear()
         self._silent = self._unrecorded = 0

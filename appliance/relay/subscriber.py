@@ -10,8 +10,10 @@ import socket
 from collections.abc import Callable, Mapping
 
 from appliance.relay.context import RelayContext
-from appliance.relay.frames import Batch
+from appliance.relay.flow import Flow
+from appliance.relay.frames import LARGE, Batch
 from appliance.relay.loop import READ, WRITE
+from appliance.relay.memory import Stall
 from appliance.relay.outbox import Outbox
 from appliance.relay.topic import RelayedTopic
 from appliance.ros.tcpros import encode_header
@@ -40,6 +42,8 @@ class Subscriber:
         self.topic = topic
         self.host = host
         self.caller_id = fields["callerid"]
+        self.flow: Flow | None = None
+        self.missed = False
         self.behind_since: float | None = None
         self._loop = context.loop
         self._socket = sock
@@ -48,7 +52,9 @@ class Subscriber:
         self._reporter = context.reporter
         self._refuse = refuse
         self._ended = ended
-        self._outbox = Outbox(context.limits, context.shares.of(host))
+        self._share = context.memory.queues.of(host)
+        self._outbox = Outbox(context.limits, self._share)
+        self._stall = Stall(context.limits.stall_seconds)
         self._number = 0
         self._live = True
         self._loop.watch(sock.fileno(), READ, self._ready)
@@ -78,26 +84,55 @@ class Subscriber:
             self._loop.change(self._socket.fileno(), READ | WRITE)
         return True
 
-    def deliver(self, batch: Batch) -> None:
-        """Send the frames, or queue what the socket does not take."""
+    def deliver(self, batch: Batch) -> int:
+        """Send the frames, or queue what the socket does not take; how many it does not get.
+
+        Large ones are not begun while its host has no memory for what the socket may leave.
+        """
+        if self.flow is not None:
+            passing = self._limited(self.flow, batch)
+            if passing is None:
+                return 0
+            batch = passing
         outbox = self._outbox
         if outbox:
             outbox.append(batch.keep(), batch.messages)
         else:
             view = batch.view
+            if len(view) > LARGE and self._share.exhausted:
+                return batch.messages
             try:
                 sent = self._send(view)
             except BlockingIOError:
                 sent = 0
             except OSError as error:
                 self._close(f"cannot be written to: {error.strerror}")
-                return
+                return 0
             if sent == len(view):
-                return
+                return 0
             outbox.append(batch.keep(), batch.messages, sent)
             self._loop.change(self._socket.fileno(), READ | WRITE)
         if self.behind_since is None and outbox.behind:
             self.behind_since = self._loop.clock()
+        return 0
+
+    def _limited(self, flow: Flow, batch: Batch) -> Batch | None:
+        """The first messages, as many as its limit lets pass; the others are told."""
+        count = flow.room(batch, batch.messages, self._loop.clock())
+        self.missed = count < batch.messages
+        if self.missed:
+            part = batch.head(count)
+            topic, gone = self.topic, len(batch.view) - len(part.view)
+            self._reporter.limited(
+                (topic.key, topic.topic, "subscriber", self.host, self.caller_id),
+                batch.messages - count,
+                gone,
+            )
+            batch = part
+        if not count:
+            return None
+        flow.take(batch)
+        return batch
 
     @property
     def full(self) -> bool:
@@ -107,6 +142,14 @@ class Subscriber:
     def trim(self) -> int:
         """Drop the oldest messages beyond the bounds; how many."""
         return self._outbox.trim()
+
+    def look(self) -> None:
+        """A second is over: beyond its host's share, one that takes nothing of a message that has begun is cut."""
+        begun = self._outbox.begun if self._outbox.short else 0
+        if self._stall.seen(begun, self._loop.clock()):
+            self._close(
+                "its host has no memory left in the relay, and it does not take the rest of a message"
+            )
 
     def cut(self, reason: str) -> None:
         """Close the connection: what it stands on is gone."""
@@ -147,7 +190,8 @@ class Subscriber:
         reason = (
             "sent data after its header; a connection is for one topic, ask for another on another connection"
         )
-        self._reporter.refused(self.topic.key, self.topic.topic, self.host, self.caller_id, reason)
+        asked = ("topic", self.topic.topic)
+        self._reporter.refused(self.topic.key, asked, self.host, self.caller_id, reason)
         self._close(reason)
 
     def _close(self, reason: str) -> None:

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from appliance.channel.messages import MonitorRow
 from appliance.relay.counts import Counts
 from appliance.relay.observations import SHOWN, Observations
+from appliance.relay.places import NOWHERE, Place, Sighting
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import Published
-
-Place = tuple[str, str]
-"""Where something happened: the key of an incarnation, and its topic or service."""
 
 
 @dataclass(slots=True)
@@ -58,15 +56,15 @@ class Telling:
         """There are counts to be taken when the second is over."""
         self._owed.append(counts)
 
-    def told(self, outcome: Outcome, place: Place) -> None:
+    def told(self, outcome: Outcome, place: Place, sighting: Sighting | None = None) -> None:
         """Tell what an outcome has besides its result, and publish what it publishes."""
         for earlier in outcome.before:
-            self.told(earlier, ("", ""))
+            self.told(earlier, NOWHERE)
         if outcome.events:
             events = tuple(outcome.events)
             self._happened[events] = self._happened.get(events, 0) + 1
-        self._verdicts(outcome, place)
-        self._faults(outcome, place)
+        self._verdicts(outcome, place, sighting)
+        self._faults(outcome, place, sighting)
         for line in outcome.log:
             self._observations.note(
                 "log",
@@ -76,15 +74,17 @@ class Telling:
                 line.text,
                 distinction=f"{line.level} {line.text}",
                 detail={"level": line.level},
+                sighting=sighting,
             )
         for published in outcome.published:
             self._observations.note(
                 "publish",
                 published.monitor,
-                ("", published.topic),
+                place._replace(key="", resource=published.topic),
                 outcome.time,
                 f"{published.type} on {published.topic}",
-                detail={"type": published.type, "events": list(outcome.events)},
+                detail={"type": published.type, "events": list(outcome.events), "because_of": place.resource},
+                sighting=sighting,
                 after=published.data[:SHOWN],
                 size=len(published.data),
             )
@@ -95,7 +95,9 @@ class Telling:
         key = (tuple(outcome.changed_by), place)
         self._again[key] = self._again.get(key, 0) + 1
 
-    def changed(self, outcome: Outcome, place: Place, before: bytes, size: int) -> None:
+    def changed(
+        self, outcome: Outcome, place: Place, before: bytes, size: int, sighting: Sighting | None = None
+    ) -> None:
         """Tell a change with the bytes before and after."""
         self._shown.add(place)
         monitors = self._count_change(outcome.changed_by, 1)
@@ -112,9 +114,12 @@ class Telling:
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
+            sighting=sighting,
         )
 
-    def dropped(self, outcome: Outcome, place: Place, body: memoryview) -> None:
+    def dropped(
+        self, outcome: Outcome, place: Place, body: memoryview, sighting: Sighting | None = None
+    ) -> None:
         """Tell a drop."""
         self._counter(outcome.dropped_by).drops += 1
         self._observations.note(
@@ -126,12 +131,15 @@ class Telling:
             detail={"events": list(outcome.events)},
             before=bytes(body[:SHOWN]),
             size=len(body),
+            sighting=sighting,
         )
 
-    def defect(self, error: Exception, place: Place, time: int) -> str:
+    def defect(self, error: Exception, place: Place, time: int, sighting: Sighting | None = None) -> str:
         """Tell an exception that no action of a monitor explains; its words."""
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
-        self._observations.note("fault", "", place, time, text, distinction=type(error).__name__)
+        self._observations.note(
+            "fault", "", place, time, text, distinction=type(error).__name__, sighting=sighting
+        )
         return text
 
     def tick(self, time: int) -> None:
@@ -201,7 +209,7 @@ class Telling:
             monitor.faults,
         )
 
-    def _verdicts(self, outcome: Outcome, place: Place) -> None:
+    def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
         for verdict in outcome.verdicts:
             self._counter(verdict.monitor).verdicts += 1
             name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic})"
@@ -220,9 +228,10 @@ class Telling:
                 },
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
+                sighting=sighting,
             )
 
-    def _faults(self, outcome: Outcome, place: Place) -> None:
+    def _faults(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
         for fault in outcome.faults:
             where = fault.position
             self._observations.note(
@@ -242,6 +251,7 @@ class Telling:
                 },
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
+                sighting=sighting,
             )
 
     def _counter(self, monitor: str) -> _Counters:

@@ -14,7 +14,10 @@ the withdrawal.
 
 A topic that monitors want has its upstream without any subscriber, too. What they leave of a batch (`middle`) is
 what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
-(`published`). What comes while nobody is served is kept for a moment (`recent`).
+(`published`). What a new publisher says first is kept for those that are on their way (`first_words`).
+
+A latched message that the publisher's host has no memory for is passed on and not kept (`latch`). Who comes later
+gets it from the publisher, which is connected to anew when there is room again; the others get it once more.
 
 When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
 most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
@@ -25,10 +28,13 @@ has caught up completely, and it never delays the others, since one that keeps u
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from appliance.channel.messages import TopicTraffic
+from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.relay.delays import Delays
-from appliance.relay.frames import Batch, MemoryBudget
-from appliance.relay.recent import Recent
+from appliance.relay.first_words import APPEARED, FirstWords
+from appliance.relay.flow import Part, PublicationFlow
+from appliance.relay.frames import Batch
+from appliance.relay.headers import to_subscriber
+from appliance.relay.memory import HostShare
 
 
 class Member(Protocol):
@@ -37,14 +43,17 @@ class Member(Protocol):
     caller_id: str
     """Who it says it is."""
 
+    missed: bool
+    """Whether its limit kept the last message from it."""
+
     behind_since: float | None
     """When so much waited for it first that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or refuse if the types differ; whether it is served now."""
 
-    def deliver(self, batch: Batch) -> None:
-        """Send the batch or queue it."""
+    def deliver(self, batch: Batch) -> int:
+        """Send the batch or queue it; how many messages it does not get."""
 
     @property
     def full(self) -> bool:
@@ -52,6 +61,9 @@ class Member(Protocol):
 
     def trim(self) -> int:
         """Drop what is beyond the bounds, oldest first; how many messages."""
+
+    def look(self) -> None:
+        """A second is over."""
 
     def cut(self, reason: str) -> None:
         """Close its connection."""
@@ -75,43 +87,63 @@ class Upstream(Protocol):
     def announce(self, names: frozenset[str], type_name: str) -> None:
         """These are served now, of a topic of this type."""
 
+    def give_again(self) -> None:
+        """Have a latching publisher give its message again."""
+
 
 Through = Callable[[Batch], Batch | None]
 """Monitors: the frames that go on, as they leave them; None when none does."""
 
 
 class RelayedTopic:
-    """A topic of an incarnation with its subscribers."""
+    """A topic of an incarnation at `host`, with its subscribers; `share` counts what is kept of it.
+
+    `fresh`: the publisher has just appeared. `limited(part, messages, size)` hears what limits
+    dropped; `flow` is where they are set. `make_room(size)` tries to have others give up so much of
+    theirs, `refused(message)` is called when a latched message is not kept.
+    """
 
     def __init__(
         self,
         key: str,
         topic: str,
         name: str,
+        host: str,
         *,
         grace: float,
         clock: Callable[[], float],
-        budget: MemoryBudget,
+        share: HostShare,
+        fresh: bool,
+        limited: Callable[[Part, int, int], None],
+        make_room: Callable[[int], None],
+        refused: Callable[[LatchRefused], None],
     ) -> None:
         self.key = key
         self.topic = topic
+        self.host = host
+        self.name = name
         self.upstream: Upstream | None = None
-        self._name = name
         self._grace = grace
         self._clock = clock
-        self._budget = budget
+        self._share = share
+        self.flow = PublicationFlow(share, limited)
+        self._make_room = make_room
+        self._refused = refused
+        self._unkept: LatchRefused | None = None
+        self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
         self._waiting: tuple[Member, ...] = ()
         self._served: tuple[Member, ...] = ()
         self._latched: Batch | None = None
         self._latching = False
         self._withheld = False
-        self._recent: Recent | None = None
+        self._first_words: FirstWords | None = None
         self._paused = False
         self._connected = False
         self._through: Through | None = None
         self._wanted = False
         self._reported = True
+        self._next = 1
         self._messages = self._bytes = self._dropped = 0
         self._delays = Delays()
 
@@ -136,9 +168,6 @@ class RelayedTopic:
         self._announce()
         self._reported = False
         self._forget_header()
-        if not self.members:
-            self._drop_recent()
-            self._settle_recent()
         self.relieve()
         if not self.members and not self._wanted and self.upstream is not None:
             self.upstream.spare()
@@ -149,7 +178,6 @@ class RelayedTopic:
         if wanted == self._wanted:
             return
         self._wanted = wanted
-        self._settle_recent()
         if self.upstream is None:
             return
         if wanted:
@@ -159,11 +187,11 @@ class RelayedTopic:
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
         """The publisher has answered with its header."""
-        header = {**header, "callerid": self._name, "topic": self.topic}
+        header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
         self._connected = True
-        self._settle_recent()
+        self._listen()
         if before is not None and _identity(before) != _identity(header):
             for member in self._served:
                 member.cut("the publisher has come back with another type")
@@ -182,10 +210,11 @@ class RelayedTopic:
     def upstream_closed(self) -> None:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
         self._latch(None)
+        self.flow.forget()
         self._withheld = False
         self._paused = False
         self._connected = False
-        self._settle_recent()
+        self._forget_first_words()
         self._forget_header()
 
     def received(self, batch: Batch, since: float) -> None:
@@ -193,6 +222,16 @@ class RelayedTopic:
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False
+        batch.first = self._next
+        self._next += batch.messages
+        if self.flow:
+            passing = self.flow.passing(batch, self._clock(), latching=self._latching)
+            if passing is None:
+                return
+            batch = passing
+        self._admit(batch, since)
+
+    def _admit(self, batch: Batch, since: float) -> None:
         left = batch if self._through is None else self._through(batch)
         if left is None:
             self._withheld = True
@@ -210,12 +249,14 @@ class RelayedTopic:
 
     def _pass_on(self, batch: Batch) -> None:
         if self._latching:
-            self._latch(batch.keep_last())
-        if self._recent is not None:
-            self._remember(self._recent, batch)
+            self._latch(batch)
+        if self._first_words is not None:
+            now = self._clock()
+            if self._first_words.over(now) or not self._first_words.add(batch, now):
+                self._forget_first_words()
         congested = False
         for member in self._served:
-            member.deliver(batch)
+            self._dropped += member.deliver(batch)
             congested = congested or member.behind_since is not None
         if congested:
             self._pause_or_trim()
@@ -233,9 +274,39 @@ class RelayedTopic:
             member.cut(reason)
 
     def tidy(self) -> None:
-        """A second is over: what was kept for a moment is given up."""
-        if self._recent is not None:
-            self._recent.forget_old(self._clock())
+        """A second is over: what was kept for a moment is given up, and what is beyond the share of a subscriber.
+
+        What a limit kept back of a latching publisher goes on when it may.
+        """
+        now = self._clock()
+        waiting = self.flow.later(now)
+        if waiting is not None:
+            self._admit(waiting, now)
+        if self._first_words is not None and self._first_words.over(now):
+            self._forget_first_words()
+        for member in self._served:
+            if self._latched is not None and member.missed:
+                self._dropped += member.deliver(self._latched)
+            if member.full:
+                self._dropped += member.trim()
+                self._reported = False
+            member.look()
+
+    @property
+    def latched(self) -> int:
+        """The bytes of the latched message that is kept."""
+        return 0 if self._latched is None else len(self._latched.view)
+
+    def give_up_latched(self) -> None:
+        """Make room for a host that has less."""
+        size = self.latched
+        self._latch(None)
+        self._keep_not(size)
+
+    def repeat(self) -> None:
+        """There is a new control: it is told what is not kept."""
+        if self._unkept is not None:
+            self._refused(self._unkept)
 
     def traffic(self) -> TopicTraffic | None:
         """The counters since the last call; None when nothing has changed."""
@@ -261,31 +332,26 @@ class RelayedTopic:
         self._announce()
         self._reported = False
         if self._latched is not None:
-            member.deliver(self._latched)
-        elif self._recent is not None:
-            for batch in self._recent.give(member.caller_id, self._clock()):
-                member.deliver(batch)
+            self._dropped += member.deliver(self._latched)
+        elif self._unkept is not None:
+            if self.upstream is not None and not self._share.refusal(self._unkept.size):
+                self.upstream.give_again()
+        elif self._first_words is not None and not self._first_words.over(self._clock()):
+            for batch in self._first_words.give(member.caller_id):
+                self._dropped += member.deliver(batch)
         self.relieve()
 
-    def _settle_recent(self) -> None:
-        """Begin to keep what comes, or stop: there is a publisher that has nobody but a monitor."""
-        if self._recent is None:
-            if self._connected and self._wanted and not self._latching and not self.members:
-                self._recent = Recent(self._budget)
-        elif not self._connected or (not self._wanted and not self._served):
-            self._drop_recent()
-
-    def _remember(self, recent: Recent, batch: Batch) -> None:
+    def _listen(self) -> None:
+        """Begin to keep what a publisher says first that has just appeared and has nobody but a monitor."""
         now = self._clock()
-        if recent.over(now):
-            self._drop_recent()
-        else:
-            recent.add(batch, now)
+        if now <= self._fresh_until and self._wanted and not self._latching and not self.members:
+            self._first_words = FirstWords(self._share, now)
+        self._fresh_until = now - 1  # the next connection is not its first
 
-    def _drop_recent(self) -> None:
-        if self._recent is not None:
-            self._recent.clear()
-            self._recent = None
+    def _forget_first_words(self) -> None:
+        if self._first_words is not None:
+            self._first_words.forget()
+            self._first_words = None
 
     def _forget_header(self) -> None:
         """Without a connection the header is only good for those who have been given it."""
@@ -299,12 +365,27 @@ class RelayedTopic:
             self.upstream.announce(names, self._header.get("type", ""))
 
     def _latch(self, batch: Batch | None) -> None:
-        """Remember the last message; it counts as memory in use."""
+        """Remember the last message of a batch, if its host has the memory for it; None forgets."""
         if self._latched is not None:
-            self._budget.used -= len(self._latched.view)
-        if batch is not None:
-            self._budget.used += len(batch.view)
-        self._latched = batch
+            self._share.add(-len(self._latched.view))
+            self._latched = None
+        if batch is None:
+            self._unkept = None
+            return
+        size = len(batch.view) - batch.find_last()
+        if self._share.refusal(size):
+            self._make_room(size)
+        if self._share.refusal(size):
+            self._keep_not(size)
+        else:
+            self._unkept = None
+            self._share.add(size)
+            self._latched = batch.keep_last()
+
+    def _keep_not(self, size: int) -> None:
+        before, self._unkept = self._unkept, LatchRefused(self.key, self.topic, size)
+        if before is None:
+            self._refused(self._unkept)
 
     def _pause_or_trim(self) -> None:
         """Let the subscribers catch up if all are behind and have not been for long; else drop for the full."""

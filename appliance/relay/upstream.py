@@ -14,9 +14,10 @@ from collections.abc import Callable
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay import Violation
 from appliance.relay.context import RelayContext
-from appliance.relay.frames import FrameReceiver
+from appliance.relay.frames import SMALL, FrameReceiver
+from appliance.relay.headers import size_of
 from appliance.relay.loop import READ, Timer
-from appliance.relay.memory import Stall
+from appliance.relay.memory import Stall, Weight
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.sockets import Stream, begin_connect
 from appliance.relay.topic import RelayedTopic
@@ -41,8 +42,10 @@ class Publisher:
         self._topic = topic
         self._reporter = context.reporter
         self._limits = limits = context.limits
-        self._receiver = FrameReceiver(context.scratch, limits.message_bytes, context.budget)
-        self._shares = context.shares
+        self._weight = Weight(context.memory.frames.of(topic.host))
+        self._receiver = FrameReceiver(
+            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
+        )
         self._stall = Stall(limits.stall_seconds)
         self._buffer = self._receiver.buffer
         self._received = self._receiver.received
@@ -95,7 +98,6 @@ class Publisher:
             return
         self._asked = False
         self._address = (host, port)
-        self._receiver.charge(self._shares.of(host))
         try:
             sock = begin_connect(host, port)
         except (OSError, OverflowError) as error:
@@ -137,6 +139,7 @@ class Publisher:
 
     def look(self) -> None:
         """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
+        self._receiver.rest()
         held = self._receiver.unfinished if self._pause is None else 0
         if self._stall.seen(held, self._clock()):
             self._lose(
@@ -173,7 +176,8 @@ class Publisher:
             return
         if header is None:
             return
-        refusal = _refusal(header)
+        size = size_of(header)
+        refusal = _refusal(header) or self._no_room(size)
         if refusal is not None:
             self._lose(*refusal)
             return
@@ -181,11 +185,17 @@ class Publisher:
         if reason:
             self._object(reason)
             return
+        self._weight.set(size)
         self._header = header
         self._flow(header, self._stream.take(), self._parser.rest)
 
-    def connect_anew(self) -> None:
-        """Have a latching publisher give its message again."""
+    def _no_room(self, size: int) -> tuple[str, Violation] | None:
+        if size > SMALL and self._weight.share.refusal(size):
+            return "the relay has no memory left for headers of this host", "limit exceeded"
+        return None
+
+    def give_again(self) -> None:
+        """Have a latching publisher give its message again, on a new connection."""
         if self._socket is not None and self._wanted:
             self._drop_connection()
             self.ask()
@@ -284,6 +294,7 @@ class Publisher:
                 self._failures = 0
             self._loop.discard(self._socket)
             self._socket = None
+            self._weight.set(0)
             self._receiver.abandon()
             self._topic.upstream_closed()
 

@@ -2,7 +2,7 @@
 
 Invariants:
 - A peer has `header_seconds` and `header_bytes` for its header; until then it costs one socket and what it
-  has sent, which is counted: beyond `header_memory_bytes` (a host's share of it) it is turned away.
+  has sent, which is counted (`anteroom`): without room for that it is turned away.
 - A refused peer gets a TCPROS header with `error=<reason>` as from any publisher or service, and `farewell`
   seconds to read it: its connection is shut for writing first, because closing over unread data would reset
   it and destroy the reason on its way.
@@ -11,6 +11,7 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
+from appliance.relay.anteroom import Anteroom
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import Loop
 from appliance.relay.sockets import Stream
@@ -32,6 +33,7 @@ class Visitor:
         key: str,
         host: str,
         *,
+        anteroom: Anteroom,
         introduced: Callable[["Visitor"], None],
         failed: Callable[["Visitor", str], None],
     ) -> None:
@@ -43,16 +45,17 @@ class Visitor:
         self._limits = limits = context.limits
         self._introduced = introduced
         self._failed = failed
-        self._share = context.headers.of(host)
-        self._weight = 0
+        self._anteroom = anteroom
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
         self._stream = Stream(context.loop, sock, self._received, self._broken)
+        self._received_bytes = 0
+        anteroom.enter(self, host)
 
     def take(self) -> socket.socket:
         """Give the socket to whoever serves it."""
         self._timer.cancel()
-        self._weigh(0)
+        self._anteroom.leave(self)
         return self._stream.take()
 
     def wait(self, seconds: float, callback: Callable[[], None]) -> None:
@@ -64,16 +67,21 @@ class Visitor:
     def close(self) -> None:
         """Cut the connection."""
         self._timer.cancel()
-        self._weigh(0)
+        self._anteroom.leave(self)
         self._stream.close()
+
+    def make_room(self) -> None:
+        """Somebody else has more right to its place."""
+        self._failed(self, "it waited longest when there was no room for others")
 
     def _received(self, data: bytes) -> None:
         if not data:
             self._failed(self, "")
             return
-        self._weigh(self._weight + len(data))
-        if self._share.exhausted:
-            self._failed(self, "too many connection headers are unfinished")
+        self._received_bytes += len(data)
+        too_much = self._anteroom.hold(self, self._received_bytes)
+        if too_much:
+            self._failed(self, too_much)
             return
         try:
             fields = self._parser.feed(data)
@@ -83,10 +91,6 @@ class Visitor:
         if fields is not None:
             self.fields, self.rest = fields, self._parser.rest
             self._introduced(self)
-
-    def _weigh(self, weight: int) -> None:
-        self._share.used += weight - self._weight
-        self._weight = weight
 
     def _broken(self, _reason: str) -> None:
         self._failed(self, "")
@@ -113,6 +117,10 @@ class Farewell:
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
             self._told()
+
+    def make_room(self) -> None:
+        """Somebody else has more right to its place."""
+        self.close()
 
     def close(self) -> None:
         """Close the connection now."""

@@ -80,6 +80,11 @@ def is_global_name(name: str) -> bool:
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
 
 
+def is_relative_member(name: str) -> bool:
+    """Whether a member `name` of a namespace of parameters is below it: no `/a`, no `~a`, no empty segment."""
+    return not name.startswith("~") and all(name.split("/"))
+
+
 def is_valid_type_name(name: str) -> bool:
     """Whether `name` is a message or service type (`package/Type`) or `*`, any type."""
     return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)

@@ -144,6 +144,12 @@ class MonitorSet:
         steps = self._steps.get(topic)
         return steps[0].event.type if steps else None
 
+    def stamped(self, topic: str) -> bool:
+        """Whether the messages of a topic begin with a `std_msgs/Header`, as their type is known here."""
+        name = self.type_of(topic)
+        fields = self.definitions.message(name).fields if name is not None else ()
+        return bool(fields) and fields[0].notation == "std_msgs/Header"
+
     def service_type_of(self, service: str) -> str | None:
         """The type of a service with an enabled event; None of another."""
         for part in ("request", "response"):

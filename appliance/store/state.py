@@ -1,7 +1,7 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.store import hosts
 from appliance.store.database import Database
+from appliance.store.order_proof import TokenKeys
 from appliance.store.tokens import TokenRow
 
 _SCHEMA = """
@@ -30,6 +31,7 @@ CREATE TABLE IF NOT EXISTS permission (
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS parameters (id INTEGER PRIMARY KEY CHECK (id = 1), tree BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS parameter_change (number INTEGER PRIMARY KEY, key TEXT NOT NULL, value BLOB);
+CREATE TABLE IF NOT EXISTS parameter_owner (key TEXT PRIMARY KEY, host TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS policy_revision (
     revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
@@ -40,6 +42,9 @@ CREATE TABLE IF NOT EXISTS monitor_revision (
 CREATE TABLE IF NOT EXISTS token (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
     created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS token_keys (
+    id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
@@ -81,7 +86,7 @@ class RegistrationRow:
 
 @dataclass(frozen=True, slots=True)
 class PermissionRow:
-    """One grant of the relay (`kind` "topic" or "service"; `caller_id` empty for services)."""
+    """One grant of the relay (`kind` "topic" or "service")."""
 
     key: str
     kind: str
@@ -237,6 +242,22 @@ class StateStore:
         self._parameter_changes = rows[-1][0] if rows else 0
         return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
+    def parameter_owned(self, key: str, host: str) -> None:
+        """From this key on the parameters are this host's."""
+        self._database.submit("INSERT OR REPLACE INTO parameter_owner VALUES (?, ?)", (key, host))
+
+    def parameters_disowned(self, key: str) -> None:
+        """This key and those below it have no owner of their own any more."""
+        above = key.rstrip("/")  # '0' follows '/'
+        self._database.submit(
+            "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
+            (key, f"{above}/", f"{above}0"),
+        )
+
+    def parameter_owners(self) -> list[tuple[str, str]]:
+        """The keys from which on parameters are another host's, and the host."""
+        return [(key, host) for key, host in self._database.query("SELECT key, host FROM parameter_owner")]
+
     def load_parameters(self) -> dict[str, Any]:
         """The kept parameter tree; empty when there is none."""
         rows = self._database.query("SELECT tree FROM parameters WHERE id = 1")
@@ -280,10 +301,20 @@ class StateStore:
             "INSERT OR REPLACE INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
             (row.id, row.name, row.role, row.salt, row.hash, row.created, row.expires, row.revoked),
         )
+        if row.keys is not None:
+            self._database.submit(
+                "INSERT OR REPLACE INTO token_keys VALUES (?, ?, ?)",
+                (row.id, row.keys.reading, row.keys.verifying),
+            )
 
     def tokens(self) -> list[TokenRow]:
         """All tokens that were ever made, the oldest first."""
-        return [TokenRow(*row) for row in self._database.query("SELECT * FROM token ORDER BY created")]
+        kept = {
+            token: TokenKeys(reading, verifying)
+            for token, reading, verifying in self._database.query("SELECT * FROM token_keys")
+        }
+        rows = self._database.query("SELECT * FROM token ORDER BY created")
+        return [replace(TokenRow(*row), keys=kept.get(row[0])) for row in rows]
 
     # --- settings ---
 

@@ -2,7 +2,8 @@
 
 A token is `rosrv_<id>_<secret>`: the id (48 bits) finds the row, the secret (256 random bits) proves it. Invariants:
 
-1. The secret is never kept: only its scrypt hash with a salt of its own is.
+1. The secret is never kept: only its scrypt hash with a salt of its own is, and what the keys that are derived from
+   it are recognised by (`order_proof.py`).
 2. The comparison takes the same time wherever the difference is.
 """
 
@@ -12,6 +13,8 @@ import hmac
 import re
 import secrets
 from dataclasses import dataclass
+
+from appliance.store.order_proof import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
@@ -37,6 +40,7 @@ class TokenRow:
     created: float
     expires: float
     revoked: float | None
+    keys: TokenKeys | None = None  # None: made by a version that did not derive any
 
     def usable(self, now: float) -> bool:
         """Whether it opens anything at this time."""
@@ -55,8 +59,9 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
         )
     token_id, salt = secrets.token_hex(6), secrets.token_bytes(16)
     secret = base64.urlsafe_b64encode(secrets.token_bytes(32)).decode("ascii").rstrip("=")
-    row = TokenRow(token_id, name, role, salt, hash_secret(secret, salt), now, now + seconds, None)
-    return row, f"rosrv_{token_id}_{secret}"
+    text = f"rosrv_{token_id}_{secret}"
+    kept = hash_secret(secret, salt)
+    return TokenRow(token_id, name, role, salt, kept, now, now + seconds, None, keys_of(text)), text
 
 
 def parse_token(text: str) -> tuple[str, str] | None:

@@ -16,7 +16,7 @@ _LONGEST_NAME = 100  # bytes: what an archive holds without a further header
 _DATABASES = "control/"  # the only part that has any
 # Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
-_LOGS_OF_ROS = frozenset({"rosmaster"})
+_LOGS_OF_ROS = frozenset({"rosmaster", "rosout"})
 
 
 class BackupError(Exception):

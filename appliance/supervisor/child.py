@@ -6,6 +6,7 @@ our own, or executes somebody else's program. A failure on the way is told on th
 in words for the person who started it.
 """
 
+import contextlib
 import importlib
 import os
 import signal
@@ -18,10 +19,12 @@ import setproctitle
 
 import appliance
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Failed, Lifeline
-from appliance.supervisor import offline, privileges
+from appliance.channel.messages import Failed, Lifeline, Walled
+from appliance.supervisor import privileges
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.users import Account
+from appliance.supervisor.walls import landlock, seccomp
+from appliance.supervisor.walls.plan import Walls
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -33,6 +36,7 @@ class Plan(msgspec.Struct, frozen=True):
     home: str
     network: bool
     files: int
+    walls: Walls
     entry: str | None = None
     index: int | None = None
     path: str | None = None
@@ -66,7 +70,7 @@ def main() -> None:
             _execute(plan)
         else:
             _call(plan, secret)
-    except (OSError, ImportError, UnreachableError) as error:
+    except (OSError, ImportError, UnreachableError, seccomp.SeccompError) as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
 
@@ -77,14 +81,44 @@ def _prepare(plan: Plan) -> None:
     privileges.raise_file_limit(plan.files)
     privileges.be_ended_early(plan.ended_early)
     if not plan.network:
-        offline.leave_network_if_allowed()
+        _leave_network_if_allowed()
     privileges.drop(plan.account, parent=plan.parent, capabilities=plan.capabilities)
-    if not plan.network:
-        offline.forbid_sockets()
     _require(plan.account, plan.home, os.R_OK | os.W_OK | os.X_OK)
     if plan.path is not None:
         _require(plan.account, plan.path, os.R_OK)
     os.chdir(plan.home)
+    _raise_walls(plan)
+
+
+def _leave_network_if_allowed() -> None:
+    if os.geteuid() == 0:
+        with contextlib.suppress(PermissionError):
+            privileges.leave_network()
+
+
+def _raise_walls(plan: Plan) -> None:
+    """Raise them, and tell the supervisor what this kernel lacks: a missing wall is seen, and ends no robot's drive.
+
+    But for a process without network, which must not make a socket. Raises `SeccompError`.
+    """
+    lacks = []
+    abi = 0
+    try:
+        abi = landlock.raise_wall(plan.walls)
+    except landlock.LandlockError as error:
+        lacks.append(str(error))
+    lacks += landlock.lacking(abi)
+    calls = "listed" if plan.walls.listed else "usual"
+    try:
+        seccomp.raise_wall(plan.walls)
+    except seccomp.SeccompError as error:
+        if not plan.network:
+            raise
+        calls = ""
+        lacks.append(str(error))
+    lifeline = Channel(socket.socket(fileno=os.dup(plan.lifeline)), Lifeline)
+    lifeline.send(Walled(calls, abi, lacks))
+    lifeline.close()
 
 
 def _require(account: Account, path: str, mode: int) -> None:

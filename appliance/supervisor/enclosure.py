@@ -22,12 +22,13 @@ from typing import Any, Literal
 
 import structlog
 
+from appliance.channel.own_node import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
-from appliance.network.firewall.rules import FirewallSettings, Forwarder, PortRange
+from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNode, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
@@ -48,10 +49,11 @@ class Ports:
     master: int
     rosmaster: int
     nodes: range
+    own_node: range  # where the appliance's own node serves messages
     inner: int | None = None
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # who may connect to it besides this machine
-    own: int | None = None
+    own: int | None = None  # control's, for the own node
     syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
 
 
@@ -160,6 +162,11 @@ class Contained(Enclosure):
             self.remove()
             raise StartError(str(error)) from error
         log.info("firewall is in force", backend=chosen, isolation=self.kind)
+        if self._namespace.lacks_syn_cookies():
+            log.warning(
+                "no SYN cookies: first packets under forged addresses can keep every host out",
+                remedy="sysctl -w net.ipv4.tcp_syncookies=1",
+            )
 
     def remove(self) -> None:
         """Take every rule away again, and the address that the tunnels end at."""
@@ -182,7 +189,7 @@ class Contained(Enclosure):
             log.error("something of the tunnels may be left", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close both to everybody but rosmaster's user."""
+        """Close them to everybody but rosmaster's user, and rosout's."""
         with self._standing():
             if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
@@ -262,12 +269,19 @@ class Contained(Enclosure):
             rosmaster_uid=account_of("rosmaster").uid,
             rosmaster_port=self._ports.rosmaster,
             inner_port=self._ports.inner,
-            own_port=self._ports.own,
+            own_node=OwnNode(
+                uid=account_of("rosrv-rosout").uid,
+                relay_uid=account_of("rosrv-relay").uid,
+                address=OWN_NODE_ADDRESS,
+                ports=PortRange(self._ports.own_node.start, self._ports.own_node.stop - 1),
+                master_port=self._ports.own,
+            ),
             master_port=self._ports.master,
             node_ports=PortRange(nodes.start, nodes.stop - 1),
-            client_ports=self._namespace.run(_client_ports),
+            client_ports=self._namespace.run(client_ports),
             api_port=self._ports.api,
             api_networks=self._api_networks(),
+            neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarder=self._forwarder(),
             tunnel_interface=TUNNEL_INTERFACE if self._tunnels and self._tunnels[1] == "user space" else None,
@@ -276,6 +290,10 @@ class Contained(Enclosure):
     def _api_networks(self) -> tuple[str, ...]:
         """Besides those that were configured, the hosts in tunnels: there they renew their certificates."""
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
+
+    def _neighbours(self) -> tuple[str, ...]:
+        """Addresses that only the machine itself may bear, where the appliance's side can tell."""
+        return ()
 
     def _forwarder(self) -> Forwarder | None:
         if self._ports.syslog is None:
@@ -299,6 +317,7 @@ class InNamespace(Contained):
             forwarded.append(PortRange.one(ports.api))
         self._isolation = isolation or Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
         self._namespace = self._isolation.namespace
+        self._others: dict[str, list[str]] = {}  # what was said last
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
@@ -332,7 +351,10 @@ class InNamespace(Contained):
 
     def _api_networks(self) -> tuple[str, ...]:
         # The host's own loopback arrives under the address of its end of the link.
-        return (*(ends.host for ends in self._isolation.ends.values()), *super()._api_networks())
+        return (*self._neighbours(), *super()._api_networks())
+
+    def _neighbours(self) -> tuple[str, ...]:
+        return tuple(ends.host for ends in self._isolation.ends.values())
 
     def route_to(self, host: str) -> str | None:
         """The host's address by which the peer reaches it; a peer in a tunnel reaches the appliance itself."""
@@ -356,7 +378,28 @@ class InNamespace(Contained):
                 log.critical("rules on the host were taken away and are put back", rules=gone)
                 self._isolation.put_rules_back()
                 rules = self._isolation.rules()
-            return super().report() | {"forwarding": [asdict(rule) for rule in rules]}
+            forwarding = {"forwarding": [asdict(rule) for rule in rules]}
+            return super().report() | forwarding | self._look_at_others()
+
+    def _look_at_others(self) -> dict[str, list[str]]:
+        """What programs such as Docker do to forwarded packets on the host; it is said when it changes."""
+        try:
+            found = {
+                "translations": list(self._isolation.translations()),
+                "obstacles": list(self._isolation.obstacles()),
+            }
+        except NetworkError as error:
+            found = {"translations": [], "obstacles": [f"the host's other rules cannot be read: {error}"]}
+        if found != self._others:
+            self._others = found
+            if found["translations"]:
+                log.info(
+                    "others translate addresses on this host; the appliance sees their hosts as they are",
+                    chains=found["translations"],
+                )
+            for obstacle in found["obstacles"]:
+                log.warning("connections from the network may not reach the appliance", reason=obstacle)
+        return found
 
 
 def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:
@@ -382,7 +425,7 @@ def _require_own_network() -> None:
         )
 
 
-def _client_ports() -> PortRange:
+def client_ports() -> PortRange:
     """The ports that the kernel of this namespace gives to sockets that do not choose."""
     first, last = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()
     return PortRange(int(first), int(last))

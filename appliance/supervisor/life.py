@@ -23,11 +23,13 @@ import msgspec
 
 import appliance
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
-from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping
+from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Walled
+from appliance.network.progress import Progress
 from appliance.supervisor.child import Plan
 
-# Starting is mostly loading: killed too early on a slow machine, it would begin anew.
+# Starting is mostly loading: killed too early on a slow machine, it would begin anew. So who gets on is waited for.
 FIRST_ANSWER_SECONDS = 60.0
+LONGEST_START_SECONDS = 1800.0
 ANSWER_SECONDS = 5.0
 _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
@@ -39,6 +41,16 @@ class Reports:
     received: Callable[["Life", Any, tuple[int, ...]], None]
     violated: Callable[["Life", str], None]
     died: Callable[["Life", int], None]
+
+
+def hangs(silent: float, *, starting: bool, still: float) -> bool:
+    """Whether a process counts as hanging that did not answer for so many seconds, `still` of them without progress.
+
+    While it starts, `silent` are the seconds since its start: it may take long as long as it gets on.
+    """
+    if starting:
+        return silent > LONGEST_START_SECONDS or (silent > FIRST_ANSWER_SECONDS and still > ANSWER_SECONDS)
+    return silent > ANSWER_SECONDS
 
 
 class Life:
@@ -53,6 +65,7 @@ class Life:
         self.since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         self.started = time.monotonic()
         self.answered: float | None = None
+        self.walls: Walled | None = None
         self._asked = 0
         self._reports = reports
         self._loop = asyncio.get_running_loop()
@@ -73,6 +86,7 @@ class Life:
             start_new_session=True,
         )
         self.pid = self._process.pid
+        self._progress = Progress(self.pid)
         self._pidfd = os.pidfd_open(self.pid)
         self._loop.add_reader(self._pidfd, self._dead)
         self._channel: Channel | None = Channel(lifeline, Lifeline, longest=1 << 20)
@@ -82,6 +96,15 @@ class Life:
     def alive(self) -> bool:
         """Whether its death has not been seen yet."""
         return self._pidfd >= 0
+
+    @property
+    def enclosed(self) -> tuple[str, list[str]]:
+        """The walls it is in, in words, and what this kernel lacks of them."""
+        if self.walls is None:
+            return "", []
+        calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.walls.calls)
+        files = f"Landlock {self.walls.landlock}" if self.walls.landlock else None
+        return ", ".join(filter(None, (calls, files))) or "none", [one[:200] for one in self.walls.lacks[:8]]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
         """Tell the process something; nothing happens when it is gone (its death is reported by itself)."""
@@ -113,9 +136,15 @@ class Life:
     def silent_too_long(self) -> bool:
         """Whether it has not answered for so long that it counts as hanging."""
         now = time.monotonic()
-        if self.answered is None:
-            return now - self.started > FIRST_ANSWER_SECONDS
-        return now - self.answered > ANSWER_SECONDS
+        # One of ours may answer once and then read policy and specifications, which takes as long as it takes.
+        starting = self.answered is None or not (self.ready or self.is_program)
+        since = self.started if self.answered is None or starting else self.answered
+        return hangs(now - since, starting=starting, still=self.still_seconds)
+
+    @property
+    def still_seconds(self) -> float:
+        """Seconds since it was last seen to get on with what it does, or to wait for a processor or a disk."""
+        return self._progress.still_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
         """Send it a signal."""
@@ -167,6 +196,7 @@ def _environment(home: str) -> dict[str, str]:
     return {
         **kept,
         "HOME": home,
+        "TMPDIR": home,  # of SQLite: no other folder may be written
         "PATH": _PROGRAM_PATH,
         "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
     }

@@ -2,6 +2,7 @@
 
 import errno
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.supervisor.errors import StartError
@@ -13,6 +14,36 @@ def free_port() -> int:
         sock.bind(("127.0.0.1", 0))
         port: int = sock.getsockname()[1]
         return port
+
+
+def first_free(ports: range) -> int:
+    """The first of these loopback ports that nobody has, and that no connection of an earlier owner keeps.
+
+    Raises `OSError` when there is none.
+    """
+    for port in ports:
+        with socket.socket() as sock:
+            try:
+                sock.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise OSError(errno.EADDRINUSE, f"none of the ports {ports.start} to {ports.stop - 1} is free")
+
+
+def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
+    """That many neighbouring ports `within`, the highest that overlap none `taken`. Raises `StartError`."""
+    stop = within.stop
+    while stop - count >= within.start:
+        wanted = range(stop - count, stop)
+        in_the_way = [one for one in taken if one.start < wanted.stop and wanted.start < one.stop]
+        if not in_the_way:
+            return wanted
+        stop = min(one.start for one in in_the_way)
+    raise StartError(
+        f"no {count} neighbouring ports between {within.start} and {within.stop - 1} are left for the appliance's own "
+        "node: make [Ports] range in the policy smaller"
+    )
 
 
 def require_free(host: str, port: int) -> None:

@@ -11,6 +11,7 @@ from appliance.supervisor.child import Plan
 from appliance.supervisor.life import Life, program_environment
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.users import account_of
+from appliance.supervisor.walls.folders import furnished
 
 LOUD_AFTER = 5  # short lives in a row
 _BACKOFF = (0.0, 0.2, 0.5, 1.0)
@@ -38,6 +39,15 @@ class Post:
         """Its last lives were short, so many that somebody must be told."""
         return self.short_lives >= LOUD_AFTER
 
+    @property
+    def is_late(self) -> bool:
+        """Nodes cannot connect before it is ready, and it is not."""
+        role = self.role
+        waited_for = (
+            role.program is None and role.after is None and not role.on_demand and not role.dispensable
+        )
+        return waited_for and (self.life is None or not self.life.ready)
+
     def bury(self, life: Life) -> float:
         """Note the death of who filled it; the seconds that it lived."""
         self.life = None
@@ -60,6 +70,7 @@ class Post:
             home=home,
             network=role.network,
             files=role.files,
+            walls=furnished(role.walls(facts), home, str(facts.config.parent)),
             entry=role.entry,
             index=self.index if role.indexed else None,
             path=str(role.path(facts)) if role.path else None,

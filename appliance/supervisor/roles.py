@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.ports import first_free
+from appliance.supervisor.walls.folders import around, runnable
+from appliance.supervisor.walls.plan import NETWORK, ROUTES, Walls
 
 ROSMASTER = Path("/usr/bin/rosmaster")
 ROSOUT = Path("/usr/lib/rosout/rosout")
@@ -24,7 +27,11 @@ class Facts:
     config: Path
     rosmaster_port: int
     rosout_master: str | None = None
+    rosout_ports: range | None = None  # None: where the kernel likes
     ca_passphrase_file: Path | None = None
+    control_reads: tuple[Path, ...] = ()
+    syslog_reads: tuple[Path, ...] = ()
+    syslog_port: int | None = None  # of TCP
 
     def part(self, name: str) -> Path:
         """The part of the state directory with this name."""
@@ -53,6 +60,7 @@ class Role:
     `group` is the user whose group it is in instead of one of its own, to read what is `readable_by` that.
     `capabilities` are those of `privileges.SUPERVISORS` that it keeps. `secret` is a file that its user may not read:
     it is opened before the privileges are given up, and `entry` gets the descriptor (or None) as its last argument.
+    `walls` say what it may ask of the kernel, and which files and ports it has besides its part and the system.
     `ended_early`: how much sooner than others the kernel ends it where memory is short (`oom_score_adj`, 0 to 1000).
     """
 
@@ -77,6 +85,7 @@ class Role:
     group: str | None = None
     secret: Callable[[Facts], Path | None] | None = None
     ended_early: int = 0
+    walls: Callable[[Facts], Walls] = lambda _facts: Walls(listed=True)
 
 
 def roles_of(
@@ -104,6 +113,12 @@ def roles_of(
             asks=True,
             outlives_control=True,
             files=8192,
+            walls=lambda facts: Walls(
+                families=ROUTES,
+                programs=runnable(SYSTEM_PYTHON),
+                binds=(facts.rosmaster_port,),
+                reaches=None,  # the inner faces: the firewall knows their port
+            ),
         ),
         Role(
             name="signer",
@@ -126,6 +141,7 @@ def roles_of(
             path=lambda facts: facts.config,
             links=("control",),
             files=65_536,
+            walls=lambda _facts: Walls(listed=True, families=NETWORK, reaches=None),
         ),
         Role(
             name="control",
@@ -137,20 +153,29 @@ def roles_of(
             links=("relay", "signer", "api", "charon", "syslog"),
             files=65_536,
             readable_by="rosrv-api",
+            walls=lambda facts: Walls(
+                listed=True, families=ROUTES, reads=around(*facts.control_reads), binds=None, reaches=None
+            ),
         ),
         Role(
             name="rosout",
-            user="rosmaster",
-            part="rosmaster",
+            user="rosrv-rosout",
+            part="rosout",
             program=lambda facts: Program(
-                (str(rosout),),
+                (str(rosout), *_messages_at(facts.rosout_ports)),
                 {
                     "ROS_IP": "127.0.0.1",
                     "ROS_MASTER_URI": str(facts.rosout_master),
-                    "ROS_LOG_DIR": str(facts.part("rosmaster") / "log"),
+                    "ROS_LOG_DIR": str(facts.part("rosout") / "log"),
                 },
             ),
             after="control",
+            walls=lambda _facts: Walls(
+                families=ROUTES,
+                programs=runnable(rosout),
+                binds=None,  # its API is where the kernel likes; the firewall says who gets there
+                reaches=None,
+            ),
         ),
         Role(
             name="api",
@@ -164,6 +189,7 @@ def roles_of(
             listens=True,
             dispensable=True,
             files=4096,
+            walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
         ),
         Role(
             name="charon",
@@ -175,6 +201,11 @@ def roles_of(
             dispensable=True,
             on_demand=True,
             capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
+            walls=lambda _facts: Walls(
+                families=ROUTES,
+                programs=("/usr", "/lib", "/lib64"),
+                writes=("/dev/net", "/proc/sys/net"),
+            ),
         ),
         Role(
             name="syslog",
@@ -187,10 +218,24 @@ def roles_of(
             after="control",
             dispensable=True,
             group="rosrv-api",
+            walls=lambda facts: Walls(
+                listed=True,
+                families=ROUTES,
+                reads=(str(facts.part("control")), *around(*facts.syslog_reads)),
+                reaches=None if facts.syslog_port is None else (facts.syslog_port,),
+            ),
         ),
     )
     left_out = {name for name, wanted in (("api", api), ("syslog", syslog)) if not wanted}
     return tuple(role for role in roles if role.name not in left_out)
+
+
+def _messages_at(ports: range | None) -> tuple[str, ...]:
+    """The argument by which roscpp serves messages at the first of these ports that is free.
+
+    A life that ended may have left connections behind, which keep its port for a minute.
+    """
+    return () if ports is None else (f"__tcpros_server_port:={first_free(ports)}",)
 
 
 def _find(program: Path, package: str) -> None:

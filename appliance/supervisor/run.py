@@ -4,21 +4,25 @@ import asyncio
 import os
 import socket
 from collections.abc import Callable
+from pathlib import Path
 
 import structlog
 
 from appliance.config import Settings
 from appliance.network.firewall.iptables import load_modules
 from appliance.supervisor import signals
-from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
+from appliance.supervisor.enclosure import Enclosure, Ports, client_ports, enclosure_of
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.ports import free_port, require_free
+from appliance.supervisor.ports import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
+_LIVES_A_MINUTE = 64  # of a rosout that keeps dying; the connections of each keep its port for so long
+_UNPRIVILEGED = range(1024, 65_536)
 _FILES = 65_536  # each kept socket, and once more while it is on its way to a new control
 
 log = structlog.get_logger()
@@ -79,6 +83,7 @@ def _run(
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(one) for one in settings.api_networks),
             syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
+            own_node=_ports_of_rosout(settings, node_ports),
         )
         enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
@@ -86,11 +91,36 @@ def _run(
         raise_file_limit(_FILES)
         enclosure.build()
         try:
-            _supervise(settings, roles, state, enclosure, ready)
+            _supervise(settings, roles, state, enclosure, ready, rosout_ports=ports.own_node)
         finally:
             enclosure.remove()
     finally:
         state.close()
+
+
+def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
+    """Where rosout serves messages: known to the firewall before it starts, and not among those the kernel chooses."""
+    chosen = client_ports()
+    taken = [settings.listen_address[1], settings.rosmaster_port]
+    taken += [settings.api_address[1]] if settings.api_address else []
+    return spare_ports(
+        _LIVES_A_MINUTE,
+        [node_ports, range(chosen.first, chosen.last + 1), *(range(one, one + 1) for one in taken)],
+        _UNPRIVILEGED,
+    )
+
+
+def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
+    to = settings.audit.syslog
+    return tuple(filter(None, (to.ca, to.certificate, to.key)))
+
+
+def _port_of_syslog(settings: Settings) -> int | None:
+    """The receiver's, if it is reached over TCP."""
+    if settings.audit.syslog.to is None:
+        return None
+    protocol, _address, port = settings.audit.syslog.destination
+    return None if protocol == "udp" else port
 
 
 def _with_ports(settings: Settings) -> Settings:
@@ -143,26 +173,43 @@ def _supervise(
     state: StateDirectory,
     enclosure: Enclosure,
     ready: Callable[[ControlReady, Settings], None],
+    *,
+    rosout_ports: range,
 ) -> None:
     with enclosure.inside():
         require_free(*settings.listen_address)
         require_free("127.0.0.1", settings.rosmaster_port)
         api = _listener(settings)
 
+    manager = ServiceManager.of(os.environ)
+
+    def say_ready(said: ControlReady) -> None:
+        ready(said, settings)
+        manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
+
     async def supervise() -> None:
-        await Supervisor(
+        supervisor = Supervisor(
             roles,
             Facts(
                 state=state.path,
                 config=state.config,
                 rosmaster_port=settings.rosmaster_port,
+                rosout_ports=rosout_ports if settings.isolation != "none" else None,
+                control_reads=tuple(filter(None, (settings.policy, settings.monitors, settings.hosts))),
+                syslog_reads=_files_of_syslog(settings),
+                syslog_port=_port_of_syslog(settings),
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
             ),
             admin=state.open_admin_socket(),
-            ready=lambda said: ready(said, settings),
+            ready=say_ready,
             relays=settings.relays,
             enclosure=enclosure,
             listeners={"api": api} if api is not None else {},
-        ).run()
+        )
+        async with manager.watched():
+            try:
+                await supervisor.run()
+            finally:
+                manager.stopping()
 
     asyncio.run(supervise())

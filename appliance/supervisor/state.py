@@ -147,12 +147,13 @@ class StateDirectory:
             _hand_over(path, uid, gid, mode)
         except FileExistsError:
             found = path.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid != uid:
+            # Ours: an earlier start was killed before it gave the folder away.
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (uid, os.geteuid()):
                 raise StartError(
                     f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
                     f"run it as that user, `chown -R {uid}:{gid} {path}`, or name another --state DIR"
                 ) from None
-            if stat.S_IMODE(found.st_mode) != mode or found.st_gid != gid:
+            if (stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid) != (mode, uid, gid):
                 _hand_over(path, uid, gid, mode)
 
 

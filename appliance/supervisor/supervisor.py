@@ -46,6 +46,7 @@ from appliance.channel.messages import (
     SocketsRestored,
     TunnelsEnclosed,
     TunnelsWanted,
+    Walled,
 )
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health, signals
@@ -54,17 +55,25 @@ from appliance.supervisor.ending import end_all
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.guard import Guard
 from appliance.supervisor.kept import KeptSockets, RefusedSocketError
-from appliance.supervisor.life import ANSWER_SECONDS, Life, Reports, link
+from appliance.supervisor.life import (
+    ANSWER_SECONDS,
+    FIRST_ANSWER_SECONDS,
+    LONGEST_START_SECONDS,
+    Life,
+    Reports,
+    link,
+)
 from appliance.supervisor.post import Post
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.users import account_of
 
 ADMIN = "admin"
 _READERS = "rosrv-api"  # the user whose group may read the audit log
-_START_SECONDS = 180.0
+_START_SECONDS = 180.0  # without any progress
+_LOOK_SECONDS = 10.0
 _MOST_UNANSWERED = 4096  # hosts of which control asks the way
 
-_FROM_ANY: tuple[type[Message], ...] = (Pong, Ready, Failed)
+_FROM_ANY: tuple[type[Message], ...] = (Walled, Pong, Ready, Failed)
 _FROM_CONTROL: tuple[type[Message], ...] = (
     SocketKept,
     SocketDropped,
@@ -87,6 +96,7 @@ class ControlReady(msgspec.Struct, frozen=True):
     inner_port: int
     own_port: int
     token: str | None = None
+    warnings: tuple[str, ...] = ()  # of the policy in force
 
 
 class Supervisor:
@@ -169,11 +179,11 @@ class Supervisor:
                     reason = await self._guard.look()
                     if reason is not None:
                         self.stop(reason)
-        asyncio.get_running_loop().call_later(_START_SECONDS, self._check_started)
+        self._spawn(self._until_ready())
 
     async def _until_answering(self, post: Post) -> None:
-        deadline = time.monotonic() + _START_SECONDS
-        while time.monotonic() < deadline and not self._stopping.is_set():
+        began = time.monotonic()
+        while self._gets_on(began, [post]) and not self._stopping.is_set():
             life = post.life
             if life is not None and await self._answers(1.0) and post.life is life:
                 life.heard()
@@ -182,11 +192,31 @@ class Supervisor:
                 await asyncio.wait_for(self._stopping.wait(), 0.05)
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; the log may say why")
 
-    def _check_started(self) -> None:
-        if not self._is_ready:
-            self.stop(
-                f"the appliance was not ready after {_START_SECONDS:.0f} seconds; the log says what happened"
-            )
+    async def _until_ready(self) -> None:
+        """Say what the start waits for, and give it up when nothing gets on any more."""
+        began = time.monotonic()
+        while not self._is_ready and not self._stopping.is_set():
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._stopping.wait(), _LOOK_SECONDS)
+            late = [post for post in self._posts if post.is_late]
+            words = ", ".join(post.role.name for post in late) or "the firewall around control's ports"
+            waited = round(time.monotonic() - began)
+            if self._is_ready or self._stopping.is_set():
+                return
+            if not self._gets_on(began, late):
+                self.stop(
+                    f"the appliance was not ready after {waited} seconds, it waited for {words}; the log says more"
+                )
+            else:
+                log.info("still starting", waits_for=words, seconds=waited)
+
+    def _gets_on(self, began: float, posts: list[Post]) -> bool:
+        """Whether a start that began then is waited for: for some minutes, and longer where processes get on."""
+        waited = time.monotonic() - began
+        if waited < _START_SECONDS:
+            return True
+        still = min((post.life.still_seconds for post in posts if post.life is not None), default=0.0)
+        return waited < LONGEST_START_SECONDS and still < FIRST_ANSWER_SECONDS
 
     def _fill(self, post: Post) -> None:
         post.due = None
@@ -194,8 +224,8 @@ class Supervisor:
             return
         here, there = socket.socketpair()
         try:
-            plan = post.plan(self._facts, there.fileno())
             with self._guard.enclosure.inside():
+                plan = post.plan(self._facts, there.fileno())
                 post.life = Life(post.role.name, post.index, plan, here, self._reports)
         except OSError as error:
             here.close()
@@ -236,6 +266,8 @@ class Supervisor:
             self._violated(life, f"sent {type(message).__name__}, which it may not send")
             return
         match message:
+            case Walled():
+                self._walled(life, message)
             case Pong():
                 life.heard()
             case Ready(detail):
@@ -244,6 +276,18 @@ class Supervisor:
                 self._cannot_serve(life, _printable(said))
             case _:
                 self._control_said(life, message, descriptors)
+
+    def _walled(self, life: Life, walls: Walled) -> None:
+        """What it is enclosed in, by its own first word: what it says later is not believed."""
+        if life.walls is not None:
+            self._violated(life, "told twice what walls it is in")
+            return
+        life.walls = walls
+        if walls.lacks:
+            log.warning(
+                "process lacks a wall", role=life.role, lacks=[_printable(one) for one in walls.lacks]
+            )
+        self._tell_processes()
 
     def _cannot_serve(self, life: Life, reason: str) -> None:
         """Before nodes may connect, it is for the person who starts the appliance; later the next life may succeed."""
@@ -430,7 +474,7 @@ class Supervisor:
 
     def _tell_processes(self) -> None:
         rows = [
-            ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1)
+            ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed)
             for post in self._posts
             if (life := post.life) is not None
         ]

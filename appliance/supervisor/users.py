@@ -18,6 +18,7 @@ NUMERIC_IDS = {
     "rosrv-signer": 61015,
     "rosrv-ipsec": 61016,
     "rosrv-syslog": 61017,
+    "rosrv-rosout": 61018,
 }
 
 

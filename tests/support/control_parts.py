@@ -19,7 +19,7 @@ from appliance.master.gate import Gate, HostLimits
 from appliance.master.graph import Graph
 from appliance.master.http import HttpRequest, Peer
 from appliance.master.liveness import Liveness, LivenessSettings
-from appliance.master.parameters import ParameterMirror, may_be_told
+from appliance.master.parameters import may_be_told
 from appliance.master.pipeline import Pipeline
 from appliance.master.reconcile import Reconciler
 from appliance.master.registration import withdraw_lost
@@ -30,7 +30,9 @@ from appliance.policy import compile_policy
 from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri
 from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
+from appliance.shares.pool import Standing
 from appliance.store.state import PermissionRow
+from tests.support.parameters import mirror
 
 HOST = ipaddress.ip_address("10.0.0.5")
 POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Commands]\ndefault=*\n"
@@ -54,7 +56,16 @@ class Records:
 
         self.strict = False
         self.obstacle: str | None = None
+        self.debt = ""
         self.meter = Nothing()
+
+    def shut_out(self, _host: str) -> str:
+        """As `Recorder`."""
+        return ""
+
+    def owing(self, _host: str) -> str:
+        """As `Recorder`."""
+        return self.debt
 
     def decided(
         self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
@@ -98,9 +109,9 @@ class Grants(Nothing):
         """As `RelayControl`."""
         return list(self.rows)
 
-    def grant_service(self, provider: Incarnation, service: str, host: Address) -> None:
+    def grant_service(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
         """As `RelayControl`."""
-        self.rows.append(PermissionRow(provider.key, SERVICE, service, str(host), ""))
+        self.rows.append(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
 
     def port(self, incarnation: Incarnation, _kind: Kind, _resource: str) -> int:
         """As `RelayControl`."""
@@ -262,7 +273,7 @@ class ControlParts:
         self.mediation, self.addresses, self.parameters = (
             Modes(),
             Addresses(),
-            ParameterMirror({}, lambda: None),
+            mirror(),
         )
         self.graph = Graph(
             self.registry,
@@ -283,6 +294,7 @@ class ControlParts:
             self.parameters,
             cast(Any, self.records),
             own_parameters=dict,
+            may_have=self._may_have,
         )
         self.master = cast(Master, self)  # what `Revocation` and `withdraw` use of one is here
         self.policy = lambda: self.current
@@ -291,7 +303,12 @@ class ControlParts:
         self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
         self.redecide_for = self.revocation.redecide_for
         self.liveness = self._make_liveness(silent)
-        self._serve = Pipeline(self.master, limits=Limits(), offload=1 << 20).handler(MASTER_CALLS)
+        self._serve = Pipeline(
+            self.master, limits=Limits(), offload=1 << 20, standing=lambda _host: Standing.REGISTERED
+        ).handler(MASTER_CALLS)
+
+    def _may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
+        return self.revocation.may_have(incarnation, kind, resource)
 
     def _make_liveness(self, silent: float) -> Liveness:
         async def withdrawn(incarnation: Incarnation, registrations: list[Registration]) -> None:
@@ -305,6 +322,7 @@ class ControlParts:
             withdraw=withdrawn,
             put_back=self.reconciler.put_back,
             returned=self.revocation.returned,
+            standing=lambda _host: Standing.REGISTERED,
         )
         cast(Any, liveness).client = self.clients.client
         return liveness

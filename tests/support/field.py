@@ -21,6 +21,7 @@ from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
 
+_ADDRESS = re.compile(r"\b(?!127\.)[0-9]{1,3}(?:\.[0-9]{1,3}){3}\b")  # loopback is everybody's own
 _RECORD_ID = re.compile(r"\[([0-9a-f]{20})\]\Z")
 
 
@@ -106,19 +107,29 @@ class Field:
     # --- what must be true afterwards ---
 
     def denied(
-        self, answer: Any, reason: str, *, rule: str | None = None, code: int = 0, **fields: Any
+        self,
+        answer: Any,
+        reason: str,
+        *,
+        in_record: str | None = None,
+        rule: str | None = None,
+        code: int = 0,
+        **fields: Any,
     ) -> Event:
         """The answer is a denial of the right shape for this reason, and the log has it, with the rule and its line.
 
-        `rule` is its section and key, as `[Nodes] default`. Returns the record.
+        It tells no address but the caller's. `in_record` is the reason there, where it says more. `rule` is its section
+        and key, as `[Nodes] default`. Returns the record.
         """
         assert isinstance(answer, list), answer
         assert (len(answer), answer[0]) == (3, code), answer
         assert reason in answer[1], answer
+        host = fields.get("host", "10.77.0.66")
+        assert set(_ADDRESS.findall(answer[1])) <= {host}, f"the denied host is told of others: {answer[1]}"
         found = _RECORD_ID.search(answer[1])
         assert found is not None, answer
         record = self.trail.wait_for(id=found[1])
-        assert reason in record["reason"], record
+        assert (in_record or reason) in record["reason"], record
         expected = {"decision": "deny", "host": "10.77.0.66"} | fields
         assert {key: record[key] for key in expected} == expected
         if rule is None:

@@ -77,11 +77,20 @@ def newest_kernel() -> Kernel:
 
 
 def machine_disk(kernel: Kernel) -> Path:
-    """The disk's image (ext4 without partitions), made now if there is none."""
+    """The image of the tests' disk (ext4 without partitions), made now if there is none."""
+    return _disk("disk", kernel, _packages(), environment=True)
+
+
+def clean_disk(kernel: Kernel, packages: tuple[str, ...]) -> Path:
+    """The image of a Debian that knows nothing of the project: these packages, systemd, and the agent."""
+    return _disk("clean", kernel, (*packages, *_MACHINES_OWN), environment=False)
+
+
+def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: bool) -> Path:
     need_program("mke2fs", "e2fsprogs")
-    base = base_archive(_packages())
+    base = base_archive(packages)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    disk = FOLDER / f"disk-{_key(base, kernel)}.ext4"
+    disk = FOLDER / f"{name}-{_key(base, kernel)}.ext4"
     if disk.exists():
         return disk
     tree = FOLDER / f"tree.{os.getpid()}"
@@ -90,9 +99,11 @@ def machine_disk(kernel: Kernel) -> Path:
         tree.mkdir()
         _run("tar", "--extract", "--numeric-owner", "--file", str(base), "--directory", str(tree))
         _furnish(tree, kernel)
+        if environment:
+            _add_environment(tree)
         making.unlink(missing_ok=True)
         _run("mke2fs", "-q", "-t", "ext4", "-d", str(tree), str(making), f"{GIGABYTES}G")
-        for older in FOLDER.glob("disk-*.ext4"):
+        for older in FOLDER.glob(f"{name}-*.ext4"):
             older.unlink()
         making.rename(disk)
     finally:
@@ -142,9 +153,6 @@ def _packages() -> tuple[str, ...]:
 def _furnish(tree: Path, kernel: Kernel) -> None:
     """Put into a Debian tree what makes it this machine."""
     shutil.copytree(kernel.modules, tree / "lib" / "modules" / kernel.release, symlinks=True)
-    environment = tree / str(ROOT / ".venv").lstrip("/")
-    shutil.copytree(ROOT / ".venv", environment, symlinks=True, ignore=_too_large)
-    _compile(environment, as_if_in=ROOT / ".venv")
     agent = tree / "usr/local/lib/rosrv-agent.py"
     agent.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(AGENT, agent)
@@ -162,7 +170,15 @@ def _furnish(tree: Path, kernel: Kernel) -> None:
     kept.mkdir(exist_ok=True)
     (kept / "tmp.conf").symlink_to("/dev/null")
     (tree / "etc/hostname").write_text("rosrv-machine\n")
-    (tree / "etc/resolv.conf").write_text("")
+    resolver = tree / "etc/resolv.conf"
+    resolver.unlink(missing_ok=True)  # some packages make it a link
+    resolver.write_text("")
+
+
+def _add_environment(tree: Path) -> None:
+    environment = tree / str(ROOT / ".venv").lstrip("/")
+    shutil.copytree(ROOT / ".venv", environment, symlinks=True, ignore=_too_large)
+    _compile(environment, as_if_in=ROOT / ".venv")
 
 
 def _too_large(_folder: str, names: list[str]) -> Iterable[str]:

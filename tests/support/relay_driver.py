@@ -201,6 +201,7 @@ class Face:
         self.publications: dict[str, str] = {}
         self.services: dict[str, int] = {}
         self.grants: set[tuple[str, str]] = set()
+        self.clients: set[tuple[str, str]] = set()
         self.listening = socket.create_server((LOOPBACK, 0), backlog=128)
         self.port: int = self.listening.getsockname()[1]
         self._server = _Server((LOOPBACK, 0), _Handler, logRequests=False, allow_none=True)
@@ -226,7 +227,7 @@ class Face:
             (NodePlaced(self.key, self.name, LOOPBACK), (self.listening.fileno(),)),
             *((PublicationPlaced(self.key, topic, kind), ()) for topic, kind in self.publications.items()),
             *((ServicePlaced(self.key, name, LOOPBACK, port), ()) for name, port in self.services.items()),
-            *((ClientGranted(self.key, name, LOOPBACK), ()) for name in self.services),
+            *((ClientGranted(self.key, name, LOOPBACK, one), ()) for name, one in self.clients),
             *((GrantInstalled(self.key, topic, LOOPBACK, caller), ()) for topic, caller in self.grants),
         ]
 
@@ -329,8 +330,12 @@ class RelayDriver:
             port = _port(arguments[2])
             face.services[arguments[1]] = port
             self.link.send(ServicePlaced(face.key, arguments[1], LOOPBACK, port))
-            self.link.send(ClientGranted(face.key, arguments[1], LOOPBACK))
+            self._grant(face, arguments[1], "/client")
             arguments[2:] = [f"rosrpc://{LOOPBACK}:{face.port}", face.uri]
+        elif method == "lookupService":
+            for face in list(self.faces.values()):
+                if arguments[1] in face.services:
+                    self._grant(face, arguments[1], arguments[0])
         elif method == "unregisterService":
             face = self.faces[arguments[0]]
             face.services.pop(arguments[1], None)
@@ -339,6 +344,10 @@ class RelayDriver:
         elif method == "subscribeParam":
             arguments[1] = self._face(arguments[0], arguments[1]).uri
         return call(self._master_uri, method, *arguments)
+
+    def _grant(self, face: Face, service: str, caller_id: str) -> None:
+        face.clients.add((service, caller_id))
+        self.link.send(ClientGranted(face.key, service, LOOPBACK, caller_id))
 
     def _received(self, message: Any) -> None:
         if isinstance(message, UpstreamWanted):

@@ -7,6 +7,7 @@ assert rest.get("/v1/policy").status == 200
 import http.client
 import json
 import ssl
+import time
 import urllib.parse
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -46,13 +47,18 @@ class Rest:
         """The same place, asked by somebody else."""
         return Rest(self.url.geturl(), token, self.certificate)
 
-    def connect(self, timeout: float = 30) -> http.client.HTTPConnection:
-        """A connection."""
+    def connect(self, timeout: float = 30, source: str = "") -> http.client.HTTPConnection:
+        """A connection, from the address `source` of this machine if it is given."""
         assert self.url.hostname is not None
+        local = (source, 0) if source else None
         if self.url.scheme == "http":
-            return http.client.HTTPConnection(self.url.hostname, self.url.port, timeout=timeout)
+            return http.client.HTTPConnection(
+                self.url.hostname, self.url.port, timeout=timeout, source_address=local
+            )
         context = ssl.create_default_context(cafile=self.certificate)
-        return http.client.HTTPSConnection(self.url.hostname, self.url.port, timeout=timeout, context=context)
+        return http.client.HTTPSConnection(
+            self.url.hostname, self.url.port, timeout=timeout, context=context, source_address=local
+        )
 
     def headers(self, given: dict[str, str] | None = None) -> dict[str, str]:
         """What is sent with every request."""
@@ -87,7 +93,10 @@ class Rest:
         return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
 
     def events(self, path: str, timeout: float = 30, **headers: str) -> Generator[dict[str, str], None, None]:
-        """Server-sent events, one dict of its fields each; the first, `{}`, says that the stream is open."""
+        """Server-sent events, one dict of its fields each; the first, `{}`, says that the stream is open.
+
+        Each is waited for at most `timeout` seconds: the appliance's pings keep a stream alive, not a test.
+        """
         connection = self.connect(timeout)
         try:
             given = {name.replace("_", "-"): text for name, text in headers.items()}
@@ -96,12 +105,15 @@ class Rest:
             assert response.status == 200, response.read()
             yield {}
             event: dict[str, str] = {}
+            deadline = time.monotonic() + timeout
             while line := response.readline():
                 text = line.decode().rstrip("\r\n")
                 if not text and event:
                     yield event
                     event = {}
-                elif text and not text.startswith(":"):
+                    deadline = time.monotonic() + timeout
+                assert time.monotonic() < deadline, f"no event of {path} within {timeout} seconds"
+                if text and not text.startswith(":"):
                     name, _colon, value = text.partition(": ")
                     event[name] = value
         finally:

@@ -117,6 +117,16 @@ class TunnelSite:
         """The first audit record with these fields that came after `mark` was taken."""
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 
+    def refused(self, since: int, host: str | None = None) -> Event:
+        """The first refusal of a tunnel after `since`: its record, or the one that counts it among its repetitions."""
+
+        def is_it(event: Event) -> bool:
+            folded = event.get("event") == "denials folded" and event["detail"]["of"] == "tunnel refused"
+            return (folded or event.get("event") == "tunnel refused") and host in (None, event.get("host"))
+
+        found = self.trail.wait_for(is_it, since=since, timeout=LONG)
+        return found | {"reason": " ".join([found["reason"], *found["detail"].get("reasons", ())])}
+
     def story(self) -> str:
         """What the appliance said, for the message of a failure."""
         return self.appliance.story()

@@ -19,5 +19,9 @@ def test_every_test_that_is_named_exists() -> None:
 def _has(path: Path, name: str) -> bool:
     if not path.exists():
         return False
-    functions = [node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    functions = [
+        node.name
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
     return not name or name in functions

@@ -1,4 +1,4 @@
-"""The link control <-> api. The api asks on behalf of a token.
+"""The link control <-> api. The api asks with what the client showed; control decides whose asking that is.
 
 What it may ask is the union `RestRequest`, which has no way to make a token.
 """
@@ -11,12 +11,28 @@ from appliance.channel.admin import AdminAnswer, RestRequest
 from appliance.channel.messages.message import Message
 
 
+class Asked(msgspec.Struct, frozen=True):
+    """The HTTP request of a change as it came, of the peer `host`; a header that it did not have is empty."""
+
+    host: str
+    method: str
+    target: str
+    if_match: str
+    content_type: str
+    proof: str
+    body: bytes
+
+
 class RequestMade(Message):
-    """The api passes on what the holder of the token `who` asks; `number` pairs it with its answer."""
+    """The api passes on what a client asks; `number` pairs it with its answer.
+
+    `shown` is the token or reading key that came with it, empty where none is needed. A change has `asked`, too.
+    """
 
     number: int
-    who: str
     request: RestRequest
+    shown: str = ""
+    asked: Asked | None = None
 
 
 class RequestAnswered(Message):
@@ -27,7 +43,10 @@ class RequestAnswered(Message):
 
 
 class TokenKept(msgspec.Struct, frozen=True):
-    """A token that may be used, without its secret; `expires` is seconds since the epoch."""
+    """A token that may be used, without its secret; `expires` is seconds since the epoch.
+
+    `reading` is the hash of its reading key, empty for a token of a version that had none.
+    """
 
     id: str
     name: str
@@ -35,6 +54,7 @@ class TokenKept(msgspec.Struct, frozen=True):
     salt: bytes
     hash: bytes
     expires: float
+    reading: bytes = b""
 
 
 class TokensStated(Message):
@@ -46,7 +66,7 @@ class TokensStated(Message):
 class RestCalled(Message):
     """A REST call to be recorded. `who` is the token's name, empty when nobody was recognised.
 
-    `count` equal calls (of one second at least) are one message; `duration_us` is of the first.
+    `count` equal calls (of one second at least) are one message; `duration_us` is of the first. `dry`: a dry run.
     """
 
     host: str
@@ -57,6 +77,7 @@ class RestCalled(Message):
     reason: str
     duration_us: int
     count: int = 1
+    dry: bool = False
 
 
 class RestServed(Message):

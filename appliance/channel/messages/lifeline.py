@@ -42,6 +42,19 @@ class Failed(Message):
     reason: str
 
 
+class Walled(Message):
+    """A child's first word: the walls it is in (docs/architecture.md), and what this kernel lacks of them.
+
+    `calls` is how its calls of the kernel are limited: "listed" (only those on a list), "usual" (all but those that no
+    process of ours makes) or empty. `landlock` is the ABI of the kernel's Landlock that limits its files and ports;
+    0 for none.
+    """
+
+    calls: str
+    landlock: int
+    lacks: list[str]
+
+
 class LinkOpened(Message):
     """Supervisor hands a child its end of a new link to another process (replaces an earlier one)."""
 
@@ -91,6 +104,8 @@ class ProcessInfo(msgspec.Struct, frozen=True):
     pid: int
     since: str
     restarts: int
+    walls: str = ""  # in words; empty for the supervisor, and for a process that has not told yet
+    lacks: list[str] = []  # what this kernel lacks of them
 
 
 class ProcessesChanged(Message):
@@ -157,7 +172,7 @@ class ApplianceStopRequested(Message):
 
 
 Lifeline = (
-    Ping | Pong | Stop | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
+    Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed

@@ -42,12 +42,27 @@ class NodeWithdrawn(Message):
     key: str
 
 
+class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
+    """What may pass in a second: messages, bytes; 0 is without a limit."""
+
+    messages: float = 0.0
+    bytes: float = 0.0
+
+
+UNLIMITED = FlowLimit()
+
+
 class PublicationPlaced(Message):
-    """The incarnation publishes this topic (type as registered, `*` when unknown)."""
+    """The incarnation publishes this topic (type as registered, `*` when unknown).
+
+    `limit` is for this publication, `together` for all of the topic. Said again, it changes them.
+    """
 
     key: str
     topic: str
     type: str
+    limit: FlowLimit = UNLIMITED
+    together: FlowLimit = UNLIMITED
 
 
 class PublicationWithdrawn(Message):
@@ -74,12 +89,16 @@ class ServiceWithdrawn(Message):
 
 
 class GrantInstalled(Message):
-    """This subscriber (host, caller_id) may have this topic of that incarnation."""
+    """This subscriber (host, caller_id) may have this topic of that incarnation, up to a limit.
+
+    Said again, it changes the limit.
+    """
 
     key: str
     topic: str
     host: str
     caller_id: str
+    limit: FlowLimit = UNLIMITED
 
 
 class GrantRevoked(Message):
@@ -92,19 +111,21 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """This host may call this service of that incarnation."""
+    """This client (host, caller_id) may call this service of that incarnation."""
 
     key: str
     service: str
     host: str
+    caller_id: str
 
 
 class ClientRevoked(Message):
-    """The host may no longer call the service; connections that stand on it are cut."""
+    """The client may no longer call the service; connections that stand on it are cut."""
 
     key: str
     service: str
     host: str
+    caller_id: str
 
 
 class UpstreamWanted(Message):
@@ -146,6 +167,14 @@ class UpstreamLost(Message):
     violation: Violation = ""
 
 
+class LatchRefused(Message):
+    """A latched message of a publisher is passed on and not kept: its host has no memory left for latched messages."""
+
+    key: str
+    topic: str
+    size: int
+
+
 class ConnectionOpened(Message):
     """A subscriber (`topic` set) or a client (`service` set) is connected through the relay."""
 
@@ -165,9 +194,13 @@ class ConnectionClosed(Message):
 
 
 class ConnectionRefused(Message):
-    """Somebody connected to a relay port and was refused; `resource` is what the header asked for."""
+    """Somebody connected to a relay port and was refused; `resource` is the topic or service that the header asked for.
+
+    `kind` is "topic" or "service", and empty as `resource` is for a header that names neither.
+    """
 
     key: str
+    kind: str
     resource: str
     host: str
     caller_id: str
@@ -196,16 +229,38 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     delay_seconds: float = 0.0
 
 
+class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
+    """Messages of a publication that were dropped since the last report, because they were beyond a limit.
+
+    `part` says whose limit. `host` and `caller_id` are of the publisher, of a subscriber's limit of the subscriber.
+    """
+
+    key: str
+    topic: str
+    part: Literal["publisher", "subscriber", "topic"]
+    host: str
+    caller_id: str
+    messages: int
+    bytes: int
+
+
+class MessagesLimited(Message):
+    """What limits of the policy dropped; once a second at most."""
+
+    rows: list[LimitedRow]
+
+
 class TrafficReported(Message):
     """Counters of all relayed topics and services that changed; once a second at most.
 
     `over`: the seconds that they are of. `unrecorded` connections came and went without a control, beyond those that
-    are told one by one.
+    are told one by one. `memory` has the bytes that all hosts hold now, by what they are.
     """
 
     rows: list[TopicTraffic]
     over: float = 1.0
     unrecorded: int = 0
+    memory: dict[str, int] = msgspec.field(default_factory=dict)
 
 
 class SpecificationsStated(Message):
@@ -290,7 +345,9 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     `kind` is verdict, drop, change, fault, log or publish; `time` is nanoseconds since the epoch; `before` and
     `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
     else how many more there were. `monitor` is who did it, of a change the last who did; `changed_by` in the detail
-    names the events of all (in a count: if it was more than one monitor).
+    names the events of all (in a count: if it was more than one monitor). `host` and `caller_id` are of the node that
+    said the message: publisher, client or server (in a count: empty where several of one host did); empty of what
+    happens by time. `number`, `seq` and `stamp` in the detail say which of its messages it was.
     """
 
     kind: str
@@ -304,6 +361,8 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     after: bytes = b""
     size: int = 0
     count: int = 0
+    host: str = ""
+    caller_id: str = ""
 
 
 class MonitorsReported(Message):
@@ -337,8 +396,8 @@ class MonitorsCounted(Message):
 RelayLink = (
     StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
     | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
-    | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | ConnectionOpened | ConnectionClosed
-    | ConnectionRefused | TrafficReported | SpecificationsStated | MonitorSwitched | MonitorResumed
-    | OwnHeaderStated | OwnPublished | SpecificationsTaken | SpecificationsRefused | PublicationRefused
-    | MonitorsReported | MonitorsCounted
+    | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | LatchRefused | ConnectionOpened
+    | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
+    | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
+    | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted
 )  # fmt: skip

@@ -29,6 +29,33 @@ class SignatureRefused(Message):
     reason: str
 
 
+class RemovalWanted(Message):
+    """Control asks the signer to approve the removal of all records up to checkpoint `number`.
+
+    `checkpoint` is its text, `newest` that of the last checkpoint that was signed.
+    """
+
+    number: int
+    checkpoint: bytes
+    newest: bytes
+
+
+class RemovalApproved(Message):
+    """The removal follows from the settings: its text, and the signer's signature over it."""
+
+    number: int
+    text: bytes
+    signature: bytes
+    public_key: bytes
+
+
+class RemovalRefused(Message):
+    """The removal does not follow from the settings; why."""
+
+    number: int
+    reason: str
+
+
 class AuthorityWanted(Message):
     """Control asks the signer for the certificate of the appliance's authority; `number` pairs all these."""
 
@@ -95,6 +122,7 @@ class RevocationsMade(Message):
 
 
 SignerLink = (
-    SignatureWanted | SignatureMade | SignatureRefused | AuthorityWanted | AuthorityStated | CertificateWanted
-    | CertificateMade | CertificateRefused | RevocationsWanted | RevocationsMade
+    SignatureWanted | SignatureMade | SignatureRefused | RemovalWanted | RemovalApproved | RemovalRefused
+    | AuthorityWanted | AuthorityStated | CertificateWanted | CertificateMade | CertificateRefused | RevocationsWanted
+    | RevocationsMade
 )  # fmt: skip

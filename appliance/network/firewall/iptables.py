@@ -20,7 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
-from appliance.network.firewall.rules import HOOKS, NAT_CHAINS, Chain, Family, Interface, Rule, Verdict
+from appliance.network.firewall.rules import (
+    COUNTED_MARK,
+    HOOKS,
+    SOURCE_TRANSLATIONS,
+    Chain,
+    Family,
+    Interface,
+    Rule,
+    Verdict,
+)
 from appliance.network.namespaces import Namespace
 
 LOCK = Path("/run/xtables.lock")  # the one of the `iptables-legacy` programs
@@ -58,10 +67,10 @@ class IptablesBackend:
 
     def install(self, rules: tuple[Rule, ...]) -> None:
         """Replace the appliance's chains, one family after the other."""
-        translating = [rule.purpose for rule in rules if rule.chain in NAT_CHAINS]
-        if translating:
+        elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
+        if elsewhere:
             raise BackendMissingError(
-                f"address translation is done with nft, not iptables: {'; '.join(translating)}"
+                f"address translation is done with nft, not iptables: {'; '.join(elsewhere)}"
             )
         rendered = [one for rule in rules for one in render_rule(rule)]
         self._in_tables(lambda table: table.replace(rendered))
@@ -98,10 +107,45 @@ def load_modules() -> None:
         subprocess.run(command, capture_output=True, timeout=_MODPROBE_SECONDS, check=False)
 
 
+def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
+    """Name the chains of legacy xtables that give connections another source."""
+    return _foreign(namespace, "nat", lambda table: table.translating())
+
+
+def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
+    """Name the chains of legacy xtables that drop forwarded packets by default."""
+    return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
+
+
+def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
+    """What `look` finds in the table `name` of each family; nothing where nobody has used that table."""
+
+    def inside() -> tuple[str, ...]:
+        used = [family for family in _families() if name in _tables_in_use(family)]
+        found: list[str] = []
+        if used:
+            with _ONE_AT_A_TIME, _xtables_lock():
+                for family in used:
+                    with _opened(family, name) as table:
+                        found += look(table)
+        return tuple(found)
+
+    return namespace.run(inside)
+
+
+def _tables_in_use(family: Family) -> list[str]:
+    """The tables that somebody has opened since the machine started; opening one would make it."""
+    names = "ip6_tables_names" if family == 6 else "ip_tables_names"
+    try:
+        return Path("/proc/thread-self/net", names).read_text(encoding="ascii").split()
+    except FileNotFoundError:
+        return []
+
+
 def render_rule(rule: Rule) -> list[RenderedRule]:
     """Return the rule for each of its families."""
     return [
-        RenderedRule(rule.chain.value, family, _attributes(rule), _matches(rule), _target(rule))
+        RenderedRule(rule.chain.value, family, _attributes(rule), _matches(rule, family), _target(rule))
         for family in rule.families()
     ]
 
@@ -120,15 +164,17 @@ def _attributes(rule: Rule) -> tuple[tuple[str, str], ...]:
 def _protocol(rule: Rule) -> str | None:
     if rule.udp_ports is not None:
         return "udp"
-    return "tcp" if rule.tcp_ports is not None or rule.opening else None
+    return "tcp" if rule.is_tcp else None
 
 
-def _matches(rule: Rule) -> tuple[Extension, ...]:
+def _matches(rule: Rule, family: Family) -> tuple[Extension, ...]:
     tcp: list[tuple[str, str | tuple[str, ...]]] = []
     if rule.tcp_ports is not None:
         tcp.append(("dport", str(rule.tcp_ports).replace("-", ":")))
-    if rule.opening:
-        tcp.append(("tcp-flags", ("SYN,ACK", "SYN")))
+    if rule.from_ports is not None:
+        tcp.append(("sport", str(rule.from_ports).replace("-", ":")))
+    if rule.opening or rule.accepting:
+        tcp.append(("tcp-flags", ("SYN,ACK", "SYN" if rule.opening else "SYN,ACK")))
     matches: list[Extension] = [("tcp", tuple(tcp))] if tcp else []
     if rule.udp_ports is not None:
         matches.append(("udp", (("dport", str(rule.udp_ports).replace("-", ":")),)))
@@ -139,13 +185,28 @@ def _matches(rule: Rule) -> tuple[Extension, ...]:
         matches.append(("policy", (("dir", direction), ("pol", "none"))))
     if rule.local_destination:
         matches.append(("addrtype", (("dst-type", "LOCAL"),)))
-    if rule.new_connection:
-        matches.append(("conntrack", (("ctstate", "NEW"),)))
-    if rule.translated:
-        matches.append(("conntrack", (("ctstate", "DNAT"),)))
+    matches += _tracked(rule)
+    if rule.distant:
+        name, below = ("hl", "hl-lt") if family == 6 else ("ttl", "ttl-lt")
+        matches.append((name, ((below, "255"),)))
     if rule.above is not None:
         matches.append(("hashlimit", _hashlimit(rule.above.per_second, rule.above.burst)))
     return (*matches, ("comment", (("comment", rule.purpose),)))
+
+
+def _tracked(rule: Rule) -> list[Extension]:
+    """The matches of what the connection tracker knows."""
+    matches: list[Extension] = []
+    if rule.new_connection:
+        matches.append(("conntrack", (("ctstate", "NEW"),)))
+    if rule.unknown:
+        matches.append(("conntrack", (("ctstate", "NEW,INVALID,UNTRACKED"),)))
+    if rule.answered:
+        matches.append(("conntrack", (("ctstatus", "ASSURED"), ("ctdir", "ORIGINAL"))))
+        matches.append(("connmark", (("mark", f"0x0/{COUNTED_MARK:#x}"),)))
+    if rule.translated:
+        matches.append(("conntrack", (("ctstate", "DNAT"),)))
+    return matches
 
 
 def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
@@ -162,6 +223,8 @@ def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
 def _target(rule: Rule) -> Extension:
     if rule.verdict is Verdict.RESET:
         return ("REJECT", (("reject-with", "tcp-reset"),))
+    if rule.verdict is Verdict.COUNTED:
+        return ("CONNMARK", (("or-mark", f"{COUNTED_MARK:#x}"),))
     return (rule.verdict.value, ())
 
 
@@ -171,8 +234,7 @@ def _interface(interface: Interface | None) -> str | None:
     return f"!{interface.name}" if interface.other else interface.name
 
 
-_TABLE = "filter"
-_CHAINS = tuple(chain for chain in Chain if chain not in NAT_CHAINS)
+_CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
 
 
 class _Table:
@@ -199,7 +261,7 @@ class _Table:
             self._table.append_entry(rule.chain, self._build(rule).rule)
         for chain in wanted:
             for hook in HOOKS[chain]:
-                self._table.insert_entry(hook, self._jump(chain).rule, 0)
+                self._table.insert_entry(hook.place, self._jump(chain).rule, 0)
         if present or wanted:
             self._table.commit()
 
@@ -208,9 +270,31 @@ class _Table:
         return [
             self._counter(chain, rule)
             for chain in _CHAINS
-            if self._table.is_chain(chain.value) and all(self._hooks(chain, hook) for hook in HOOKS[chain])
+            if self._table.is_chain(chain.value)
+            and all(self._hooks(chain, hook.place) for hook in HOOKS[chain])
             for rule in self._library.Chain(self._table, chain.value).rules
         ]
+
+    def translating(self) -> list[str]:
+        """Name the chains that have a target which translates sources."""
+        chains = [str(chain.name) for chain in self._table.chains]
+        return [self._named(name) for name in chains if self._targets(name) & SOURCE_TRANSLATIONS]
+
+    def dropping(self, chain: str) -> list[str]:
+        """Name a built-in chain if its policy is DROP."""
+        drops = self._library.Chain(self._table, chain).get_policy().name == "DROP"
+        return [self._named(chain)] if drops else []
+
+    def _named(self, chain: str) -> str:
+        program = "ip6tables" if self._family == 6 else "iptables"
+        return f"{program}-legacy chain {self._table.name} {chain}"
+
+    def _targets(self, chain: str) -> set[str]:
+        found, entry = set(), self._table.first_rule(chain)
+        while entry:
+            found.add(self._table.get_target(entry).decode())
+            entry = self._table.next_rule(entry)
+        return found
 
     def _counter(self, chain: Chain, rule: Any) -> RuleCounter:
         packets, octets = rule.get_counters()
@@ -218,9 +302,9 @@ class _Table:
 
     def _unhook(self, chain: Chain) -> None:
         for hook in HOOKS[chain]:
-            for _ in range(self._hooks(chain, hook)):
+            for _ in range(self._hooks(chain, hook.place)):
                 jump = self._jump(chain)
-                self._table.delete_entry(hook, jump.rule, jump.mask)
+                self._table.delete_entry(hook.place, jump.rule, jump.mask)
 
     def _hooks(self, chain: Chain, hook: str) -> int:
         """Count the jumps to a chain; of foreign rules nothing but the target is looked at."""
@@ -260,27 +344,27 @@ def _comment(rule: Any) -> str:
 
 
 @contextlib.contextmanager
-def _opened(family: Family) -> Iterator[_Table]:
+def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
     """Open the table in the namespace of the calling thread, and close it for the next one."""
     library = _library()
     program = "ip6tables" if family == 6 else "iptables"
     table = None
     try:
-        table = (library.Table6 if family == 6 else library.Table)(_TABLE, autocommit=False)
+        table = (library.Table6 if family == 6 else library.Table)(name, autocommit=False)
         table.refresh()
         yield _Table(library, table, family)
     except library.IPTCError as error:
         message = str(error)
         if table is None or "initialize" in message:
             raise BackendMissingError(
-                f"the kernel has no {program} table {_TABLE} ({message}): modprobe {program[:-1]}_{_TABLE}, "
+                f"the kernel has no {program} table {name} ({message}): modprobe {program[:-1]}_{name}, "
                 "CAP_NET_ADMIN and CAP_NET_RAW are needed; or choose the back end nft"
             ) from error
-        raise FirewallError(f"{program} refused the rules in table {_TABLE}: {message}") from error
+        raise FirewallError(f"{program} refused the rules in table {name}: {message}") from error
     finally:
         if table is not None:
             table.close()
-            type(table)._cache.pop(_TABLE, None)  # the cached table is of this namespace
+            type(table)._cache.pop(name, None)  # the cached table is of this namespace
 
 
 def _library() -> Any:

@@ -16,10 +16,12 @@ from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
 from appliance.network.firewall.rules import (
+    COUNTED_MARK,
     HOOKS,
-    NAT_CHAINS,
+    SOURCE_TRANSLATIONS,
     Chain,
     Family,
+    Hook,
     Interface,
     PortRange,
     RateLimit,
@@ -27,16 +29,18 @@ from appliance.network.firewall.rules import (
     Verdict,
 )
 from appliance.network.namespaces import Namespace
+from appliance.network.progress import communicate
 
 TABLE = "rosrv"
 _FAMILY = "inet"
-_SECONDS = 20.0
-_FILTER_PRIORITY, _DNAT_PRIORITY, _SNAT_PRIORITY = 0, -100, 100
 _METER_SIZE = 65535  # hosts
 _METER_SECONDS = 60
+_OF_A_FAMILY = (Verdict.DNAT, Verdict.KEEP_SOURCE, Verdict.FULL_HOPS)
+_FULL_HOPS = 255
 _SHARED = " (no bucket left)"  # after the purpose, in the comment of the second rule
 
 Json = dict[str, Any]
+_MARK: Json = {"ct": {"key": "mark"}}
 
 
 class NftBackend:
@@ -65,12 +69,22 @@ class NftBackend:
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
-        """Return the chains of other tables that hook forwarded packets with the policy drop."""
+        """Name the chains of other tables that hook forwarded packets with the policy drop."""
         return tuple(
             f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
             for chain in self._list("chain", "list", "chains")
             if chain.get("hook") == "forward" and chain.get("policy") == "drop"
         )
+
+    def foreign_translations(self) -> tuple[str, ...]:
+        """Name the chains of other tables that give forwarded connections another source address."""
+        rules = self._list("rule", "list", "ruleset")
+        found = (
+            f"nftables chain {rule['family']} {rule['table']} {rule['chain']}"
+            for rule in rules
+            if not (rule["family"] == _FAMILY and rule["table"] == TABLE) and _translates_source(rule)
+        )
+        return tuple(dict.fromkeys(found))
 
     def _list(self, kind: str, *arguments: str) -> list[Json]:
         """What nft lists of one kind: `table`, `chain` or `rule`."""
@@ -100,10 +114,9 @@ class NftBackend:
             raise FirewallError(f"nft cannot be run: {error.strerror}") from error
         with process:
             try:
-                out, err = process.communicate(text, timeout=_SECONDS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                raise FirewallError(f"nft did not answer within {_SECONDS:.0f} seconds") from None
+                out, err = communicate(process, text, "nft")
+            except TimeoutError as error:
+                raise FirewallError(str(error)) from None
         if process.returncode != 0:
             reason = _first_lines(err or out)
             raise FirewallError(f"nft refused the rules in {self._namespace.name}: {reason}")
@@ -124,8 +137,8 @@ def render(rules: tuple[Rule, ...]) -> list[Json]:
 
 def render_rule(rule: Rule) -> list[Json]:
     """Return the rule as libnftables wants it: once, or once per family where the rule differs by it."""
-    both = len(rule.families()) == 2 and rule.above is None
-    if both:
+    same = rule.above is None and not rule.distant and rule.verdict not in _OF_A_FAMILY
+    if same and len(rule.families()) == 2:
         return [_body(rule, [], None)]
     bodies = [_body(rule, [_match(_meta("nfproto"), f"ipv{family}")], family) for family in rule.families()]
     if rule.above is None:
@@ -143,9 +156,11 @@ def _transport(rule: Rule) -> list[Json]:
     for transport, ports in (("tcp", rule.tcp_ports), ("udp", rule.udp_ports)):
         if ports is not None:
             expressions.append(_match(_payload(transport, "dport"), _ports(ports)))
-    if rule.opening:
+    if rule.from_ports is not None:
+        expressions.append(_match(_payload("tcp", "sport"), _ports(rule.from_ports)))
+    if rule.opening or rule.accepting:
         flags = {"&": [_payload("tcp", "flags"), {"|": ["syn", "ack"]}]}
-        expressions.append(_match(flags, "syn"))
+        expressions.append(_match(flags, "syn" if rule.opening else {"|": ["syn", "ack"]}))
     return expressions
 
 
@@ -164,16 +179,43 @@ def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
     if rule.clear_text:
         through: Json = {"rt": {"key": "ipsec"}} if rule.chain is Chain.OUT else _meta("ipsec")
         expressions.append(_match(through, False))
-    if rule.local_destination:
-        expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
-    if rule.new_connection:
-        expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))
-    if rule.translated:
-        expressions.append(_match({"ct": {"key": "status"}}, "dnat", "in"))
+    expressions += [*_origin(rule, protocol), *_tracked(rule)]
     if rule.above is not None:
         expressions.append(_over_limit(rule, protocol))
     expressions += [{"counter": None}, _verdict(rule, protocol)]
     return {"chain": rule.chain.value, "expr": expressions, "comment": rule.purpose}
+
+
+def _origin(rule: Rule, protocol: str) -> list[Json]:
+    """The matches of where a packet comes from and goes to, as the machine's routes and interfaces say."""
+    expressions: list[Json] = []
+    if rule.local_destination:
+        expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
+    if rule.local_source:
+        expressions.append(_match({"fib": {"result": "type", "flags": ["saddr"]}}, "local"))
+    if rule.forwarded is not None:  # what is made here has no interface that it came in by
+        expressions.append(_match(_meta("iif"), 0, "!=" if rule.forwarded else "=="))
+    if rule.distant:
+        expressions.append(_match(_hops(protocol), _FULL_HOPS, "!="))
+    return expressions
+
+
+def _tracked(rule: Rule) -> list[Json]:
+    """The matches of what the connection tracker knows."""
+    expressions: list[Json] = []
+    if rule.new_connection:
+        expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))
+    if rule.unknown:
+        expressions.append(_match({"ct": {"key": "state"}}, {"|": ["established", "related"]}, "!"))
+    if rule.answered:
+        expressions += [
+            _match({"ct": {"key": "status"}}, "assured", "in"),
+            _match({"ct": {"key": "direction"}}, "original"),
+            _match({"&": [_MARK, COUNTED_MARK]}, 0),
+        ]
+    if rule.translated:
+        expressions.append(_match({"ct": {"key": "status"}}, "dnat", "in"))
+    return expressions
 
 
 def _verdict(rule: Rule, protocol: str) -> Json:
@@ -181,6 +223,12 @@ def _verdict(rule: Rule, protocol: str) -> Json:
         return {"reject": {"type": "tcp reset"}}
     if rule.verdict is Verdict.DNAT:
         return {"dnat": {"family": protocol, "addr": rule.to}}
+    if rule.verdict is Verdict.KEEP_SOURCE:
+        return {"snat": {"family": protocol, "addr": _payload(protocol, "saddr")}}
+    if rule.verdict is Verdict.FULL_HOPS:
+        return {"mangle": {"key": _hops(protocol), "value": _FULL_HOPS}}
+    if rule.verdict is Verdict.COUNTED:
+        return {"mangle": {"key": _MARK, "value": {"|": [_MARK, COUNTED_MARK]}}}
     return {rule.verdict.value.lower(): None}
 
 
@@ -225,17 +273,18 @@ def _meter_set(name: str) -> Json:
     }
 
 
-def _hook(chain: Chain, hook: str) -> list[Json]:
+def _hook(chain: Chain, hook: Hook) -> list[Json]:
     """A base chain at a hook of the kernel, and its jump to the chain with the rules."""
-    kind, priority = "filter", _FILTER_PRIORITY
-    if chain in NAT_CHAINS:
-        kind, priority = "nat", _SNAT_PRIORITY if hook == "POSTROUTING" else _DNAT_PRIORITY
-    base = f"{kind}-{hook}"
+    base = {
+        "name": f"{chain.value}-{hook.place}",
+        "type": hook.kind,
+        "hook": hook.place.lower(),
+        "prio": hook.priority,
+        "policy": "accept",
+    }
     return [
-        _add(
-            "chain", {"name": base, "type": kind, "hook": hook.lower(), "prio": priority, "policy": "accept"}
-        ),
-        _add("rule", {"chain": base, "expr": [{"jump": {"target": chain.value}}]}),
+        _add("chain", base),
+        _add("rule", {"chain": base["name"], "expr": [{"jump": {"target": chain.value}}]}),
     ]
 
 
@@ -264,6 +313,10 @@ def _payload(protocol: str, field: str) -> Json:
     return {"payload": {"protocol": protocol, "field": field}}
 
 
+def _hops(protocol: str) -> Json:
+    return _payload(protocol, "hoplimit" if protocol == "ip6" else "ttl")
+
+
 def _interface(key: str, interface: Interface) -> Json:
     return _match(_meta(key), interface.name, "!=" if interface.other else "==")
 
@@ -279,6 +332,15 @@ def _ports(ports: PortRange) -> object:
 
 def _is_ours(table: Json) -> bool:
     return table.get("family") == _FAMILY and table.get("name") == TABLE
+
+
+def _translates_source(rule: Json) -> bool:
+    """Whether a rule has `masquerade` or `snat`, as nft or as the iptables on top of it writes them."""
+    return any(
+        "masquerade" in part or "snat" in part or part.get("xt", {}).get("name") in SOURCE_TRANSLATIONS
+        for part in rule["expr"]
+        if isinstance(part, dict)
+    )
 
 
 def _jumps(rule: Json) -> list[str]:

@@ -14,7 +14,7 @@ from appliance.network.firewall.backend import Backend, FirewallError
 from appliance.network.firewall.rules import inner_port
 from appliance.network.namespaces import Namespace
 
-_SECONDS = 2.0
+_SECONDS = 20.0  # of a slow machine: who is let in or refused is told at once
 _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 

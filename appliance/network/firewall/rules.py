@@ -3,42 +3,62 @@
 Invariants:
 
 1. The appliance's own rules only ever *refuse* (or RETURN to the rules of others): installing them opens
-   nothing that another firewall on the machine has closed. The one ACCEPT is in ROSRV-FWD, for the
-   appliance's own veth.
+   nothing that another firewall on the machine has closed.
 2. A connection is refused at its first packet, a SYN without ACK, whatever the connection tracker thinks of
    it: no `NOTRACK` rule opens the port, and packets of sockets already closed are left alone (rejecting
    those makes them linger).
 3. Who may connect is said positively, then all others are refused. A packet whose owner is unknown is
    refused.
+4. What counts the connections of a host counts those that it has answered in: the address of a first packet can be
+   anybody's, and he must not pay for it.
 """
 
 import ipaddress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 Family = Literal[4, 6]
 MAX_PORT = 65535
 
 
 class Chain(StrEnum):
-    """The chains of the appliance; each is hooked into the built-in ones that HOOKS names."""
+    """The chains of the appliance; each is hooked into the kernel where HOOKS says."""
 
     IN = "ROSRV-IN"
     OUT = "ROSRV-OUT"
     FORWARD = "ROSRV-FWD"
     NAT = "ROSRV-NAT"
     SOURCE_NAT = "ROSRV-SNAT"
+    ARRIVING = "ROSRV-PRE"
+    KEPT_SOURCE = "ROSRV-KEEP"
+    LEAVING = "ROSRV-POST"
 
 
-HOOKS: dict[Chain, tuple[str, ...]] = {
-    Chain.IN: ("INPUT",),
-    Chain.OUT: ("OUTPUT",),
-    Chain.FORWARD: ("FORWARD",),
-    Chain.NAT: ("PREROUTING", "OUTPUT"),
-    Chain.SOURCE_NAT: ("POSTROUTING",),
+class Hook(NamedTuple):
+    """Where the kernel tries a chain: chains of one place in the order of their priorities, smallest first."""
+
+    place: str
+    kind: Literal["filter", "nat"] = "filter"
+    priority: int = 0
+
+
+# A connection takes the first translation that any chain of the kind `nat` gives it, whoever made the chain. Everybody
+# else's are at 100 (firewalld's at 110); none may be before -199.
+HOOKS: dict[Chain, tuple[Hook, ...]] = {
+    Chain.IN: (Hook("INPUT"),),
+    Chain.OUT: (Hook("OUTPUT"),),
+    Chain.FORWARD: (Hook("FORWARD"),),
+    Chain.NAT: (Hook("PREROUTING", "nat", -100), Hook("OUTPUT", "nat", -100)),
+    Chain.SOURCE_NAT: (Hook("POSTROUTING", "nat", 100),),
+    Chain.ARRIVING: (Hook("PREROUTING", priority=-300),),  # before the connection tracker
+    Chain.KEPT_SOURCE: (Hook("POSTROUTING", "nat", -199),),
+    Chain.LEAVING: (Hook("POSTROUTING", priority=300),),  # after all translation
 }
-NAT_CHAINS = frozenset({Chain.NAT, Chain.SOURCE_NAT})
+COUNTED_MARK = 0x40000000  # the bit of the connection tracker's mark that says so
+SOURCE_TRANSLATIONS = frozenset({"MASQUERADE", "SNAT", "NETMAP"})  # targets of iptables
 
 
 class Verdict(StrEnum):
@@ -50,6 +70,11 @@ class Verdict(StrEnum):
     DROP = "DROP"
     DNAT = "DNAT"
     MASQUERADE = "MASQUERADE"
+    COUNTED = "COUNTED"  # the connection is marked: what matches `answered` is no more true of it
+    KEEP_SOURCE = "KEEP SOURCE"  # translated to the source it has: no later chain can give it another
+    FULL_HOPS = (
+        "FULL HOPS"  # TTL or hop limit 255, and on: a router that passes the packet on makes it smaller
+    )
 
 
 @dataclass(frozen=True)
@@ -91,7 +116,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """More than `per_second` new connections of one host, after a burst of `burst`."""
+    """Where it stands in a rule: more than `per_second` new connections of one host, after a burst of `burst`."""
 
     per_second: int
     burst: int
@@ -115,24 +140,46 @@ class Rule:
     destination: str | None = None
     tcp_ports: PortRange | None = None
     udp_ports: PortRange | None = None
+    from_ports: PortRange | None = None  # of TCP
     opening: bool = False  # a SYN without ACK
+    accepting: bool = False  # a SYN with ACK: the answer of a socket that listens
     uid: int | None = None  # the owner of the local socket; chain OUT only
     clear_text: bool = False  # did not come (OUT: does not leave) through IPsec
     above: RateLimit | None = None
     local_destination: bool = False  # an address of this machine
+    local_source: bool = False  # an address of this machine
+    forwarded: bool | None = None  # chain LEAVING only: passed on for another machine (False: made here)
+    distant: bool = False  # a router passed it on: its TTL or hop limit is below 255
     new_connection: bool = False  # as the connection tracker sees it
+    unknown: bool = False  # of no connection that the tracker knows: new, untracked, invalid
+    answered: bool = (
+        False  # of a connection whose opener has answered our SYN-ACK, and that is not counted yet
+    )
     translated: bool = False  # belongs to a connection whose destination was translated
     to: str | None = None  # of DNAT: the address
 
     def __post_init__(self) -> None:
         if self.verdict is Verdict.RESET and self.tcp_ports is None:
             raise ValueError(f"rule {self.purpose!r}: only TCP can be reset")
-        if self.udp_ports is not None and (self.tcp_ports is not None or self.opening):
+        if self.udp_ports is not None and self.is_tcp:
             raise ValueError(f"rule {self.purpose!r}: a packet is TCP or UDP, not both")
         if self.uid is not None and self.chain is not Chain.OUT:
             raise ValueError(f"rule {self.purpose!r}: a packet has an owner in {Chain.OUT} only")
+        if self.forwarded is not None and self.chain is not Chain.LEAVING:
+            raise ValueError(
+                f"rule {self.purpose!r}: where a packet came from is matched in {Chain.LEAVING} only"
+            )
+        if self.above is not None and not self.answered:
+            raise ValueError(
+                f"rule {self.purpose!r}: a limit counts who has answered; others may be named by anybody"
+            )
         if (self.verdict is Verdict.DNAT) != (self.to is not None):
             raise ValueError(f"rule {self.purpose!r}: DNAT and its address go together")
+
+    @property
+    def is_tcp(self) -> bool:
+        """Whether something of TCP's header is matched."""
+        return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
         """Return the families the rule is for: its own, that of its addresses, or both."""
@@ -150,18 +197,26 @@ class Rule:
             "destination": self.destination,
             "tcp": self.tcp_ports,
             "udp": self.udp_ports,
+            "from tcp": self.from_ports,
             "uid": self.uid,
             "above": f"{self.above.per_second}/s" if self.above else None,
         }
         words = [f"{name} {value}" for name, value in matches.items() if value is not None]
         flags = {
             "syn": self.opening,
+            "syn ack": self.accepting,
             "no ipsec": self.clear_text,
             "to this machine": self.local_destination,
+            "from this machine's address": self.local_source,
+            "forwarded": self.forwarded is True,
+            "made here": self.forwarded is False,
+            "passed on by a router": self.distant,
             "new": self.new_connection,
+            "of no known connection": self.unknown,
+            "answered": self.answered,
             "translated": self.translated,
         }
-        words += [name for name, held in flags.items() if held]
+        words += [name for name, is_held in flags.items() if is_held]
         return f"{', '.join(words) or 'all'} -> {self.verdict}{f' to {self.to}' if self.to else ''}"
 
 
@@ -182,26 +237,50 @@ class Forwarder:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OwnNode:
+    """The local user of the appliance's own node (rosout), who may reach it, and whom it may reach.
+
+    It listens on every address, at a port that the kernel chooses for its node API and at one of `ports` for messages.
+    So its API is called at `address`, one of loopback's that nobody else may connect to, and it takes no other
+    connection but the relay's at `ports`. `master_port` (None: not known yet) is where it finds its master.
+    """
+
+    uid: int
+    relay_uid: int
+    address: str
+    ports: PortRange
+    master_port: int | None = None
+
+    def __post_init__(self) -> None:
+        family_of(self.address)
+        if min(self.uid, self.relay_uid) < 0:
+            raise ValueError(f"own node: {min(self.uid, self.relay_uid)} is no user id")
+
+
+@dataclass(frozen=True, kw_only=True)
 class FirewallSettings:
     """What the rules of the appliance's own namespace are built from.
 
-    `rosmaster_port`, `inner_port` and `own_port` may be unknown (None) before their processes run: `Firewall.update`
+    `rosmaster_port` and `inner_port` may be unknown (None) before their processes run: `Firewall.update`
     adds them. Hosts in `tunnel_only` are accepted through IPsec only: by the kernel's policy, or, when ESP
     runs in user space, on `tunnel_interface`. `api_networks` says who reaches the REST port besides
-    loopback: nobody, if empty. `client_ports` are those that the kernel gives to whoever does not choose: the own
-    nodes (rosout) listen there on every address, whatever ROS_IP says.
+    loopback: nobody, if empty. `neighbours` are addresses of the machine at the other end of the link (isolation
+    netns): only packets that it made itself may bear them, which come with a full TTL. `client_ports` are those
+    that the kernel gives to whoever does not choose: the own nodes (rosout) listen there on every address, whatever
+    ROS_IP says.
     """
 
     control_uid: int
     rosmaster_uid: int
     rosmaster_port: int | None = None
     inner_port: int | None = None
-    own_port: int | None = None
+    own_node: OwnNode | None = None
     master_port: int = 11311
     node_ports: PortRange | None = None
     client_ports: PortRange | None = None
     api_port: int | None = None
     api_networks: tuple[str, ...] = ()
+    neighbours: tuple[str, ...] = ()
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
     forwarder: Forwarder | None = None
@@ -211,13 +290,12 @@ class FirewallSettings:
         for port in (
             self.rosmaster_port,
             self.inner_port,
-            self.own_port,
             self.master_port,
             self.api_port,
         ):
             if port is not None:
                 PortRange.one(port)
-        for network in (*self.api_networks, *self.tunnel_only):
+        for network in (*self.api_networks, *self.tunnel_only, *self.neighbours):
             family_of(network)
         for name in ("control_uid", "rosmaster_uid"):
             if getattr(self, name) < 0:
@@ -226,11 +304,13 @@ class FirewallSettings:
 
 LOOPBACK = Interface("lo")
 OUTSIDE = Interface("lo", other=True)
+_ANY_PORT = PortRange(1, MAX_PORT)
 
 
 def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
     """Return the rules of the appliance's namespace, in the order in which they are tried."""
     return (
+        *(_own_packets_only(address) for address in settings.neighbours),
         *(
             rule
             for network in settings.tunnel_only
@@ -238,7 +318,8 @@ def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
         ),
         *inner_port("ROSMaster port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
-        *inner_port("own nodes' master", settings.own_port, "rosmaster", settings.rosmaster_uid),
+        *_rosmaster(settings),
+        *_own_node(settings),
         *_forwarding(settings.forwarder),
         *_api(settings),
         *_rate_limits(settings),
@@ -260,9 +341,10 @@ def family_of(address: str) -> Family:
 
 def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[Rule, ...]:
     """Return the rules of a port that one local user alone may connect to, over loopback; none for None."""
-    if port is None:
-        return ()
-    ports = PortRange.one(port)
+    return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
+
+
+def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Rule, ...]:
     return (
         Rule(
             chain=Chain.IN,
@@ -289,6 +371,88 @@ def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[Rule, 
             tcp_ports=ports,
             opening=True,
         ),
+    )
+
+
+def _own_packets_only(neighbour: str) -> Rule:
+    """Refuse packets that the machine at the other end of the link passed on under an address of its own."""
+    return Rule(
+        chain=Chain.IN,
+        purpose=f"{neighbour}: the machine's own packets only",
+        verdict=Verdict.DROP,
+        arrives_on=OUTSIDE,
+        source=neighbour,
+        opening=True,
+        distant=True,
+    )
+
+
+def _rosmaster(settings: FirewallSettings) -> tuple[Rule, ...]:
+    """Once the inner faces are there, ROSMaster connects to nothing else."""
+    if settings.inner_port is None:
+        return ()
+    uid = settings.rosmaster_uid
+    return (
+        Rule(
+            chain=Chain.OUT,
+            purpose="rosmaster: connects to nothing else",
+            verdict=Verdict.RESET,
+            leaves_on=LOOPBACK,
+            tcp_ports=_ANY_PORT,
+            opening=True,
+            uid=uid,
+        ),
+        _sends_nothing_out("rosmaster", uid),
+    )
+
+
+def _own_node(settings: FirewallSettings) -> tuple[Rule, ...]:
+    """Control alone calls the own node, and that reaches its master, faces and relays only."""
+    node = settings.own_node
+    if node is None:
+        return ()
+    api = partial(Rule, chain=Chain.OUT, destination=node.address, tcp_ports=_ANY_PORT, opening=True)
+    answer = partial(Rule, chain=Chain.OUT, uid=node.uid, accepting=True)
+    return (
+        api(purpose="own node's API: control may", verdict=Verdict.RETURN, uid=settings.control_uid),
+        api(purpose="own node's API: no other user", verdict=Verdict.RESET),
+        *_inner_ports("own node's messages", node.ports, "relay", node.relay_uid),
+        answer(purpose="own node: control is answered", verdict=Verdict.RETURN, source=node.address),
+        answer(purpose="own node: the relay is answered", verdict=Verdict.RETURN, from_ports=node.ports),
+        answer(purpose="own node: nobody else is answered", verdict=Verdict.DROP),
+        *inner_port("own node's master", node.master_port, "rosout", node.uid),
+        *_ports_of_others(node.uid, settings),
+        _sends_nothing_out("own node", node.uid),
+    )
+
+
+def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[Rule]:
+    """What the own node has no business with: RVMaster's port, REST, low ports, and those of the kernel's choice.
+
+    Not said positively: which ports the faces and relays have, a new policy may change.
+    """
+    connects = partial(Rule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True, uid=uid)
+    chosen, faces = settings.client_ports, settings.node_ports
+    if faces is not None and chosen is not None and faces.overlaps(chosen):
+        yield connects(purpose="own node: faces and relays", verdict=Verdict.RETURN, tcp_ports=faces)
+    closed = {
+        "RVMaster port": PortRange.one(settings.master_port),
+        "REST port": PortRange.one(settings.api_port) if settings.api_port is not None else None,
+        "low port": PortRange(1, 1023),
+        "port of the kernel's choice": chosen,
+    }
+    for name, ports in closed.items():
+        if ports is not None:
+            yield connects(purpose=f"own node: no {name}", verdict=Verdict.RESET, tcp_ports=ports)
+
+
+def _sends_nothing_out(name: str, uid: int) -> Rule:
+    return Rule(
+        chain=Chain.OUT,
+        purpose=f"{name}: sends nothing out",
+        verdict=Verdict.DROP,
+        leaves_on=OUTSIDE,
+        uid=uid,
     )
 
 
@@ -355,7 +519,6 @@ def _api(settings: FirewallSettings) -> tuple[Rule, ...]:
         )
         for network in settings.api_networks
     )
-    # The rate limit stands before the RETURN of the networks, or it would not count them.
     return (
         *_rate_limit(settings.new_connections, "REST port", ports),
         *allowed,
@@ -411,7 +574,12 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> tuple[Rule, ...]:
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[Rule, ...]:
-    """Drop what is above the limit: the peer's kernel tries again a second later, which slows it down."""
+    """Count the connections of each host; what is above the limit is dropped, and sent again by the host's kernel.
+
+    Counted is the first packet after the handshake, once for each connection: who sends it has received our SYN-ACK,
+    so the address is not somebody else's. First packets are the kernel's affair: it remembers as many half-open
+    connections as the listener asked for, and answers more of them with SYN cookies, which take no memory.
+    """
     if limit is None:
         return ()
     return (
@@ -421,7 +589,15 @@ def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[R
             verdict=Verdict.DROP,
             arrives_on=OUTSIDE,
             tcp_ports=ports,
-            opening=True,
+            answered=True,
             above=limit,
+        ),
+        Rule(
+            chain=Chain.IN,
+            purpose=f"{name}: counted",
+            verdict=Verdict.COUNTED,
+            arrives_on=OUTSIDE,
+            tcp_ports=ports,
+            answered=True,
         ),
     )

@@ -8,7 +8,7 @@ from appliance.rosmop.compile.conversion import condition, constant_value, conve
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
 from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.positions import Position
+from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import FaultError
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
@@ -19,6 +19,7 @@ from appliance.rosmop.types.messages import shown
 from appliance.rosmop.types.resolve import resolve
 
 _NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]+|[0-9.]+(?:[eE][+-]?[0-9]+)?)([uUlLfF]*)\Z")
+_DECIMAL = re.compile(r"[1-9][0-9]{0,30}")
 _MAX_DIGITS = 400
 
 
@@ -37,7 +38,7 @@ def elements(scope: Scope, node: tree.Elements, target: Type) -> str:
     return initializers.elements(scope, node, target, value_of)
 
 
-def literal_number(node: tree.Number) -> Value:
+def literal_number(scope: Scope, node: tree.Number) -> Value:
     """A number literal, with the type C++ gives it."""
     found = _NUMBER.match(node.text)
     if found is None or len(node.text) > _MAX_DIGITS or found[1].count(".") > 1:
@@ -47,7 +48,12 @@ def literal_number(node: tree.Number) -> Value:
         return _floating(node, float(text), suffix)
     if "f" in suffix:
         raise SpecificationError.at(node.position, f"{shown(node.text)} is no number; write `{text}.0f`")
-    return _integer(node, text, suffix)
+    return _integer(scope, node, text, suffix)
+
+
+def _is_beyond_long(node: tree.Number) -> bool:
+    """Whether it is a decimal integer without suffix that `long` does not hold."""
+    return bool(_DECIMAL.fullmatch(node.text)) and int(node.text) > kinds.LONG.most
 
 
 def _floating(node: tree.Number, value: float, suffix: str) -> Value:
@@ -58,7 +64,7 @@ def _floating(node: tree.Number, value: float, suffix: str) -> Value:
     return constant_value(node.position, kinds.DOUBLE, value)
 
 
-def _integer(node: tree.Number, text: str, suffix: str) -> Value:
+def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
     decimal = text == "0" or text[0] != "0"
     try:
         value = int(text, 10 if decimal else 16 if text[1:2] in ("x", "X") else 8)
@@ -75,6 +81,12 @@ def _integer(node: tree.Number, text: str, suffix: str) -> Value:
     for kind in candidates:
         if value <= kind.most:
             return constant_value(node.position, kind, value)
+    if value <= kinds.ULONG.most:  # g++ has a type of 128 bits for it, and warns, too
+        warning = (
+            f"{shown(node.text)} is larger than `long` holds, and an `unsigned long` here; write `{text}u`"
+        )
+        scope.shared.findings.append(Finding(node.position, "warning", warning))
+        return constant_value(node.position, kinds.ULONG, value)
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
 
 
@@ -101,9 +113,8 @@ def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]
 
 
 def _number(scope: Scope, node: tree.Expression) -> Value:
-    del scope
     assert isinstance(node, tree.Number)  # so says the table at the end
-    return literal_number(node)
+    return literal_number(scope, node)
 
 
 def _text(scope: Scope, node: tree.Expression) -> Value:
@@ -168,6 +179,12 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Unary)
+    if node.operator == "-" and isinstance(node.operand, tree.Number) and _is_beyond_long(node.operand):
+        if int(node.operand.text) == -kinds.LONG.least:
+            return constant_value(node.position, kinds.LONG, kinds.LONG.least)
+        raise SpecificationError.at(
+            node.position, f"{shown('-' + node.operand.text)} is less than any integer type holds"
+        )
     site = scope.site(node)
     return folded(
         scope,
@@ -230,6 +247,8 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
         )
     value = value_of(scope, node.value)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
+    if node.operator == "+=" and isinstance(target.type, kinds.String):
+        return target, operators.extended(operands).code
     return target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
 
 

@@ -15,7 +15,7 @@ import ast
 from appliance.rosmop.compile.module import Module
 from appliance.rosmop.runtime.numbers import MATH
 
-FUNCTIONS = frozenset({f"h_{name}" for name in MATH}) | {
+FUNCTIONS = frozenset({f"h_{name}{suffix}" for name in MATH for suffix in ("", "f")}) | {
     "c_f32", "c_f32_integer", "c_float", "c_terminated", "c_truncate",
     "h_abs", "h_compare", "h_isfinite", "h_isinf", "h_isnan", "h_len", "h_max", "h_min",
     "l_element", "l_len", "m_duration", "m_nanoseconds", "m_time",

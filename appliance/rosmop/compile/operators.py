@@ -20,6 +20,7 @@ FUNCTIONS = {
     "o_remainder": numbers.remainder,
     "o_ratio": numbers.ratio,
     "o_join": texts.join,
+    "o_extend": texts.extend,
     "o_time": times.time,
     "o_duration": times.duration,
     "o_scaled": times.scaled,
@@ -168,10 +169,7 @@ def _shift(operator: str, operands: Operands) -> Value:
 def _texts(operator: str, operands: Operands) -> Value:
     left, right = operands.left, operands.right
     if operator == "+":
-        return operands.value(
-            kinds.STRING,
-            f"o_join({operands.scope.context}, {_joined(operands, left)}, {_joined(operands, right)}, {operands.site})",
-        )
+        return _put_together("o_join", operands)
     if operator == "<<":
         raise operands.refused(operator, "; write `std::cout << …` or ROS_INFO_STREAM(…)")
     if operator not in COMPARISONS:
@@ -194,6 +192,23 @@ def _compared_texts(operands: Operands, operator: str, left: str, right: str) ->
     if known is None:
         return f"({charged})"
     return f"({left} {operator} {right} if l_len({known}) <= {_SHORT} else {charged})"
+
+
+def extended(operands: Operands) -> Value:
+    """`left += right`, where `left` is a string: what it holds goes with it."""
+    return _put_together("o_extend", operands)
+
+
+def _put_together(function: str, operands: Operands) -> Value:
+    for value, other in ((operands.left, operands.right), (operands.right, operands.left)):
+        if isinstance(value.type, kinds.Characters) and isinstance(
+            other.type, kinds.Integer | kinds.Floating
+        ):
+            hint = "; there is no arithmetic of pointers: write `std::string(…).substr(1)`"
+            raise operands.refused("+", hint)
+    codes = [_joined(operands, value) for value in (operands.left, operands.right)]
+    code = f"{function}({operands.scope.context}, {codes[0]}, {codes[1]}, {operands.site})"
+    return operands.value(kinds.STRING, code)
 
 
 def _text_hint(left: Value, right: Value) -> str:

@@ -16,6 +16,7 @@ from appliance.rosmop.types import kinds
 
 FUNCTIONS: dict[str, Callable[..., object]] = {
     **{f"h_{name}": function for name, (_, function) in numbers.MATH.items()},
+    **{f"h_{name}f": function for name, function in numbers.FLOAT_MATH.items()},
     "h_abs": abs,
     "h_min": min,
     "h_max": max,
@@ -46,7 +47,6 @@ class Arguments:
     ) -> None:
         self.scope = scope
         self.name = "::".join(parts)
-        self.standard = parts[0] == "std"
         self.values = values
         self.position = position
         self.site = site
@@ -84,11 +84,10 @@ def _math(name: str, count: int) -> Function:
         call.count(count)
         for value in call.values:
             require_number(value, f"`{call.name}`")
+        if all(value.type == kinds.FLOAT for value in call.values):  # C++ has an overload for them
+            return call.value(kinds.FLOAT, f"h_{name}f({', '.join(value.code for value in call.values)})")
         codes = [number(value.code, value.type, kinds.DOUBLE) for value in call.values]
-        code = f"h_{name}({', '.join(codes)})"
-        if call.standard and all(value.type == kinds.FLOAT for value in call.values):
-            return call.value(kinds.FLOAT, f"c_f32({code})")
-        return call.value(kinds.DOUBLE, code)
+        return call.value(kinds.DOUBLE, f"h_{name}({', '.join(codes)})")
 
     return function
 
@@ -104,8 +103,7 @@ def _math_of_floats(name: str, count: int) -> Function:
             else value
             for value in call.values
         ]
-        value = function(call)
-        return call.value(kinds.FLOAT, value.code if value.type == kinds.FLOAT else f"c_f32({value.code})")
+        return function(call)
 
     return of_floats
 
@@ -119,6 +117,17 @@ def _rounded(name: str) -> Function:
         return call.value(kinds.LONG, number(value.code, value.type, kinds.LONG))
 
     return to_integer
+
+
+def _absolute_of_long(call: Arguments) -> Value:
+    """`labs`: of an integer, whatever is given."""
+    for value in call.values:
+        require_number(value, "`labs`")
+    call.values = [
+        Value(kinds.LONG, number(value.code, value.type, kinds.LONG), value.position, pure=value.pure)
+        for value in call.values
+    ]
+    return _absolute(call)
 
 
 def _absolute(call: Arguments) -> Value:
@@ -266,8 +275,8 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
     {
         **{name: _math(name, count) for name, (count, _) in numbers.MATH.items()},
         "abs": _absolute,
-        "labs": _absolute,
-        "llabs": _absolute,
+        "labs": _absolute_of_long,
+        "llabs": _absolute_of_long,
         "min": _extreme("min"),
         "max": _extreme("max"),
         **{f"{name}f": _math_of_floats(name, count) for name, (count, _) in numbers.MATH.items()},

@@ -21,7 +21,7 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
     "t_insert": texts.insert,
     "t_replace": texts.replace,
     "t_shorten": texts.shorten,
-    "t_join": texts.join,
+    "t_extend": texts.extend,
     "t_bytes": bytes,
     "t_float": float,
 }
@@ -73,14 +73,14 @@ def _compare(call: Invocation) -> Value:
 
 def _text_append(call: Invocation) -> Value:
     call.count(1)
-    return call.changes(f"t_join({call.scope.context}, {call.base.code}, {call.text(0)}, {call.site})")
+    return call.changes(f"t_extend({call.scope.context}, {call.base.code}, {call.text(0)}, {call.site})")
 
 
 def _text_push(call: Invocation) -> Value:
     call.count(1)
     code = convert(call.scope, call.arguments[0], kinds.CHAR)
     added = f"t_bytes(({code} & 255,))"
-    return call.changes(f"t_join({call.scope.context}, {call.base.code}, {added}, {call.site})")
+    return call.changes(f"t_extend({call.scope.context}, {call.base.code}, {added}, {call.site})")
 
 
 def _text_clear(call: Invocation) -> Value:

@@ -108,14 +108,14 @@ class Context:
                 -1, f"more than {BUDGET} instructions for one message: too many elements stand before a field"
             )
 
-    def allocate(self, size: int, site: int) -> None:
-        """`size` bytes are about to be made, or copied."""
+    def allocate(self, size: int, site: int, replaced: int = 0) -> None:
+        """`size` bytes are about to be made, or copied, in the place of `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)
         self._allocated += size
         if self._allocated > UNMEASURED:
-            self._measure(size, site)
+            self._measure(size - replaced, site)
 
     def log(self, level: str, text: bytes, site: int) -> None:
         """A line of output. Bytes that are not UTF-8 are shown as U+FFFD."""

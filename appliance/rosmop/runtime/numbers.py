@@ -1,5 +1,6 @@
 """Numbers as in C++ on a 64-bit machine: two's complement that wraps, IEEE floating point, 32-bit floats."""
 
+import ctypes
 import math
 import struct
 from collections.abc import Callable
@@ -229,3 +230,21 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "erfc": (1, math.erfc),
 }
 """Functions of `<math.h>` on doubles: how many arguments, and what they do."""
+
+
+def _of_floats(name: str, count: int) -> Callable[..., float]:
+    """A function of the C library on floats: what a compiled C++ monitor would call, to the last bit."""
+    function = getattr(ctypes.CDLL("libm.so.6"), f"{name}f")
+    function.argtypes, function.restype = [ctypes.c_float] * count, ctypes.c_float
+
+    def call(*values: float) -> float:  # and nothing else that the library's object could do
+        result: float = function(*values)
+        return result
+
+    return call
+
+
+FLOAT_MATH: dict[str, Callable[..., float]] = {
+    name: _of_floats(name, count) for name, (count, _) in MATH.items()
+}
+"""The same on floats. Their results are not those on doubles, rounded: `sinf` of 380738.94 is another number."""

@@ -29,6 +29,14 @@ def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
     return left + right
 
 
+def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
+    """`text` after `text += added`."""
+    size = len(text) + len(added)
+    if size > _LONG:
+        context.allocate(size, site, len(text))
+    return text + added
+
+
 def repeat(context: Context, count: int, character: int, site: int) -> bytes:
     """`std::string(count, character)`."""
     context.allocate(count, site)
@@ -57,7 +65,7 @@ def with_character(context: Context, text: bytes, index: int, value: int, site: 
     if not 0 <= index < len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     if len(text) > _LONG:
-        context.allocate(len(text), site)
+        context.allocate(len(text), site, len(text))
     return text[:index] + bytes((value & 0xFF,)) + text[index + 1 :]
 
 
@@ -105,7 +113,7 @@ def compare(left: bytes, right: bytes) -> int:
 
 def resize(context: Context, text: bytes, size: int, value: int, site: int) -> bytes:
     """`text` after `text.resize(size, value)`."""
-    context.allocate(size, site)
+    context.allocate(size, site, len(text))
     return text[:size].ljust(size, bytes((value & 0xFF,)))
 
 
@@ -113,7 +121,7 @@ def erase(context: Context, text: bytes, start: int, count: int, site: int) -> b
     """`text` after `text.erase(start, count)`."""
     if start > len(text):
         raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
-    context.allocate(len(text), site)
+    context.allocate(len(text), site, len(text))
     return text[:start] + text[start + count :]
 
 
@@ -121,7 +129,7 @@ def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -
     """`text` after `text.insert(start, added)`."""
     if start > len(text):
         raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
-    context.allocate(len(text) + len(added), site)
+    context.allocate(len(text) + len(added), site, len(text))
     return text[:start] + added + text[start:]
 
 
@@ -129,7 +137,7 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
     """`text` after `text.replace(start, count, added)`."""
     if start > len(text):
         raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
-    context.allocate(len(text) + len(added), site)
+    context.allocate(len(text) + len(added), site, len(text))
     return text[:start] + added + text[start + count :]
 
 
@@ -182,7 +190,7 @@ def _cut(buffer: bytes) -> bytes:
 def _allocate(context: Context, buffer: bytes, site: int) -> None:
     """A buffer is about to be made anew."""
     if len(buffer) > _LONG:
-        context.allocate(len(buffer), site)
+        context.allocate(len(buffer), site, len(buffer))
 
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:

@@ -173,7 +173,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def fields(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
         del meta
-        return [binding for group in children for binding in group]
+        return [binding for group in children if group is not None for binding in group]
 
     def bind(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
         path, name = children

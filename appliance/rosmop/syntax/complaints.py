@@ -75,6 +75,8 @@ _FOUND = re.compile(
 _CONTAINER = re.compile(
     r"(?:std\s*::\s*)?\b(map|unordered_map|set|list|deque|queue|pair|array|tuple|shared_ptr|function)\s*<[^;{}]*\Z"
 )
+_NEARLY_EVENT = re.compile(r"\b(\w+)\s+(\w+)\s*\([^()]*\)\s*\Z")
+_TRIGGERS = frozenset({"/", "service", "every"})
 _HINTS = {
     "->": "there are no pointers; write `.`",
     "&": "there are no addresses; pass the variable itself",
@@ -150,7 +152,12 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
     container = _CONTAINER.search(text, max(0, offset - 100), offset + 1)
     if container is not None:
         hint = f"there is no `{container[1]}`; use a `std::vector`"
+    nearly = _NEARLY_EVENT.search(text, max(0, offset - 200), offset)
+    if nearly is not None and {"SEMICOLON", "LBRACE"} <= accepted and piece in _TRIGGERS:
+        return f"found {shown(nearly[1])} where an event begins with `event`; write `event {nearly[2]}(…)`"
     expected = _expected(accepted)
+    if accepted == {"AT"} and text[:offset].rstrip().endswith(":"):
+        return f"found {found}, expected a formula; a property is `logic: formula @category {{ … }}`"
     if accepted == {"AT"}:
         return f"found {found} after the formula; a property needs a handler: `@category {{ … }}`"
     if "'" in found and "QUOTE" not in accepted and "STRING" in accepted:

@@ -35,7 +35,7 @@ trigger: TOPIC MESSAGE_TYPE pattern ["when" "(" expression ")"]
        | SERVICE TOPIC MESSAGE_TYPE SERVICE_PART pattern ["when" "(" expression ")"] -> service_trigger
        | EVERY DURATION                         -> timer
 pattern: QUOTE "{" [fields] "}" QUOTE
-fields: field ("," field)*
+fields: field ("," field)* [","]
 field: path ":" NAME                              -> bind
      | path ":" constant                          -> constrain
      | path ":" "{" [fields] "}"                  -> nest

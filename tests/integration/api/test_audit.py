@@ -1,13 +1,17 @@
 """The audit log over REST: searched, followed live, verified, exported; what REST did is in it."""
 
 import json
+import threading
+import time
 import xmlrpc.client
 from collections.abc import Generator, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.support.appliance import Appliance
+from tests.support.relay_driver import wait_until
 from tests.support.rest import Rest
 
 POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault = *\n"
@@ -17,7 +21,7 @@ POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault 
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     """An appliance that denies every publisher but that of /allowed; what it answered is in the log."""
     config = tmp_path_factory.mktemp("config") / "appliance.yaml"
-    config.write_text("audit: {durability: strict}\napi: 127.0.0.1:0\napi_tls: off\n")
+    config.write_text("audit: {durability: strict, checkpoint_seconds: 2}\napi: 127.0.0.1:0\napi_tls: off\n")
     with Appliance(policy=POLICY, options=("--config", str(config))) as running:
         yield running
 
@@ -118,21 +122,71 @@ def test_export_is_ndjson_oldest_first(appliance: Appliance, rest: Rest) -> None
     lines = answer.body.decode("ascii").splitlines()
     sequences = [json.loads(line)["sequence"] for line in lines]
     assert sequences == sorted(sequences)
-    assert lines == appliance.rosrv("audit", "export", "--event", "decision").stdout.splitlines()
+    here = appliance.rosrv("audit", "export", "--event", "decision").stdout.splitlines()
+    assert list(map(_record, lines)) == list(map(_record, here))
+
+
+def test_what_rest_exports_proves_itself(appliance: Appliance, rest: Rest, tmp_path: Path) -> None:
+    """An export over REST, of some records only, is proven by the appliance's public key, without the log."""
+    publish(appliance, "/evidence")
+    file, public = tmp_path / "evidence.ndjson", appliance.state / "control" / "audit.pub"
+    proven, deadline = 0, time.monotonic() + 60
+    while not proven:  # until the signer has sealed it
+        assert time.monotonic() < deadline
+        threading.Event().wait(0.5)
+        if not public.exists():
+            continue
+        file.write_bytes(rest.get("/v1/audit/export?resource=/evidence").body)
+        verified = appliance.rosrv(
+            "audit", "verify", "--export", str(file), "--key", str(public), "--json", check=False
+        )
+        proven = json.loads(verified.stdout)["proven"]
+    assert json.loads(verified.stdout)["ok"] is True
+    file.write_text(file.read_text().replace("/evidence", "/innocent", 1))
+    tampered = appliance.rosrv(
+        "audit", "verify", "--export", str(file), "--key", str(public), "--json", check=False
+    )
+    assert json.loads(tampered.stdout)["ok"] is False
+
+
+def _record(line: str) -> dict[str, Any]:
+    """A line of an export without its place in the chain, of which more is known with each checkpoint."""
+    return {name: value for name, value in json.loads(line).items() if name != "chain"}
 
 
 def test_what_rest_did_is_in_the_log(rest: Rest) -> None:
-    """Each call has who, method, path and status; repeated reads are one record and a count."""
+    """Each call has who, method, path and status; five equal reads are the first in full, and sums of the others."""
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/graph")
     next(events)
     for _ in range(5):
         rest.get("/v1/graph")
-    first, rest_of_them = (json.loads(next(events)["data"]) for _ in range(2))
+    told = [json.loads(next(events)["data"])]
+    first = told[0]
     assert first["detail"] | {"took_us": 0} == {
         "count": 1, "method": "GET", "status": 200, "took_us": 0, "who": "first",
     }  # fmt: skip
     assert (first["host"], first["category"], first["decision"]) == ("127.0.0.1", "rest", "allow")
-    assert rest_of_them["detail"]["count"] == 4
+    while sum(one["detail"]["count"] for one in told) < 5:
+        told.append(json.loads(next(events)["data"]))
+    assert sum(one["detail"]["count"] for one in told) == 5
+    assert len(told) <= 4  # two, or two for each half if a sum was due between the reads
+    events.close()
+
+
+def test_what_rest_changed_is_never_folded(rest: Rest) -> None:
+    """Equal orders that were carried out, and dry runs, are a record each, however fast they come."""
+    events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/policy*")
+    next(events)
+    for _ in range(3):
+        assert rest.post("/v1/policy/reload", match="*").status == 200
+        assert rest.post("/v1/policy?dry_run=1", POLICY).status == 200
+    told = [json.loads(next(events)["data"]) for _ in range(6)]
+    assert [one["resource"] for one in told] == ["/v1/policy/reload", "/v1/policy"] * 3
+    assert {(one["detail"]["method"], one["detail"]["count"], one["decision"]) for one in told} == {
+        ("POST", 1, "allow")
+    }
+    assert [one["detail"].get("dry_run") for one in told] == [None, True] * 3
+    events.close()
 
 
 def test_who_was_refused_is_in_the_log(rest: Rest) -> None:
@@ -181,14 +235,21 @@ def test_denials_of_a_topic_are_found_by_the_words_of_the_command(rest: Rest) ->
     assert rest.get("/v1/audit?resource=/a&topic=/a").status == 422
 
 
-def test_followers_are_bounded(rest: Rest) -> None:
-    """Beyond `api_limits.streams` a follower is told to come back; when one leaves there is room again."""
+def test_followers_have_a_share_each(appliance: Appliance, rest: Rest) -> None:
+    """A viewer's token takes six of sixteen streams, and is told; an admin still follows, and there is room again."""
+    made = appliance.rosrv("token", "add", "greedy", "--role", "viewer", "--json").stdout
+    admin, rest = rest, rest.with_token(json.loads(made)["token"])
+    wait_until(lambda: rest.get("/v1/whoami").status == 200, "the api knows the token")
     open_ones: list[Generator[dict[str, str], None, None]] = []
     with pytest.raises(AssertionError, match="too many clients"):
         while len(open_ones) <= 16:
             one = rest.events("/v1/audit/stream?event=nothing")
             next(one)
             open_ones.append(one)
+    assert len(open_ones) == 6
+    follows = admin.events("/v1/audit/stream?event=nothing")
+    next(follows)
+    follows.close()
     refused = rest.get("/v1/audit/stream?event=nothing")
     assert refused.status == 503
     assert int(refused.headers["retry-after"]) > 0

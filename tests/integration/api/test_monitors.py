@@ -70,10 +70,43 @@ def test_a_specification_is_tried_loaded_replaced_and_removed(appliance: Applian
     removed = send(rest, "DELETE", "/v1/monitors/speed", None, replaced.etag)
     assert (removed.json["removed"], removed.json["monitors"]) == (["speed.rv"], ["count"])
     reloaded = send(rest, "POST", "/v1/monitors/reload", None, removed.etag)
-    assert (reloaded.json["removed"], reloaded.json["monitors"]) == (["count.rv"], [])
+    assert (reloaded.json["kept"], reloaded.json["monitors"]) == (["count.rv"], ["count"])
+    pruned = send(rest, "POST", "/v1/monitors/reload?prune=1", None, reloaded.etag)
+    assert (pruned.json["removed"], pruned.json["monitors"]) == (["count.rv"], [])
     assert rest.get("/v1/monitors").json["who"] == "disk"
     records = appliance.audit("--event", "specifications loaded", "--oldest-first")
-    assert [one["detail"]["who"] for one in records] == ["first"] * 4
+    assert [one["detail"]["who"] for one in records] == ["first"] * 5
+
+
+def test_a_reload_leaves_what_was_loaded_over_rest(appliance: Appliance) -> None:
+    """The folder is read again; a safety monitor that it never had stays, until an admin says otherwise."""
+    rest, file = appliance.rest(), appliance.directory / "monitors" / "count.rv"
+    file.write_text(OTHER)
+    assert "added count.rv" in appliance.rosrv("monitor", "reload").stdout
+    assert load(rest, {"speed.rv": LIMIT}).status == 200
+    assert "reload" not in appliance.rosrv("status", check=False).stdout
+    file.unlink()
+    said = appliance.rosrv("monitor", "reload").stdout
+    assert "removed count.rv" in said
+    assert "still in force: speed.rv" in said
+    assert [one["name"] for one in rest.get("/v1/monitors").json["monitors"]] == ["speed"]
+    made = appliance.rosrv("token", "add", "op", "--role", "operator", "--json").stdout
+    operator = rest.with_token(json.loads(made)["token"])
+    assert send(operator, "POST", "/v1/monitors/reload?prune=1", None, "*").status == 403
+    assert "removed speed.rv" in appliance.rosrv("monitor", "reload", "--prune").stdout
+
+
+def test_without_a_folder_a_reload_is_an_error() -> None:
+    """Nothing is taken away, by command or over REST, and the words say how to have a folder."""
+    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as appliance:
+        rest = appliance.rest()
+        assert load(rest, {"speed.rv": LIMIT}).status == 200
+        done = appliance.rosrv("monitor", "reload", check=False)
+        assert (done.returncode, "no folder of specifications is configured" in done.stderr) == (1, True)
+        assert send(rest, "POST", "/v1/monitors/reload", None, "*").status == 422
+        body = rest.get("/v1/monitors").json
+        assert [one["name"] for one in body["monitors"]] == ["speed"]
+        assert body["differs_from_folder"] is False
 
 
 def test_one_monitor_is_shown_with_what_it_is_made_of(appliance: Appliance) -> None:

@@ -1,16 +1,20 @@
 """Policies over REST: tried, refused, loaded, explained, taken back, kept over a restart."""
 
 import json
+import os
 import re
+import subprocess
+import threading
 import time
 import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.rest import Rest
@@ -24,6 +28,25 @@ def appliance() -> Iterator[Appliance]:
     """An appliance of its own for a test that changes its policy."""
     with Appliance(options=TRANSPORT) as running:
         yield running
+
+
+@pytest.fixture
+def living_node() -> Iterator[int]:
+    """The port of a node API that answers whatever it is asked."""
+
+    class Node:
+        """Answers every call."""
+
+        def _dispatch(self, _method: str, _params: tuple[Any, ...]) -> list[Any]:
+            return [1, "", 0]
+
+    with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False, allow_none=True) as server:
+        server.register_instance(Node())
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server.server_address[1]
+        server.shutdown()
+        thread.join()
 
 
 def register(uri: str, topic: str) -> Any:
@@ -47,6 +70,10 @@ def test_a_wrong_policy_is_refused_whole_with_every_place(appliance: Appliance) 
     refused = next(one for one in calls if one["detail"]["status"] == 422)
     assert refused["detail"]["who"] == "first"
     assert "policy:3:1" in refused["reason"]
+    assert refused["decision"] == "deny"
+    [recorded] = appliance.audit("--event", "policy refused")
+    assert recorded["detail"]["who"] == "first"
+    assert "revision 2:3:1" in recorded["detail"]["findings"][0]
 
 
 def test_a_right_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
@@ -55,9 +82,11 @@ def test_a_right_policy_is_in_force_at_once_and_survives(appliance: Appliance) -
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
     posted = rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "no publishers"}, match='"1"')
     assert posted.status == 200
-    assert posted.json | {"changes": [], "warnings": []} == {
+    assert posted.json | {"changes": [], "warnings": [], "ends": []} == {
         "loaded": True, "revision": 2, "replaced": 1, "revoked": 1, "confirm_by": None, "warnings": [], "changes": [],
+        "ends": [],
     }  # fmt: skip
+    assert [(one["what"], one["resource"]) for one in posted.json["ends"]] == [("publication", "/cmd_vel")]
     assert posted.etag == '"2"'
     assert register(appliance.master_uri, "/cmd_vel")[0] == 0
     loaded = appliance.audit("--event", "policy loaded")[0]
@@ -84,6 +113,61 @@ def test_a_dry_run_says_what_would_change_and_changes_nothing(appliance: Applian
     assert "/cmd_vel" in change["reason"]
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
     assert rest.get("/v1/policy").json["revision"] == 1
+
+
+def test_a_dry_run_says_all_that_would_end_and_whose(
+    appliance: Appliance, living_node: int, tmp_path: Path
+) -> None:
+    """Live publications, subscriptions, services, calls, parameters; the same over REST and by command, either way."""
+    node = f"http://127.0.0.1:{living_node}/"
+    with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+        answers = [
+            master.registerPublisher("/driver", "/scan", "std_msgs/String", node),
+            master.registerSubscriber("/driver", "/cmd_vel", "std_msgs/String", node),
+            master.registerService("/driver", "/reset", "rosrpc://127.0.0.1:2", node),
+            master.subscribeParam("/driver", node, "/limits/speed"),
+            master.lookupService("/ui", "/reset"),
+        ]
+    assert [one[0] for one in answers] == [1] * 5  # type: ignore[index]  # what a master answers
+    nothing = "[Nodes]\n/other = *\n[Commands]\nshutdown = robot\n[Services]\n[Clients]\n[Parameters]\n"
+    rest = appliance.rest()
+    ends = rest.post("/v1/policy?dry_run=1", nothing).json["ends"]
+    expected = {
+        ("publication", "/scan", "/driver"), ("subscription", "/cmd_vel", "/driver"),
+        ("service", "/reset", "/driver"), ("parameter", "/limits/speed", "/driver"), ("parameter", "", "/driver"),
+        ("call", "/reset", "/ui"),
+    }  # fmt: skip
+    assert {(one["what"], one["resource"], one["caller_id"]) for one in ends} == expected
+    file = tmp_path / "nothing.ini"
+    file.write_text(nothing)
+    by_socket = appliance.rosrv("policy", "check", str(file))
+    assert by_socket.stdout.count("would end: ") == len(ends)
+    assert "subscription /cmd_vel of /driver on " in by_socket.stdout
+    told = appliance.rosrv("policy", "check", str(file), "--json").stdout.splitlines()
+    assert sum("ends" in json.loads(one) for one in told) == len(ends)
+    by_rest = subprocess.run(
+        [ROSRV, "policy", "check", str(file), "--api", str(appliance.ready["api"])],
+        env={"PATH": os.environ["PATH"], "ROSRV_TOKEN": str(appliance.ready["token"])},
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert (
+        sorted(by_rest.stdout.splitlines())[-len(ends) :]
+        == sorted(by_socket.stdout.splitlines())[-len(ends) :]
+    )
+    assert rest.get("/v1/policy").json["revision"] == 1
+    assert rest.post("/v1/policy?dry_run=1", OPEN_POLICY).json["ends"] == []
+
+
+def test_check_knows_who_is_enrolled_where_it_may_ask(appliance: Appliance, tmp_path: Path) -> None:
+    """A policy that names the robot and nobody else is right without `--robot`; without the appliance it says so."""
+    file = tmp_path / "p.ini"
+    file.write_text("[Nodes]\ndefault = host:laptop\n[Commands]\ndefault = robot\n")
+    assert 'no host "laptop" is enrolled' in appliance.rosrv("policy", "check", str(file)).stdout
+    given = appliance.rosrv("policy", "check", str(file), "--enrolled", "laptop=10.0.0.9").stdout
+    assert "is enrolled" not in given
+    appliance.stop()
+    stopped = appliance.rosrv("policy", "check", str(file), check=False)
+    assert (stopped.returncode, "checked without it" in stopped.stderr) == (0, True)
 
 
 def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None:

@@ -48,6 +48,8 @@ TOO_FEW_OR_MANY: list[Step] = [
     ("getTopicTypes", TESTER, "more"),
     ("getUri", TESTER, "more"),
     ("getPid", TESTER, "more"),
+    ("shutdown", TESTER),
+    ("shutdown", TESTER, "a", "b"),
     ("getParamNames", TESTER, "more"),
     ("getParam", TESTER),
     ("getParam", TESTER, "/a", "/b"),

@@ -5,10 +5,13 @@ The kinds of cases are those of ROS's own test of its parameter server (ros_comm
 
 import math
 import random
+from functools import partial
 from typing import Any
 from xmlrpc.client import Binary, DateTime
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tests.integration.conformance.side_by_side import (
     TESTER,
@@ -20,6 +23,12 @@ from tests.integration.conformance.side_by_side import (
 )
 
 Step = tuple[Any, ...]
+SEGMENTS = st.sampled_from(["arm", "speed", "max", "left"])
+VALUES_BELOW = st.recursive(
+    st.one_of(st.integers(0, 9), st.just([1, {"a": 2}])),
+    lambda below: st.dictionaries(SEGMENTS, below, max_size=3),
+    max_leaves=6,
+)
 VALUES: list[Any] = [
     0, 1024, 2**31 - 1, -(2**31), True, False, "", "x", "hello world", "ünïcode & <xml> ]]>", "\t two\nlines ",
     0.0, -0.0, math.pi, 3.4028235e38, -1e-300, 1e300, math.inf, -math.inf, math.nan, [], [1, 2, 3], ["a", "b"],
@@ -171,6 +180,64 @@ def test_watchers_are_told_alike(both: BothMasters, watched: str) -> None:
             assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]  # mypy does not infer a lambda with defaults
     told = both.calls_made(lambda call: call.method == "paramUpdate")
     assert told.plain == told.appliance
+
+
+_WATCHED = st.sampled_from(["/", "/arm", "/arm/speed", "/arm/speed/max", "/left", "/left/arm"])
+_WRITES = st.one_of(
+    st.tuples(
+        st.just("setParam"),
+        st.sampled_from([TESTER, "/ear", "/eye"]),
+        _WATCHED.filter("/".__ne__),
+        VALUES_BELOW,
+    ),
+    st.tuples(st.just("deleteParam"), st.just(TESTER), _WATCHED),
+)
+_WATCHES = st.tuples(
+    st.sampled_from(["subscribeParam", "subscribeParam", "unsubscribeParam"]),
+    st.sampled_from(["ear", "eye"]),
+    _WATCHED,
+)
+
+
+@settings(
+    max_examples=40,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(steps=st.lists(st.one_of(_WATCHES, _WRITES, _WRITES), min_size=3, max_size=12))
+def test_any_sequence_is_told_alike(both: BothMasters, steps: list[Step]) -> None:
+    """Whatever is watched, set and deleted in whatever order: every watcher is told the same of every single write."""
+    both.reset()
+    for node in ("ear", "eye"):
+        both.call("subscribeParam", f"/{node}", Api(node), "/settled")
+    for number, (method, who, *rest) in enumerate(steps):
+        watches = method in {"subscribeParam", "unsubscribeParam"}
+        step = (method, f"/{who}", Api(who), *rest) if watches else (method, who, *rest)
+        assert differences(both.call(*step)) == [], step
+        both.call("setParam", TESTER, "/settled", number)
+        for side in (both.plain, both.appliance):
+            for node in ("ear", "eye"):
+                settled = partial(_is_told, side, node, number)
+                assert side.nodes.wait_until(settled), f"{node} after {step}"
+        told = both.calls_made(lambda call: call.method == "paramUpdate" and call.params[1] != "/settled/")
+        assert _sorted(told.plain) == _sorted(told.appliance), f"after {step}"
+        for side in (both.plain, both.appliance):
+            side.nodes.forget()
+
+
+def _is_told(side: MasterSide, node: str, number: int) -> bool:
+    """Whether the node heard that `number` is settled, and so of everything before it."""
+    return any(
+        call.node.startswith(f"{node}-") and call.params[1:] == ("/settled/", number)
+        for call in side.nodes.all_calls()
+    )
+
+
+def _sorted(told: dict[str, list[Any]]) -> dict[str, list[str]]:
+    """The updates of one write have no order."""
+    return {node: sorted(map(repr, calls)) for node, calls in told.items()}
 
 
 def _has_settled(side: MasterSide, number: int) -> bool:

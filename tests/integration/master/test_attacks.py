@@ -5,6 +5,7 @@ told why in the shape its library expects, and the audit log has the refusal wit
 """
 
 import contextlib
+import json
 import re
 import socket
 import threading
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from appliance.network.scan import scan
+from appliance.ros.tcpros import HeaderParser
 from tests.support.field import Field, Impostor, answering, response
 from tests.support.processes import LIMIT
 
@@ -60,6 +62,7 @@ shutdown = own
 """
 API = Field.api
 ROGUE = r"10\.77\.0\.66"
+VOICE_TOLD = "/voice is held by a node of another host; 10.77.0.66 cannot speak for it"
 VOICE_HELD = "/voice is held by 10.77.0.10; 10.77.0.66 cannot speak for it"
 TCPROS = [["TCPROS"]]
 LOOPBACK = "0100007F"  # as /proc/net/tcp writes 127.0.0.1
@@ -135,8 +138,10 @@ def test_speaking_for_another_hosts_node(
     """No call of the Master API can be made in the name of a node that lives on another host."""
     answer = field.rogue(method, "/voice", *parameters)
     allowed_but_held = {"subscribeParam": "is held by", "unsubscribeParam": "is held by"}
-    reason = allowed_but_held.get(method, VOICE_HELD)
-    record = field.denied(answer, reason, caller_id="/voice", category=category)
+    told = allowed_but_held.get(method, VOICE_TOLD)
+    record = field.denied(
+        answer, told, in_record="is held by 10.77.0.10", caller_id="/voice", category=category
+    )
     assert record["detail"]["call"] == method
 
 
@@ -144,14 +149,15 @@ def test_speaking_for_another_hosts_node(
 def test_takeover_of_a_running_node(field: Field, method: str) -> None:
     """A node that runs on another host keeps its name, though the policy grants it to both."""
     answer = field.rogue(method, "/voice", "/shared/talk", "std_msgs/String", API)
-    field.denied(answer, "/voice is held by a running node on 10.77.0.10")
+    field.denied(answer, "/voice is held by a running node of another host", in_record="node on 10.77.0.10")
     assert answer[2] == []
 
 
 def test_takeover_by_offering_a_service(field: Field) -> None:
     """Nor is it taken by a service."""
     answer = field.rogue("registerService", "/voice", "/shared/s", "rosrpc://10.77.0.66:9", API)
-    field.denied(answer, "/voice is held by a running node on 10.77.0.10", category="offer")
+    held = "/voice is held by a running node"
+    field.denied(answer, f"{held} of another host", in_record=f"{held} on 10.77.0.10", category="offer")
 
 
 def test_name_that_the_policy_keeps(field: Field) -> None:
@@ -177,16 +183,15 @@ def test_what_nodes_log_is_collected(field: Field) -> None:
 def test_speaking_for_a_node_to_a_node(field: Field, method: str) -> None:
     """On another node's face nobody can use the name of a node of another host either."""
     answer = field.rogue(method, "/ear", uri=outer(field, "/shared_voice"))
-    record = field.denied(answer, "/ear is held by 10.77.0.20", caller_id="/ear")
+    record = field.denied(answer, "/ear is held by", in_record="/ear is held by 10.77.0.20", caller_id="/ear")
     assert record["detail"]["node"] == "/shared_voice"
 
 
 def test_asking_for_a_topic_in_anothers_name(field: Field) -> None:
     """The subscriber's name on `requestTopic` is bound to its host."""
     uri = outer(field, "/shared_voice")
-    field.denied(
-        field.rogue("requestTopic", "/ear", "/shared/talk", TCPROS, uri=uri), "/ear is held by 10.77.0.20"
-    )
+    answer = field.rogue("requestTopic", "/ear", "/shared/talk", TCPROS, uri=uri)
+    field.denied(answer, "/ear is held by", in_record="/ear is held by 10.77.0.20")
 
 
 def test_late_call_of_a_replaced_node(field: Field) -> None:
@@ -217,7 +222,8 @@ def test_unregistering_with_the_real_uri_of_the_victim(field: Field) -> None:
     answer = field.rogue("unregisterPublisher", "/another", "/shared/talk", uri)
     assert answer[:1] == [1]  # ROSMaster's "not a registered node"
     assert "not a registered node" in answer[1]
-    field.denied(field.rogue("unregisterPublisher", "/voice", "/shared/talk2", uri), VOICE_HELD)
+    answer = field.rogue("unregisterPublisher", "/voice", "/shared/talk2", uri)
+    field.denied(answer, VOICE_TOLD, in_record=VOICE_HELD)
 
 
 # --- multicall ---
@@ -241,7 +247,7 @@ def test_multicall_is_decided_part_by_part(field: Field) -> None:
     )
     assert [one[0][0] for one in answers] == [1, 0, 0, 1]
     field.denied(answers[1][0], "/forbidden", rule="[Parameters] write default", caller_id="/mixer")
-    field.denied(answers[2][0], VOICE_HELD, caller_id="/voice")
+    field.denied(answers[2][0], VOICE_TOLD, in_record=VOICE_HELD, caller_id="/voice")
     assert field.call(field.robot, "getParam", "/looker", "/shared/mixed")[2] == 2
     assert field.call(field.robot, "hasParam", "/looker", "/forbidden")[2] is False
 
@@ -433,12 +439,37 @@ def test_secrets_are_not_listed(field: Field) -> None:
 
 def test_keys_with_slashes_inside_a_value(field: Field) -> None:
     """A dictionary whose keys look like paths stays where it was put; nothing else is reached by it."""
-    value = {"a/b": 1, "/secret/key": 2, "": 3, "..": 4, "~": 5, "/": {"secret": {"key": 6}}}
+    value = {"a/b": 1, "..": 4, "secret/key": 5, "list": [{"/secret/key": 6}]}
     assert field.rogue("setParam", "/writer", "/shared/odd", value)[0] == 1
     assert field.call(field.robot, "getParam", "/looker", "/secret/key")[2] == 4711
     assert field.rogue("getParam", "/writer", "/shared/odd")[2] == value
     assert "/secret/key" not in field.rogue("getParamNames", "/writer")[2]
     assert field.rogue("deleteParam", "/writer", "/shared/odd")[0] == 1
+
+
+@pytest.mark.parametrize("name", ["/limits/speed", "/limits", "~limits", "", "/", "a//b", "a/"])
+def test_a_forged_update(field: Field, name: str) -> None:
+    """A member whose name is no relative name is refused: no node that watches another key hears of it."""
+    watcher = field.ros.parameters("rospy", name="cautious")
+    watcher.wait_for(event="ready")
+    field.call(field.robot, "setParam", "/driver", "/limits/speed", 1)
+    watcher.send(json.dumps({"do": "watch", "key": "/limits/speed"}))
+    watcher.wait_for(event="done", do="watch", value=1)
+    forged = {name: {"speed": 666}, "limits": 666, "limits/speed": 666}
+    for value in (forged, {"limits": forged}):
+        for answer in (
+            field.rogue("setParam", "/forger", "/shared/forged", value),
+            field.rogue("system.multicall", [part("setParam", "/forger", "/shared/forged", value)])[0][0],
+        ):
+            assert answer[0] == -1, answer
+            assert "no relative name" in answer[1]
+    field.recorded("no relative name", event="malformed", host="10.77.0.66", resource="setParam")
+    assert field.rogue("setParam", "/forger", "/shared/forged", {"limits/speed": 666})[0] == 1
+    assert field.rogue("deleteParam", "/forger", "/shared/forged")[0] == 1
+    field.call(field.robot, "setParam", "/driver", "/limits/speed", 2)
+    watcher.wait_for(event="changed", value=2)
+    assert {event["value"] for event in watcher.seen(event="changed")} == {2}
+    watcher.stop()
 
 
 @pytest.mark.parametrize("value", [None, {"a": None}, [1, [None]], {"a": {"b": [{"c": None}]}}], ids=repr)
@@ -518,7 +549,7 @@ def test_more_parameters_than_anybody_needs(field: Field) -> None:
             refused = answer
             break
     assert refused is not None
-    field.denied(refused, "all parameters together would have", event="limit exceeded")
+    field.denied(refused, "bytes of parameters; the share of one host is", event="limit exceeded")
     assert field.call(field.robot, "getParam", "/looker", "/open_key")[2] == 1
     assert field.rogue("deleteParam", "/hoarder", "/shared/hoard")[0] == 1
     assert field.rogue("setParam", "/hoarder", "/shared/small", 1)[0] == 1
@@ -615,6 +646,42 @@ def test_service_of_a_third_machine(field: Field) -> None:
         assert field.rogue("unregisterService", "/pointer2", "/shared/away", uri)[0] == 1
 
 
+@pytest.mark.parametrize("name", ["/listener", "/voice", "", "/caller\x1b[2J", "caller", "/other"])
+def test_forged_name_of_a_service_client(field: Field, name: str) -> None:
+    """A client calls under the name that it has looked the service up by; another is refused, and recorded."""
+    code, _text, uri = field.rogue("lookupService", "/caller", "/shared/negate")
+    assert code == 1
+    port = int(uri.rpartition(":")[2])
+    answer = knock(field, port, header(callerid=name, service="/shared/negate", md5sum="*"))
+    reason = "no grant for" if name.startswith("/") and name.isprintable() else "is not a global ROS name"
+    assert reason.encode() in answer
+    field.recorded(reason, host="10.77.0.66", decision="deny")
+    answer = knock(field, port, header(callerid="/caller", service="/shared/negate", md5sum="*"))
+    assert b"callerid=/shared_negator" in answer
+
+
+def test_what_a_service_sees_of_its_client(field: Field) -> None:
+    """The name that was looked up with and ROS's own fields; who probes as another tool does is told the same."""
+    with field.robot.run(lambda: socket.create_server(("10.77.0.10", 0))) as home:
+        home.settimeout(LIMIT)
+        place = f"rosrpc://10.77.0.10:{home.getsockname()[1]}"
+        provider = ("/seer", "/shared/see", place)
+        assert field.call(field.robot, "registerService", *provider, "http://10.77.0.10:40405/")[0] == 1
+        uri = field.rogue("lookupService", "/caller", "/shared/see")[2]
+        for given, seen in (
+            ({"callerid": "/caller", "persistent": "1"}, {"persistent": "1"}),
+            ({"callerid": "/rosservice", "probe": "1"}, {"probe": "1"}),
+        ):
+            with field.connect(port=int(uri.rpartition(":")[2])) as client:
+                fields = given | {"service": "/shared/see", "md5sum": "*"}
+                client.sendall(header(**fields, admin="yes", _bad="\x1b"))
+                connection, _peer = home.accept()
+                with connection:
+                    told = HeaderParser().feed(connection.recv(65536))
+                assert told == {"callerid": "/caller", "service": "/shared/see", "md5sum": "*"} | seen
+        assert field.call(field.robot, "unregisterService", *provider)[0] == 1
+
+
 def header(**fields: str) -> bytes:
     """A TCPROS connection header."""
     body = b"".join(
@@ -687,23 +754,28 @@ def test_topic_without_the_right(field: Field) -> None:
 
 
 @pytest.mark.parametrize(
-    "protocols",
-    [[["UDPROS", b"x", "10.77.0.66", 4, 1500]], [], ["TCPROS"], [[]], [[["TCPROS"]]], [7]],
+    ("protocols", "code", "words"),
+    [
+        ([["UDPROS", b"x", "10.77.0.66", 4, 1500]], 0, "only TCPROS"),
+        ([[]], 0, "only TCPROS"),
+        ([[["TCPROS"]]], 0, "only TCPROS"),
+        ([], -1, "a list that is not empty"),
+        (["TCPROS"], -1, "a list of protocols"),
+        ([7], -1, "a list of protocols"),
+    ],
     ids=repr,
 )
-def test_other_protocols(field: Field, protocols: Any) -> None:
-    """Only TCPROS is carried; who offers something else is told so, and gets nothing."""
-    code, text, value = field.rogue(
-        "requestTopic", "/udp", "/shared/talk", protocols, uri=outer(field, "/shared_voice")
-    )
-    assert (code, value) == (0, [])
-    assert "only TCPROS" in text
+def test_other_protocols(field: Field, protocols: Any, code: int, words: str) -> None:
+    """Only TCPROS is carried; who offers something else, or no protocols, is told so as by rospy, and gets nothing."""
+    answer = field.rogue("requestTopic", "/udp", "/shared/talk", protocols, uri=outer(field, "/shared_voice"))
+    assert (answer[0], answer[2]) == (code, [])
+    assert words in answer[1]
 
 
 def test_topic_that_the_node_does_not_publish(field: Field) -> None:
     """A right to a topic is no right to a node: it must publish it."""
     answer = field.rogue("requestTopic", "/asker", "/shared/other", TCPROS, uri=outer(field, "/voice"))
-    assert (answer[0], answer[2]) == (0, [])
+    assert (answer[0], answer[2]) == (-1, []), "as rospy says it"
 
 
 # --- the relay's ports ---
@@ -781,10 +853,19 @@ def test_grant_of_another_host(field: Field) -> None:
 
 
 def test_host_that_no_rule_names(field: Field) -> None:
-    """A stranger gets a fault that says so, before his request is read, and is recorded."""
+    """A stranger gets a fault that says so, and is recorded with what he asked for."""
     answer = field.call(field.stranger, "getPid", "/stranger")
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
-    field.recorded(host="10.77.0.99", decision="deny")
+    record = field.recorded(host="10.77.0.99", decision="deny", resource="getPid", caller_id="/stranger")
+    assert record["detail"] == {"call": "getPid", "stranger": True}
+    field.call(field.stranger, "registerPublisher", "/evil", "/shared/x", "std_msgs/String", field.api)
+    field.recorded(host="10.77.0.99", category="publish", resource="/shared/x", caller_id="/evil")
+    wider = field.home / "wider.ini"
+    wider.write_text("[Publishers]\n/shared/x = 10.77.0.99\n[Nodes]\ndefault = *\n")
+    differs = field.appliance.rosrv(
+        "policy", "diff", str(field.appliance.policy_file), str(wider), check=False
+    ).stdout
+    assert any("/shared/x" in line and "10.77.0.99" in line for line in differs.splitlines()), differs
     face = outer(field, "/voice")
     answer = field.call(field.stranger, "getPid", "/stranger", uri=face)
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
@@ -867,20 +948,30 @@ def bomb(connection: socket.socket, _request: bytes) -> None:
     "behave", [silent, endless, twice, rubbish, redirect, drip, bomb], ids=lambda one: one.__name__
 )
 def test_node_that_lies(field: Field, behave: Any) -> None:
-    """A node of the rogue's that misbehaves when it is called costs only himself, and the answer stays well formed."""
+    """A node of the rogue's that misbehaves when it is called costs only himself: who asks it gets a well-formed answer
+    or, where it gives none, the end of the connection, as of a node that is not there."""
     before = field.memory()
     with Impostor(field.attacker, behave) as node:
         name, topic = f"/liar_{behave.__name__}", f"/shared/liar_{behave.__name__}"
         assert field.rogue("registerPublisher", name, topic, "std_msgs/String", node.uri)[0] == 1
         uri = outer(field, name)
         answers: list[Any] = []
-        asking = threading.Thread(target=lambda: answers.append(field.rogue("getPid", "/asker", uri=uri)))
+
+        def ask() -> None:
+            try:
+                answers.append(field.rogue("getPid", "/asker", uri=uri))
+            except ConnectionError as error:
+                answers.append(error)
+
+        asking = threading.Thread(target=ask)
         asking.start()
         assert node.called.wait(LIMIT)
         field.unharmed(20)
         asking.join(LIMIT)
         [answer] = answers
-        assert len(answer) == 3
-        assert isinstance(answer[1], str)
+        assert isinstance(answer, ConnectionError) != (behave is twice)
+        if behave is twice:
+            assert len(answer) == 3
+            assert isinstance(answer[1], str)
         assert f":{node.port}" not in str(answer)
     assert field.memory() < before + (100 << 20)

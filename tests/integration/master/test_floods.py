@@ -101,7 +101,7 @@ def test_connections(calm: Field) -> None:
         for _ in range(700):
             held.append(calm.attacker.run(lambda: socket.create_connection(("10.77.0.2", 11311), 1)))
     record = calm.recorded(event="limit exceeded", host=HOST)
-    assert "connections open, the limit for one host" in record["reason"]
+    assert "connections open; the share of one host is" in record["reason"]
     assert bystander(calm) < SLOW
     for one in held:
         one.close()

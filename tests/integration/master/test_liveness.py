@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import xmlrpc.client
 from pathlib import Path
 
@@ -41,6 +42,34 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
         finally:
             tail.stop()
         assert [record["caller_id"] for record in appliance.audit("--event", "node lost")] == ["/brief"]
+
+
+def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Host, tmp_path: Path) -> None:
+    """450 nodes of a guest take connections and answer nothing; a node that is gone is lost within some looks."""
+    guest = lab.host("guest", "10.77.0.66/24")
+    config = tmp_path / "appliance.yaml"
+    config.write_text("liveness: {interval: 2, silent: 300}\n")
+    with Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance:
+        with guest.entered():
+            silent = socket.create_server(("10.77.0.66", 4000), backlog=1024)
+
+        def register(name: str, uri: str) -> None:
+            with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+                answer = master.registerSubscriber(name, "/chatter", "std_msgs/String", uri)
+            assert isinstance(answer, list)
+            assert answer[0] == 1, answer
+
+        def fill() -> None:
+            for number in range(450):
+                register(f"/guest_{number}", f"http://10.77.0.66:4000/{number}")
+
+        with silent:
+            guest.run(fill)
+            command = [ROSRV, "audit", "tail", "--json", "--state", str(appliance.state)]
+            with Process(ThisMachine(), command, env=os.environ, label="rosrv audit tail") as tail:
+                tail.wait_for(lambda event: "sequence" in event)
+                robot.run(lambda: register("/brief", NOBODY))
+                tail.wait_for(event="node lost", caller_id="/brief", timeout=8)
 
 
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])

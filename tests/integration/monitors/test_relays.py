@@ -5,7 +5,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,7 @@ from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.relay_driver import wait_until
 from tests.support.requirements import needs
+from tests.support.rosmaster import PlainMaster
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 SPECIFICATION = """
@@ -190,3 +191,27 @@ def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
     for listener in listeners:
         heard = [event["publisher"] for event in listener.seen(event="received")]
         assert len(heard) == len(set(heard)) >= 3, ros.story()
+
+
+@pytest.mark.parametrize("master", ["plain", "appliance"])
+@pytest.mark.parametrize("client", CLIENTS)
+def test_the_next_subscriber_of_a_stream_gets_nothing_old(
+    request: pytest.FixtureRequest, tmp_path: Path, client: Client, master: str
+) -> None:
+    """Nothing that was said before it was started, behind the appliance as on a plain master: nobody acts on it."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with ExitStack() as stack:
+        if master == "plain":
+            uri = stack.enter_context(PlainMaster(tmp_path)).master_uri
+        else:
+            uri = request.getfixturevalue("appliance").master_uri
+        ros = stack.enter_context(RosSession(uri, tmp_path))
+        talker = ros.talker(client, "/left", "--rate", "20")
+        talker.wait_for_count(30, event="sent")
+        for name in ("first", "second"):
+            said = talker.seen(event="sent")[-1]["number"]
+            listener = ros.listener(client, "/left", name=name)
+            heard = listener.wait_for(event="received")["data"]
+            assert int(heard.split()[-1]) > said
+            listener.stop()
+            talker.wait_for_count(said + 60, event="sent")

@@ -190,6 +190,7 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
         assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
         assert told(robot, "fire")["shots"] == shots
     [dropped] = appliance.audit("--event", "message dropped", resource=TRIGGERED)
+    assert (dropped["caller_id"], dropped["host"]) == ("/ocu", "127.0.0.1")
     assert "safeTrigger" in json.dumps(dropped)
 
 

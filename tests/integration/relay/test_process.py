@@ -9,6 +9,7 @@ import pytest
 
 from appliance.channel.messages import NodePlaced, NodeWithdrawn, StateEnded
 from appliance.relay.limits import Limits
+from appliance.relay.process import fitted
 from tests.support.relay_driver import LOOPBACK, RelayProcess
 
 
@@ -32,7 +33,9 @@ def test_it_says_that_it_is_ready_and_how_it_sends(relay: RelayProcess) -> None:
     """The status shows which congestion control it got and how many connections it may have."""
     assert relay.ready.detail["index"] == 0
     assert relay.ready.detail["congestion"].startswith(("cubic", "bbr", "reno"))
-    assert relay.ready.detail["connections"] == Limits().connections
+    assert (
+        relay.ready.detail["connections"] == fitted(Limits(), relay.ready.detail["descriptors"]).connections
+    )
 
 
 def test_it_answers_pings_from_its_main_loop(relay: RelayProcess) -> None:

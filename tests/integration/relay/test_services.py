@@ -104,7 +104,7 @@ def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSessio
     """With an error header, and control is told; services that are not there likewise."""
     ros.service_server("rospy", "/mode", name="server")
     face = driver.faces["/server"]
-    driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK))
+    driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK, "/client"))
     for service, reason in (("/mode", "no grant"), ("/other", "not a provider")):
         fields = {"callerid": "/client", "service": service, "md5sum": "*"}
         assert reason in ask_header(face, fields)["error"]
@@ -117,7 +117,7 @@ def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, r
     client = ros.service_client("rospy", "/mode", "--persistent", name="client")
     client.send("true")
     client.wait_for(event="answered")
-    driver.link.send(ClientRevoked(driver.faces["/server"].key, "/mode", LOOPBACK))
+    driver.link.send(ClientRevoked(driver.faces["/server"].key, "/mode", LOOPBACK, "/client"))
     driver.link.wait_for(
         lambda message: isinstance(message, ConnectionClosed) and "revoked" in message.reason
     )

@@ -106,8 +106,9 @@ class _Actor:
         self.lifeline.send(Ready())
 
     def misbehave(self) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            self.lifeline.send(SocketKept("stolen"), (listener.fileno(),))
+        one, other = socket.socketpair()
+        with one, other:
+            self.lifeline.send(SocketKept("stolen"), (one.fileno(),))
 
     def say(self, **fields: Any) -> None:
         os.write(2, (json.dumps({"actor": self.name, "pid": os.getpid(), **fields}) + "\n").encode())

@@ -17,8 +17,10 @@ from appliance.network.lab import Host, Lab
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Contained, InNamespace, Ports
 from tests.support.requirements import need_program, need_root
+from tests.support.translators import TRANSLATORS, load
 
 NODES = range(19001, 19101)
+OWN_NODE = range(18000, 18064)
 
 
 @pytest.fixture
@@ -40,7 +42,9 @@ def hidden(host: Host) -> Iterator[int]:
 @pytest.fixture
 def enclosure(host: Host, hidden: int) -> Iterator[Contained]:
     """The surroundings of an appliance whose ROSMaster is the hidden port."""
-    made = Contained(Ports(master=11311, rosmaster=hidden, nodes=NODES), "auto", host.namespace)
+    made = Contained(
+        Ports(master=11311, rosmaster=hidden, nodes=NODES, own_node=OWN_NODE), "auto", host.namespace
+    )
     yield made
     made.remove()
 
@@ -180,7 +184,7 @@ def test_rules_on_the_host_come_back(host: Host, tmp_path: Path) -> None:
     forwarded = IsolationSettings(
         ports=(PortRange.one(11311),), name=f"renc{os.getpid()}", directory=tmp_path
     )
-    ports = Ports(master=11311, rosmaster=11411, nodes=NODES)
+    ports = Ports(master=11311, rosmaster=11411, nodes=NODES, own_node=OWN_NODE)
     enclosure = InNamespace(ports, "auto", Isolation(host.namespace, forwarded))
     enclosure.build()
     try:
@@ -188,6 +192,28 @@ def test_rules_on_the_host_come_back(host: Host, tmp_path: Path) -> None:
         report = enclosure.report()
         assert report["forwarding"]
         assert all(rule["in_force"] for rule in report["forwarding"] + report["rules"])
+    finally:
+        enclosure.remove()
+
+
+def test_what_others_do_to_forwarded_packets_is_said(host: Host, tmp_path: Path) -> None:
+    """Docker's rules on the host are in the report; the namespace takes only the machine's own packets for its."""
+    need_program("iptables-legacy-restore", "iptables")
+    load(host.namespace, TRANSLATORS[0].form, TRANSLATORS[0].rules)
+    forwarded = IsolationSettings(
+        ports=(PortRange.one(11311),), name=f"rend{os.getpid()}", directory=tmp_path
+    )
+    ports = Ports(master=11311, rosmaster=11411, nodes=NODES, own_node=OWN_NODE)
+    isolation = Isolation(host.namespace, forwarded)
+    enclosure = InNamespace(ports, "auto", isolation)
+    enclosure.build()
+    try:
+        report = enclosure.report()
+        assert report["translations"] == [TRANSLATORS[0].chain]
+        (obstacle,) = report["obstacles"]
+        assert "iptables-legacy chain filter FORWARD" in obstacle
+        own = f"{isolation.ends[4].host}: the machine's own packets only"
+        assert [rule["in_force"] for rule in report["rules"] if rule["purpose"] == own] == [True]
     finally:
         enclosure.remove()
 

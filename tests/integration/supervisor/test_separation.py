@@ -19,6 +19,7 @@ READS = {  # besides what is its own
     "syslog": LOG,
     "relay": set(),
     "rosmaster": set(),
+    "rosout": set(),
     "signer": set(),
     "ipsec": set(),
     "control": set(),

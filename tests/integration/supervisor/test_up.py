@@ -200,3 +200,53 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
         finally:
             assert running.stop(with_signal=signal.SIGTERM) == 0
         assert not Path("/run/netns/rosrv").exists()
+
+
+@pytest.mark.parametrize(
+    ("policy", "monitors", "said"),
+    [
+        (None, None, "the policy cannot be read: No such file or directory"),
+        ("[Nodes]\nbogus\n[Publishrs]\n", None, "policy.ini:2:1: error:"),
+        ("\xff", None, "not UTF-8"),
+        (POLICY, "missing", "there is no such folder of specifications"),
+        (POLICY, "wrong", "wrong.rv:2:"),
+    ],
+    ids=["no policy", "wrong policy", "no text", "no folder", "wrong specification"],
+)
+def test_what_it_is_to_read_is_read_before_anything_is_made(
+    directory: Path, policy: str | None, monitors: str | None, said: str
+) -> None:
+    """A policy or specifications that are not there, or wrong: exit status 1, every place, and no state directory."""
+    (directory / "policy.ini").unlink()
+    if policy is not None:
+        (directory / "policy.ini").write_bytes(policy.encode("latin-1"))
+    (directory / "wrong").mkdir()
+    (directory / "wrong" / "wrong.rv").write_text(
+        "speed() {\n    event said() /chatter std_msgs/Strong '{}' { }\n}\n"
+    )
+    more = () if monitors is None else ("--monitors", str(directory / monitors))
+    assert said in refusal(directory, *more)
+    assert not (directory / "state").exists()
+
+
+def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
+    """The appliance starts with what an operator brought into force, though the file is gone; else it does not."""
+    with up(directory, "--json") as running:
+        running.wait_for(event="ready", timeout=60)
+        state = str(directory / "state")
+        for verb in (("reload",), ("rollback", "1")):
+            subprocess.run(
+                [ROSRV, "policy", *verb, "--state", state], env=ENVIRONMENT, check=True, timeout=60
+            )
+    (directory / "policy.ini").unlink()
+    with up(directory, "--json") as running:
+        assert running.wait_for(event="ready", timeout=60)["revision"] == 3
+    (directory / "policy.ini").write_text(POLICY)
+    with up(directory, "--json") as running:
+        running.wait_for(event="ready", timeout=60)
+        subprocess.run(
+            [ROSRV, "policy", "reload", "--state", str(directory / "state")],
+            env=ENVIRONMENT, check=True, timeout=60,
+        )  # fmt: skip
+    (directory / "policy.ini").unlink()
+    assert "the policy cannot be read" in refusal(directory)

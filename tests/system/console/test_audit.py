@@ -53,7 +53,7 @@ def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: 
     for number in range(120):
         attempt("getParam", f"/reader_{number}", "/nothing")
     reader = opened()
-    page = reader.go("audit")
+    page = reader.go("audit?looks=1")
     expect(page.locator("tbody tr")).to_have_count(100)
     page.get_by_role("button", name="Older records").click()
     expect(page.locator("tbody tr").nth(110)).to_be_visible()
@@ -139,3 +139,33 @@ def test_the_list_goes_by_keys(opened: Callable[..., Reader], attempt: Callable[
     expect(page.locator("tbody tr.chosen")).to_have_count(0)
     page.keyboard.press("/")
     expect(page.get_by_label("Text")).to_be_focused()
+
+
+def test_the_readers_own_looks_are_not_what_is_shown_first(
+    opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """After views were opened the newest record is what a host did; the looks are there when they are asked for."""
+    reader = opened()
+    refuse(attempt, "/before_the_looks")
+    for view in ("monitors", "hosts", "policy"):
+        expect(reader.go(view).get_by_role("heading", level=1)).to_be_visible()
+    page = reader.go("audit")
+    expect(page.locator("tbody tr").first).to_be_visible()
+    looked = re.compile("v1.(monitors|hosts|policy)")
+    expect(page.locator("tbody tr").filter(has_text=looked)).to_have_count(0)
+    expect(page.get_by_role("row", name="/before_the_looks").first).to_be_visible()
+    page = reader.go("audit?looks=1")
+    expect(page.locator("tbody tr").filter(has_text=looked).first).to_be_visible()
+
+
+def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """On a wide screen no column is so narrow that a name of a dozen letters is broken, whatever the others hold."""
+    refuse(attempt, "/a_dozen_let")
+    page = opened().go("audit")
+    expect(page.get_by_role("row", name="/a_dozen_let").first).to_be_visible()
+    broken = page.eval_on_selector_all(
+        "tbody .given-mono",
+        """names => names.filter(name => name.innerText.length <= 12 && name.getClientRects().length > 1)
+                         .map(name => name.innerText)""",
+    )
+    assert broken == []

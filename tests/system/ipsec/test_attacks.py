@@ -218,7 +218,7 @@ def test_a_host_cannot_ask_for_anothers_address(
     conf.write_text(conf.read_text().replace("local_ts = dynamic", f"local_ts = {theirs}/32"))
     mark = site.mark
     with insisting:
-        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+        refused = site.refused(mark, OTHER)
     assert "traffic that is not allowed" in refused["reason"]
 
 
@@ -229,7 +229,7 @@ def test_a_name_must_be_the_certificates(site: TunnelSite, kit: Path, other: Hos
     conf.write_text(conf.read_text().replace("id = fqdn:ocu-2", "id = fqdn:ocu-1"))
     mark = site.mark
     with thief:
-        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+        refused = site.refused(mark, OTHER)
     assert refused["decision"] == "deny"
     assert site.state() == "down"
 
@@ -332,7 +332,7 @@ def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -
     with site.join(expiring, other) as visitor:
         site.recorded(mark, event="tunnel up", host=visitor.address)
         site.recorded(mark, event="tunnel down", host=visitor.address)
-        refused = site.recorded(mark, event="tunnel refused", host=OTHER)
+        refused = site.refused(mark, OTHER)
         assert refused["decision"] == "deny"
     assert site.state("visitor") == "expired"
     site.appliance.rosrv("host", "revoke", "visitor")

@@ -27,7 +27,7 @@ def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
                 mark = site.mark
                 site.appliance.rosrv("host", "revoke", "ocu-1")
                 site.recorded(mark, event="tunnel down")
-                site.recorded(mark, event="tunnel refused", decision="deny")
+                assert site.refused(mark)["decision"] == "deny"
             site.appliance.stop()
             passphrase.write_text("wrong\n")
             said = start_in_vain(site)

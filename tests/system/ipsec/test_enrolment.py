@@ -30,7 +30,7 @@ from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root
 from tests.support.rest import Rest
 from tests.support.script_host import ScriptHost
-from tests.support.tunnel_site import MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
+from tests.support.tunnel_site import LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
 
 API = 8443
@@ -307,8 +307,12 @@ def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, t
     second = row(site, "brief")
     assert second["serial"] != first["serial"]
     assert second["expires"] >= first["expires"]  # in whole seconds, and a quick machine takes less
-    site.recorded(mark, event="tunnel down")
-    site.recorded(site.mark - 1, event="tunnel up")
+    down = site.recorded(mark, event="tunnel down")
+    site.trail.wait_for(
+        lambda event: event.get("event") == "tunnel up" and event["sequence"] > down["sequence"],
+        since=mark,
+        timeout=LONG,
+    )
     assert row(site, "brief")["serial"] == second["serial"]
     site.appliance.rosrv("host", "revoke", "brief")
 

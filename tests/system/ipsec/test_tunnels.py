@@ -115,7 +115,7 @@ def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
     mark = site.mark
     with thief:
         thief.wait_until_refused()
-        refused = site.recorded(mark, event="tunnel refused")
+        refused = site.refused(mark)
     assert refused["host"] == ATTACKER
     assert "no issuer certificate found" in refused["reason"]
     assert refused["decision"] == "deny"
@@ -155,7 +155,7 @@ def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: 
     mark = site.mark
     new = site.kit("kit")
     site.recorded(mark, event="tunnel down")
-    refused = site.recorded(mark, event="tunnel refused")
+    refused = site.refused(mark)
     assert refused["host"] == OCU
     assert "revoked" in refused["reason"]
     joined.stop()
@@ -184,7 +184,7 @@ def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
         moments = [_seconds(record) for record in (revoked, closed, down)]
         assert max(moments) - moments[0] < 1.0
         assert "/orders" not in on_robot.run("/usr/bin/rostopic", "list", "-p").stdout
-        refused = site.recorded(mark, event="tunnel refused", host=OCU)
+        refused = site.refused(mark, OCU)
         assert refused["decision"] == "deny"
         assert site.state() == "revoked"
         talker.kill()  # it cannot say good-bye to anybody

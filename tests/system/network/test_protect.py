@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from appliance.network import links
 from appliance.network.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
+from tests.support.translators import TRANSLATORS, guest_behind, load
+from tests.system.network.test_isolation import serving, source_seen
 
 COMMAND = (
     "import sys, typer; from appliance.cli.protect import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
@@ -115,6 +118,40 @@ def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attack
         assert reaches(robot, "127.0.0.1", INSIDE)
         protect(robot, "--remove")
         assert reaches(attacker, robot.address, INSIDE)
+
+
+def test_nobody_behind_the_machine_is_taken_for_it(
+    lab: Lab, robot: Host, gateway: Host, attacker: Host
+) -> None:
+    """A container on the robot arrives at the appliance as the robot; with the protection it does not arrive at all."""
+    need_program("iptables-legacy-restore", "iptables")
+    behind = lab.host("container", "10.76.0.2/24")
+    links.delete_link(behind.namespace, "eth0")
+    guest = guest_behind(robot.namespace, behind.namespace, TRANSLATORS[0])
+    links.add_route(gateway.namespace, f"{TRANSLATORS[0].network}.0/24", robot.address)
+    with serving(gateway.namespace, 11311) as master, serving(attacker.namespace, 80) as elsewhere:
+        assert source_seen(master, guest, gateway.address, 11311) == robot.address
+        close(robot, gateway)
+        with guest.entered(), pytest.raises(TimeoutError):
+            socket.create_connection((gateway.address, 11311), timeout=1)
+        assert source_seen(master, robot, gateway.address, 11311) == robot.address
+        assert source_seen(master, robot, gateway.address6, 11311) == robot.address6
+        assert source_seen(elsewhere, guest, attacker.address, 80) == robot.address, (
+            "not the appliance's affair"
+        )
+        load(robot.namespace, "iptables-legacy-restore", "*nat\n-F POSTROUTING\nCOMMIT\n")
+        assert source_seen(master, guest, gateway.address, 11311) == guest.address, "a router stays a router"
+
+
+def test_a_machine_that_forged_first_packets_can_fill_is_told(robot: Host, gateway: Host) -> None:
+    """Without SYN cookies half-open connections keep the appliance out; who applies the file is told so."""
+    robot.namespace.sysctl("net.ipv4.tcp_syncookies", "0")
+    command = [sys.executable, "-c", COMMAND, "--appliance", gateway.address, "--ports", FEW, "--apply"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    process = robot.popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=environment
+    )
+    assert "sysctl -w net.ipv4.tcp_syncookies=1" in process.communicate(timeout=240)[1]
 
 
 def test_the_check_from_outside_sees_what_is_open(robot: Host, gateway: Host, attacker: Host) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, StatusWanted
@@ -47,6 +48,11 @@ def run(play: Callable[[ControlLink, Callable[[], Control], list[TokenKept]], Aw
     asyncio.run(whole())
 
 
+def bearer(shown: str) -> Bearer:
+    """Somebody who showed this."""
+    return Bearer("0", "alice", Role.ADMIN, 1e12, shown)
+
+
 def call(number: int) -> RestCalled:
     """A call to be recorded."""
     return RestCalled("h", "w", "GET", f"/{number}", 200, "", 1)
@@ -57,9 +63,9 @@ def test_each_question_gets_its_own_answer() -> None:
 
     async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
         there = control()
-        asked = [asyncio.create_task(link.ask(StatusWanted(), f"who{one}")) for one in range(3)]
+        asked = [asyncio.create_task(link.ask(StatusWanted(), bearer(f"who{one}"))) for one in range(3)]
         for made in reversed(await there.until(3)):
-            there.channel.send(messages.RequestAnswered(made.number, AdminAnswer(True, {"who": made.who})))
+            there.channel.send(messages.RequestAnswered(made.number, AdminAnswer(True, {"who": made.shown})))
         assert [(await one).body["who"] for one in asked] == ["who0", "who1", "who2"]
 
     run(play)
@@ -70,17 +76,17 @@ def test_a_question_ends_with_the_link_or_in_time() -> None:
 
     async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
         with pytest.raises(ControlAwayError, match="restarted"):
-            await link.ask(StatusWanted(), "w")
+            await link.ask(StatusWanted(), bearer("w"))
         there = control()
         with pytest.raises(ControlAwayError, match=r"within 0\.01 s"):
-            await link.ask(StatusWanted(), "w", seconds=0.01)
-        dying = asyncio.create_task(link.ask(StatusWanted(), "w"))
+            await link.ask(StatusWanted(), bearer("w"), seconds=0.01)
+        dying = asyncio.create_task(link.ask(StatusWanted(), bearer("w")))
         await there.until(2)
         there.channel.close()
         with pytest.raises(ControlAwayError, match="not known"):
             await dying
         there = control()
-        replaced = asyncio.create_task(link.ask(StatusWanted(), "w"))
+        replaced = asyncio.create_task(link.ask(StatusWanted(), bearer("w")))
         await there.until(1)
         control()
         with pytest.raises(ControlAwayError):
@@ -94,7 +100,7 @@ def test_open_questions_are_bounded() -> None:
 
     async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
         there = control()
-        asked = [asyncio.create_task(link.ask(StatusWanted(), "w", seconds=1)) for _ in range(200)]
+        asked = [asyncio.create_task(link.ask(StatusWanted(), bearer("w"), seconds=1)) for _ in range(200)]
         answers = await asyncio.gather(*asked, return_exceptions=True)
         assert all(isinstance(one, ControlAwayError) for one in answers)
         assert len(there.heard) == 48

@@ -24,7 +24,7 @@ def test_what_control_adds_is_passed_on() -> None:
     """A section of the status that a newer part of the appliance adds is shown, not a failure."""
     fields = {
         "version": "1", "master": "http://10.0.0.1:11311", "since": 1.0,
-        "processes": [{"role": "control", "pid": 1, "since": "-", "restarts": 0}],
+        "processes": [{"role": "control", "pid": 1, "since": "-", "restarts": 0, "walls": "", "lacks": []}],
         "isolation": "none", "relaying": "all", "mediation": "full", "firewall": {}, "probe": "",
         "policy": {
             "revision": 1, "file": "f", "source": "f", "who": "disk", "differs_from_file": False, "warnings": 0,

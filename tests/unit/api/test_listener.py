@@ -2,14 +2,20 @@
 
 import asyncio
 import contextlib
+import datetime
 import socket
+import ssl
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 
+import uvloop
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
+from appliance.api.certificate import tls_context
 from appliance.api.listener import Listener
 from appliance.config import ApiLimits
+from appliance.shares.pool import Standing
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
@@ -25,7 +31,7 @@ def run(limits: ApiLimits, play: Callable[[Connect], Awaitable[None]]) -> None:
 
     async def whole() -> None:
         sock = socket.create_server(("127.0.0.1", 0))
-        listener = Listener(application, limits)
+        listener = Listener(application, limits, lambda _peer: Standing.REGISTERED)
         await listener.start(sock, None)
         writers: list[asyncio.StreamWriter] = []
 
@@ -198,3 +204,72 @@ def test_so_many_requests_wait_on_a_connection() -> None:
         assert text.count(b"HTTP/1.1 200") < 100
 
     run(ApiLimits(), play)
+
+
+def test_strangers_in_the_handshake_make_room(tmp_path: Path) -> None:
+    """Silent connections count from the moment they are accepted: a known peer is served at once, and its own stay."""
+
+    async def play() -> None:
+        context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
+        known = {"127.0.0.1"}
+        listener = Listener(
+            application,
+            ApiLimits(connections=16, connections_per_host=12),
+            lambda peer: Standing.REGISTERED if peer in known else Standing.STRANGER,
+        )
+        sock = socket.create_server(("127.0.0.1", 0))
+        where = sock.getsockname()
+        await listener.start(sock, context)
+        silent = [socket.create_connection(where, source_address=(f"127.0.1.{n}", 0)) for n in range(1, 61)]
+        trust = ssl.create_default_context(cafile=tmp_path / "certificate.pem")
+        trust.check_hostname = False
+        pool = listener.arrivals.connected
+        for _ in range(12):
+            reader, writer = await asyncio.open_connection(*where, ssl=trust)
+            assert await served(reader, writer)
+            assert pool.held_by(Standing.STRANGER) <= 6
+            assert pool.total <= 16
+        assert pool.held("127.0.0.1") == 12
+        for one in silent:
+            one.close()
+        await listener.stop()
+
+    async def bounded() -> None:
+        async with asyncio.timeout(30):
+            await play()
+
+    uvloop.run(bounded())
+
+
+def test_a_handshake_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    """Nonsense, an end in the middle, and silence beyond the time: the place is free again."""
+
+    async def play() -> None:
+        context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
+        listener = Listener(application, ApiLimits(header_seconds=0.3), lambda _peer: Standing.STRANGER)
+        sock = socket.create_server(("127.0.0.1", 0))
+        where = sock.getsockname()
+        await listener.start(sock, context)
+        peers = [socket.create_connection(where) for _ in range(3)]
+        peers[0].sendall(b"GET / HTTP/1.1\r\n\r\n")
+        peers[1].sendall(b"\x16\x03\x01")
+        peers[1].close()
+        await asyncio.sleep(0)
+        while listener.arrivals.connected.total or not await at_end(peers[2]):
+            await asyncio.sleep(0.01)
+        for peer in peers:
+            peer.close()
+        await listener.stop()
+
+    async def at_end(peer: socket.socket) -> bool:
+        peer.setblocking(False)
+        try:
+            return await asyncio.get_running_loop().sock_recv(peer, 1) == b""
+        except ConnectionError:
+            return True
+
+    async def bounded() -> None:
+        async with asyncio.timeout(30):
+            await play()
+
+    uvloop.run(bounded())

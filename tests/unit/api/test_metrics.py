@@ -39,6 +39,8 @@ def body() -> dict[str, Any]:
         "delayed": {"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
         "drop_at": {"/b": [5]}, "change_at": {"/b": [6], "(others)": [1]},
         "connections": {"topic": 7},
+        "memory": {"latched": 12},
+        "limited": [["/scan", "publisher", 3]],
         "rest": [(("GET", "200"), 8)],
         "hosts": [
             host("a", "up", remote="10.0.0.9", seconds=7, bytes_in=100, bytes_out=50, expires=time.time() + 1000),

@@ -1,5 +1,7 @@
 """What tests of the audit log share: a place, a log with a signer that lives in the test, and records."""
 
+import contextlib
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,8 +10,39 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
+from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
 
 MakeLog = Callable[..., AuditLog]
+
+
+class Notary:
+    """The signer's memory, settings and clock, which stands `ago` nanoseconds behind."""
+
+    def __init__(self, directory: Path) -> None:
+        directory.mkdir()
+        self.directory = directory
+        self.ago = 0
+        self.kept = Kept()
+        self._signed = SignedCheckpoints(directory, clock=self._now)
+
+    def _now(self) -> int:
+        return time.time_ns() - self.ago
+
+    def sign(self, text: bytes) -> None:
+        """Remember a checkpoint, unless it is of another past: some tests make these."""
+        with contextlib.suppress(CheckpointRefusedError):
+            self._signed.approve(text)
+
+    def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
+        """The text of a removal. Raises `RemovalRefusedError`."""
+        return Removals(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
+
+
+@pytest.fixture
+def notary(tmp_path: Path) -> Notary:
+    """What the signer of a test's logs remembers."""
+    return Notary(tmp_path / "notary")
 
 
 @pytest.fixture
@@ -25,22 +58,42 @@ def key() -> Ed25519PrivateKey:
 
 
 @pytest.fixture
-def make_log(path: Path, key: Ed25519PrivateKey) -> Iterator[MakeLog]:
-    """Opens logs at `path` that are signed at once, and closes them after the test."""
-    logs: list[AuditLog] = []
+def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[MakeLog]:
+    """Opens logs at `path` that are signed at once, and closes them after the test.
+
+    The signer has the retention that the log is opened with.
+    """
+    logs: list[AuditLog] = []  # the one that is open
+    made: list[AuditLog] = []
     public = key.public_key().public_bytes_raw()
 
     def sign(number: int, text: bytes) -> None:
         if logs:  # what a log asks while it is being made is asked again by `request_signatures`
+            notary.sign(text)
             logs[-1].signed(number, key.sign(text), public)
+
+    def approve(number: int, checkpoint: bytes, newest: bytes) -> None:
+        if not logs:
+            return
+        try:
+            text = notary.approve(checkpoint, newest)
+        except RemovalRefusedError as error:
+            logs[-1].removal_refused(number, str(error))
+        else:
+            logs[-1].removal_approved(number, text, key.sign(text), public)
 
     def make(**settings: Any) -> AuditLog:
         settings.setdefault("signer", sign)
+        settings.setdefault("removals", approve)
+        logs.clear()
+        if "retention" in settings:
+            notary.kept = Kept(settings["retention"].days, settings["retention"].size)
         log = AuditLog(path, **settings)
         logs.append(log)
+        made.append(log)
         log.request_signatures()
         return log
 
     yield make
-    for log in logs:
+    for log in made:
         log.close()

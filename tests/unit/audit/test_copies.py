@@ -22,7 +22,7 @@ from appliance.audit.retention import Retention
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
-from tests.unit.audit.conftest import MakeLog
+from tests.unit.audit.conftest import MakeLog, Notary
 
 
 @pytest.fixture
@@ -128,23 +128,29 @@ def test_all_signed_with_a_new_key(log: Path, tmp_path: Path) -> None:
     assert kinds(verify(log, public, tmp_path / "signer", copies)) == {Kind.WRONG_KEY}
 
 
-def test_records_that_retention_removed(make_log: MakeLog, path: Path) -> None:
-    """Checkpoints of records that retention removed since are no contradiction."""
+def test_records_that_retention_removed(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """Checkpoints of what retention removed since are no contradiction; alone they prove nothing, and that is said."""
+    notary.ago = 2 * 86_400_000_000_000
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):
         log.record(decision(log, number, time=1))
         settle(log)
     log.close()
     copies = signed_checkpoints(path)
+    notary.ago = 0
     log = make_log(checkpoint_every=20, retention=Retention(days=1))
     deadline = time.monotonic() + 30
     while not verify(path).removed and time.monotonic() < deadline:
         log.record(decision(log))
         settle(log)
     log.close()
-    result = verify(path, copies=copies)
+    newer = signed_checkpoints(path)
+    result = verify(path, copies=copies + newer)
     assert result.ok, result.findings
     assert copies[0].sequence <= result.removed
+    gone = [one for one in copies if one.sequence < result.removed]
+    assert gone
+    assert kinds(verify(path, copies=gone)) == {Kind.PROVES_NOTHING}
 
 
 def test_what_a_file_may_look_like(log: Path, tmp_path: Path) -> None:

@@ -6,22 +6,28 @@ from typing import Any
 import msgspec
 
 from appliance.audit.folding import Folder, FoldSettings
-from appliance.audit.record import Record
+from appliance.audit.record import Record, RuleReference
+from appliance.shares.pool import Bounds
 
 _numbers = itertools.count(1)
 
 
-def make_folder(**settings: Any) -> Folder:
-    """A folder whose summaries are called s1, s2, ..."""
+def make_folder(
+    seconds: float = 10.0, keys: int = 4096, keys_per_host: int = 256, strangers: int = 8
+) -> Folder:
+    """A folder whose summaries are called s1, s2, ..., with room for so many kinds."""
     ids = itertools.count(1)
-    return Folder(FoldSettings(**settings), lambda: f"s{next(ids)}", lambda: 1)
+    bounds = Bounds(keys, min(keys_per_host, keys), min(strangers, keys), 0)
+    settings = FoldSettings(seconds=seconds, kinds=bounds, read_kinds=bounds)
+    return Folder(settings, lambda: f"s{next(ids)}", lambda: 1)
 
 
 def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> Record:
     """A denial with an id of its own."""
-    fields = {"decision": "deny", "caller_id": "/n", "category": "call", "reason": "no"} | fields
-    made = f"r{next(_numbers)}"
-    return Record(id=made, time=1, event="decision", host=host, resource=resource, **fields)
+    plain: dict[str, Any] = {
+        "event": "decision", "decision": "deny", "caller_id": "/n", "category": "call", "reason": "no",
+    }  # fmt: skip
+    return Record(id=f"r{next(_numbers)}", time=1, host=host, resource=resource, **(plain | fields))
 
 
 def offer(folder: Folder, *records: Record, now: float = 0) -> list[Record]:
@@ -58,10 +64,11 @@ def test_summaries_go_on_while_it_repeats() -> None:
 
 
 def test_what_differs_is_not_folded() -> None:
-    """Another host, caller, resource, reason or policy revision is another kind, recorded in full."""
+    """Another host, caller, resource, reason, rule or policy revision is another kind, recorded in full."""
     folder = make_folder()
     kinds = [
-        denial(), denial(host="10.0.0.2"), denial(caller_id="/other"), denial("/b"), denial(reason="other"),
+        denial(), denial(reason="other"), denial(host="10.0.0.2"), denial(caller_id="/other"), denial("/b"),
+        denial(rule=RuleReference("Publishers", "/**", "robot.ini", 3)),
         denial(revision=9), denial(category="read"), denial(decision="would deny"),
     ]  # fmt: skip
     assert offer(folder, *kinds) == kinds
@@ -79,8 +86,8 @@ def test_an_allow_ends_the_folding_it_contradicts() -> None:
     assert offer(folder, again) == [again]
 
 
-def test_allows_are_never_folded() -> None:
-    """Every allow is recorded in full."""
+def test_allows_that_change_something_are_never_folded() -> None:
+    """Every allow that changes something is recorded in full."""
     folder = make_folder()
     allows = [denial(decision="allow") for _ in range(50)]
     assert offer(folder, *allows) == allows
@@ -109,7 +116,7 @@ def test_varied_addresses_are_folded_together() -> None:
     """Even with an address for each denial memory is bounded and every denial is counted."""
     folder = make_folder(keys=64)
     written = offer(folder, *(denial(host=f"10.1.{n // 256}.{n % 256}") for n in range(20_000)))
-    assert len(folder) <= 65
+    assert len(folder) <= 2 * 64 + 1
     summaries = list(folder.finish())
     assert len(written) + sum(one.detail["count"] for one in summaries) == 20_000
     assert len(folder) == 0
@@ -215,3 +222,110 @@ def test_what_is_no_text_can_be_kept() -> None:
     (allowed,) = [denial("/\udfff", **strange | {"decision": "allow"})]
     assert [one.event for one in offer(folder, allowed)] == ["denials folded", "decision"]
     assert len(folder) == 0
+
+
+def test_strangers_with_reasons_of_their_own_take_no_kind_of_a_named_host() -> None:
+    """Strangers who put a number of their choice into everything have a few kinds; a named host keeps its own."""
+    folder = make_folder(keys=64, strangers=8)
+    flood = [
+        denial(
+            f"/topic{number}", host=f"10.9.0.{number % 24}", caller_id=f"/n{number}", reason=f"no {number}",
+            detail={"call": "registerPublisher"}, stranger=True,
+        )
+        for number in range(5000)
+    ]  # fmt: skip
+    written = offer(folder, *flood)
+    assert len(written) == 9
+    assert len(folder) == 9
+    named = [denial(f"/{number}") for number in range(40)]
+    assert offer(folder, *named) == named
+    summaries = list(folder.finish())
+    assert sum(one.detail["count"] for one in summaries) == 5000 - 9
+    (together,) = [one for one in summaries if one.detail["scope"] == "strangers"]
+    assert together.host is None
+    assert sum(together.detail["hosts"].values()) == together.detail["count"]
+    assert len(together.detail["reasons"]) == 9
+    assert all(one.caller_id is None and one.resource is None for one in summaries)
+
+
+def test_what_a_peer_puts_into_a_reason_makes_no_kind() -> None:
+    """Numbers, names and quotations in the reason of a refused request are one kind, counted in its summary."""
+    folder = make_folder(seconds=10)
+    flood = [
+        denial(reason=f"number {number} of '/x{number}' at /n{number} is too large", event="malformed")
+        for number in range(1000)
+    ]
+    assert offer(folder, *flood) == flood[:1]
+    (one,) = folder.expire(10)
+    assert one.reason == flood[0].reason
+    assert one.detail["count"] == sum(one.detail["reasons"].values()) == 999
+    assert len(one.detail["reasons"]) == 9
+
+
+def test_many_named_hosts_keep_a_line_each() -> None:
+    """With all kinds taken by others, a named host's denials are still counted under its own address."""
+    folder = make_folder(keys=64, keys_per_host=16)
+    offer(folder, *(denial(f"/{n}", host=f"10.1.0.{host}") for host in range(4) for n in range(50)))
+    late = [denial(f"/{number}", host="10.2.0.1") for number in range(10)]
+    assert offer(folder, *late) == late[:1]
+    (mine,) = [one for one in folder.finish() if one.host == "10.2.0.1"]
+    assert mine.detail["count"] == 9
+
+
+def read(key: str, **fields: Any) -> Record:
+    """An allowed call that reads a parameter."""
+    plain: dict[str, Any] = {"decision": "allow", "folds": True, "detail": {"call": "hasParam", "key": key}}
+    return denial("hasParam", **(plain | fields))
+
+
+def test_reads_are_folded_as_denials_are() -> None:
+    """The first read of its kind is in full; the rest is one summary that says who read what, and how often."""
+    folder = make_folder(seconds=10)
+    same = [read("/a") for _ in range(500)]
+    assert offer(folder, *same, read("/b"))[:1] == same[:1]
+    (one,) = [found for found in folder.expire(10) if found.event == "repetitions folded"]
+    assert (one.decision, one.resource, one.detail["key"], one.detail["count"]) == (
+        "allow", "hasParam", "/a", 499,
+    )  # fmt: skip
+
+
+def test_reads_beyond_the_share_are_recorded_in_full() -> None:
+    """No read loses its key: past the share of kinds each is a record of its own, and takes no kind of a denial."""
+    folder = make_folder(keys=64, keys_per_host=16)
+    varied = [read(f"/{number}") for number in range(1000)]
+    assert offer(folder, *varied) == varied
+    assert len(folder) == 16
+    refused = [denial(f"/{number}") for number in range(10)]
+    assert offer(folder, *refused) == refused
+
+
+def test_a_denial_ends_the_reads_it_contradicts() -> None:
+    """What was read before a denial is summarised before it; the read after it is in full again."""
+    folder = make_folder()
+    offer(folder, read("/a"), read("/a"))
+    refused = read("/a", decision="deny", folds=False)
+    again = read("/a")
+    assert [one.event for one in offer(folder, refused)] == ["repetitions folded", "decision"]
+    assert offer(folder, again) == [again]
+
+
+def test_another_key_ends_nothing() -> None:
+    """Denials of one parameter go on being counted while the same call on another one is allowed."""
+    folder = make_folder()
+    flood = [one for n in range(100) for one in (read(f"/a/{n}"), read("/b", decision="deny", folds=False))]
+    written = offer(folder, *flood)
+    assert [one.detail["key"] for one in written].count("/b") == 1
+
+
+def test_events_of_a_host_beyond_its_budget_are_counted() -> None:
+    """What no call waits for is counted once its host is beyond its budget, by kind and past that by host."""
+    folder = make_folder(keys=64, keys_per_host=4)
+    opened = [
+        denial(f"/t{n % 8}", event="connection opened", decision=None, folds=True, reason="")
+        for n in range(800)
+    ]
+    written = offer(folder, *opened)
+    assert len(written) == 5
+    summaries = list(folder.finish())
+    assert {one.event for one in summaries} == {"repetitions folded"}
+    assert len(written) + sum(one.detail["count"] for one in summaries) == 800

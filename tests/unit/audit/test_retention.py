@@ -12,11 +12,12 @@ import pytest
 
 from appliance.audit.findings import Kind
 from appliance.audit.query import Filter
-from appliance.audit.retention import Retention
+from appliance.audit.record import Record, Severity
+from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
-from tests.unit.audit.conftest import MakeLog
+from tests.unit.audit.conftest import MakeLog, Notary
 
 _DAY = 86_400_000_000_000
 _LIMIT_SECONDS = 30
@@ -30,8 +31,9 @@ def await_removal(path: Path, through: int = 1) -> None:
         tick.wait(0.02)
 
 
-def make_old(make_log: MakeLog, path: Path) -> None:
-    """A log of 2000 records that are a week old."""
+def make_old(make_log: MakeLog, notary: Notary) -> None:
+    """A log of 2000 records that are a week old, and were signed then."""
+    notary.ago = 7 * _DAY
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock))
     for number in range(2000):
@@ -40,11 +42,12 @@ def make_old(make_log: MakeLog, path: Path) -> None:
             settle(log)
     log.record(decision(log, time=next(clock)))
     log.close()
+    notary.ago = 0
 
 
-def test_old_records_go_and_that_is_recorded(make_log: MakeLog, path: Path) -> None:
+def test_old_records_go_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """Records past the limit are removed, the log says which, and verification proves the rest."""
-    make_old(make_log, path)
+    make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
     log.record(fresh)
@@ -96,6 +99,50 @@ def test_size(make_log: MakeLog, path: Path) -> None:
     assert "larger than" in search(path, Filter(event="records removed")).entries[0].record.reason
 
 
+def test_denials_and_alarms_go_last(make_log: MakeLog, path: Path) -> None:
+    """A flood of what was allowed pushes no denial out: it is written again, with its id, time, and first place."""
+    log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
+    early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
+    log.record(early)
+    end = time.monotonic() + 3 * _LIMIT_SECONDS
+    number = 0
+    while not (first := next(export(path, Filter(), page=1), None)) or first.sequence < 3000:
+        assert time.monotonic() < end
+        for _ in range(200):
+            number += 1
+            log.record(decision(log, number))
+        settle(log)
+    settle(log)
+    log.close()
+    (kept,) = search(path, Filter(decision=("deny",))).entries
+    assert (kept.record.id, kept.record.time, kept.record.resource) == (early.id, early.time, "/cmd_vel")
+    assert kept.record.detail["kept"]["sequence"] == 2
+    assert kept.sequence > 3000
+    result = verify(path)
+    assert result.ok, result.findings
+    assert result.removal == "signed"
+
+
+def denial(number: int, host: str, **fields: Any) -> Record:
+    """A denial with an id of its own."""
+    return Record(id=f"{number:020x}", time=number, event="decision", decision="deny", host=host, **fields)
+
+
+def test_a_flood_of_denials_pushes_no_other_hosts_out() -> None:
+    """At most half of what goes is written again, the hosts in turn, all strangers as one, alarms before summaries."""
+    flood = [denial(number, "10.0.0.66") for number in range(400)]
+    strangers = [denial(1000 + n, f"10.9.0.{n}", detail={"stranger": True}) for n in range(90)]
+    few = [denial(2000 + number, "10.0.0.5") for number in range(10)]
+    alarm = denial(3000, "10.0.0.66", severity=Severity.ALARM)
+    kept = worth_keeping([*flood, *strangers, *few, alarm], 501)
+    assert len(kept) == 250
+    assert {one.id for one in few} <= {one.id for one in kept}
+    assert alarm in kept
+    assert kept == sorted(kept, key=lambda one: one.time)
+    assert worth_keeping(few, 1000) == few
+    assert worth_keeping(few, 1) == []
+
+
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     """What the signer has not signed yet is not removed, however old it is."""
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
@@ -111,9 +158,9 @@ def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     assert next(export(path, Filter())).sequence == 1
 
 
-def test_removal_by_hand_is_not_retention(make_log: MakeLog, path: Path) -> None:
+def test_removal_by_hand_is_not_retention(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """Removing more than retention said it removed is found."""
-    make_old(make_log, path)
+    make_old(make_log, notary)
     log = make_log(retention=Retention(days=1))
     log.record(decision(log))
     await_removal(path)

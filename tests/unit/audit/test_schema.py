@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from appliance.audit.events import EVENTS
+from appliance.audit.evidence import Chain
 from appliance.audit.output import Entry, as_object
 from appliance.audit.record import Record, RuleReference
-from appliance.audit.schema import json_schema, markdown
+from appliance.audit.schema import export_schema, json_schema, markdown
 
 _PAGE = Path(__file__).parents[3] / "docs" / "audit.md"
 
@@ -25,6 +26,13 @@ def test_every_field_is_documented() -> None:
     bare = as_object(Entry(1, Record(id="0" * 20, time=1, event="decision")))
     assert list(bare) == schema["required"]
     assert list(full["rule"]) == schema["properties"]["rule"]["required"]
+
+
+def test_a_line_of_an_export_is_a_record_and_its_place() -> None:
+    """The schema of an export is that of a record with `chain`, whose fields are those that are written."""
+    schema = export_schema()
+    assert [name for name in schema["properties"] if name not in json_schema()["properties"]] == ["chain"]
+    assert list(schema["properties"]["chain"]["properties"]) == list(Chain.__struct_fields__)
 
 
 def test_events_are_described() -> None:

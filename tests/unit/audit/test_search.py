@@ -196,3 +196,23 @@ def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
     before = path.read_bytes()
     search(path, Filter(text="needle"))
     assert path.read_bytes() == before
+
+
+def test_calls_that_only_looked_are_left_out(log: AuditLog, path: Path) -> None:
+    """Allowed GETs of REST go; orders, refused looks, and words that a client made up stay."""
+    calls = [
+        ("GET", "allow", "rest call", "rest"), ("HEAD", "allow", "rest call", "rest"),
+        ("POST", "allow", "rest call", "rest"),
+        ("GET", "deny", "rest call", "rest"), ('X","method":"GET', "allow", "rest call", "rest"),
+        ("GET", "allow", "rest call", "publish"),
+    ]  # fmt: skip
+    for method, decided, event, category in calls:
+        fields: dict[str, Any] = {"event": event, "decision": decided, "category": category}
+        log.record(decision(log, resource="/v1/x", detail={"method": method, "status": 200}, **fields))
+    assert settle(log) is None
+    everything = Filter(resource="/v1/x")
+    assert len(sequences(path, everything)) == 6
+    shown = search(path, Filter(resource="/v1/x", without_looks=True), newest_first=False).entries
+    assert [entry.record.detail["method"] for entry in shown] == ["POST", "GET", 'X","method":"GET', "GET"]
+    followed = Follower(path, Filter(resource="/v1/x", without_looks=True), 0).poll(100)
+    assert [entry.sequence for entry in followed] == [entry.sequence for entry in shown]

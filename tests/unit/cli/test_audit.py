@@ -283,3 +283,34 @@ def test_checkpoints_kept_elsewhere(tmp_path: Path) -> None:
     none = rosrv("verify", "--checkpoints", str(tmp_path / "nothing"), state=tmp_path)
     assert none.returncode == 2
     assert "nothing: No such file" in none.stderr
+
+
+def test_an_export_verifies_without_the_log(tmp_path: Path) -> None:
+    """What was exported is proven with the public key alone; without a key, or tampered with, it is not."""
+    (tmp_path / "control").mkdir()
+    key = Ed25519PrivateKey.generate()
+    public = key.public_key().public_bytes_raw()
+    logs: list[AuditLog] = []
+    log = AuditLog(
+        tmp_path / "control" / "audit.db",
+        checkpoint_every=10,
+        signer=lambda number, text: logs[0].signed(number, key.sign(text), public) if logs else None,
+    )
+    logs.append(log)
+    for number in range(60):
+        log.record(decision(log, number))
+        settle(log)
+    log.close()
+    pinned, file = tmp_path / "control" / "audit.pub", tmp_path / "evidence.ndjson"
+    rosrv("export", "--topic", "/cmd_7", "--output", str(file), state=tmp_path)
+    (tmp_path / "control" / "audit.db").unlink()
+    proven = rosrv("verify", "--export", str(file), "--key", str(pinned))
+    assert proven.returncode == 0
+    assert "3 are proven by a signed checkpoint" in proven.stdout
+    result = json.loads(rosrv("verify", "--export", str(file), "--key", str(pinned), "--json").stdout)
+    assert (result["ok"], result["records"], result["proven"]) == (True, 3, 3)
+    without = rosrv("verify", "--export", str(file))
+    assert (without.returncode, without.stderr.count("--key")) == (2, 1)
+    file.write_text(file.read_text().replace('"decision":"allow"', '"decision":"deny"', 1))
+    changed = rosrv("verify", "--export", str(file), "--key", str(pinned))
+    assert (changed.returncode, "CHANGED" in changed.stdout) == (1, True)

@@ -1,9 +1,11 @@
 """Tests of `appliance.cli.main`."""
 
+import json
 import sys
 
 import pytest
 
+from appliance import __version__
 from appliance.cli import main
 from appliance.config_sources import ConfigError, Mistake
 from appliance.network.namespaces import NetworkError
@@ -60,3 +62,43 @@ def outcome(monkeypatch: pytest.MonkeyPatch, error: Exception) -> object:
     with pytest.raises(SystemExit) as ended:
         main.main()
     return ended.value.code
+
+
+def said_by(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
+) -> tuple[object, str]:
+    """Exit status and all that was said for these arguments."""
+    monkeypatch.setattr(sys, "argv", ["rosrv", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+    shown = capsys.readouterr()
+    return ended.value.code, shown.out + shown.err
+
+
+def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--version` says it in a line; `version --json` also what it stands on, as a report of a defect needs."""
+    assert said_by(monkeypatch, capsys, "--version") == (0, f"rosrv {__version__}\n")
+    status, text = said_by(monkeypatch, capsys, "version", "--json")
+    facts = json.loads(text)
+    assert (status, facts["version"]) == (0, __version__)
+    assert facts["packages"]["fastapi"]
+
+
+@pytest.mark.parametrize("words", [("policy", "reload", "-h"), ("help", "policy", "reload")])
+def test_help_is_found_in_every_usual_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    """`-h` and `help VERB` are what `VERB --help` is."""
+    assert said_by(monkeypatch, capsys, *words) == said_by(monkeypatch, capsys, "policy", "reload", "--help")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"), [(("polcy",), "policy"), (("monitor", "lst"), "list"), (("policy", "chek"), "check")]
+)
+def test_a_mistyped_verb_is_told_the_nearest(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], meant: str
+) -> None:
+    """Exit status 2, and the verb that was probably meant."""
+    status, text = said_by(monkeypatch, capsys, *words)
+    assert status == 2
+    assert f"Did you mean '{meant}'?" in text

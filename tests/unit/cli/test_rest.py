@@ -18,8 +18,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
+from appliance.store.order_proof import is_signed, keys_of, parse_proof, reading_key, statement
 
 TOKEN = "rosrv_5c0f3d2b9a11_" + "x" * 43
+SHOWN = f"Bearer {reading_key(TOKEN)}"
 
 
 @dataclass
@@ -30,6 +32,8 @@ class Server:
     body: bytes = b"{}"
     headers: dict[str, str] = field(default_factory=dict)
     seen: list[tuple[str, str, str | None]] = field(default_factory=list)
+    bodies: list[bytes] = field(default_factory=list)
+    proofs: list[str | None] = field(default_factory=list)
     context: ssl.SSLContext | None = None
     url: str = ""
 
@@ -43,6 +47,15 @@ class Server:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
+                if self.path == "/v1/challenge":
+                    answer = b'{"challenge": "a.challenge", "seconds": 60}'
+                    self.send_response(200)
+                    self.send_header("Content-Length", str(len(answer)))
+                    self.end_headers()
+                    self.wfile.write(answer)
+                    return
+                server.bodies.append(self.rfile.read(int(self.headers.get("Content-Length", "0"))))
+                server.proofs.append(self.headers.get("ROSRV-Proof"))
                 server.seen.append((self.command, self.path, self.headers.get("Authorization")))
                 self.send_response(server.status)
                 for name, text in server.headers.items():
@@ -155,7 +168,7 @@ def test_each_refusal_is_told(  # noqa: PLR0917  one column each
     found = run("monitor", "enable", "x", "--api", server.url)
     assert found[0] == exit_status
     assert said in found[1]
-    assert server.seen == [("PATCH", "/v1/monitors", f"Bearer {TOKEN}")]
+    assert server.seen == [("PATCH", "/v1/monitors", SHOWN)]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +226,7 @@ def test_a_proxy_and_netrc_are_not_used(
         monkeypatch.setenv(name, "http://127.0.0.1:9")
     server.problem(403, "reached")
     assert "reached" in run("status", "--api", server.url)[1]
-    assert server.seen[0][2] == f"Bearer {TOKEN}"
+    assert server.seen[0][2] == SHOWN
 
 
 def test_nobody_there_is_told() -> None:
@@ -286,3 +299,27 @@ def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SS
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(pair)
     return context
+
+
+def test_an_order_is_signed_and_the_token_is_not_sent(server: Server) -> None:
+    """What a server is sent of a change proves this change and nothing else; a look needs no proof."""
+    server.problem(403, "no good")
+    run("monitor", "disable", "a", "b", "--api", server.url)
+    run("token", "revoke", "two words", "--api", server.url)
+    run("status", "--api", server.url)
+    stated = [("PATCH", "/v1/monitors", "*"), ("DELETE", "/v1/tokens/two%20words", "")]
+    for (method, target, match), body, proof in zip(stated, server.bodies, server.proofs, strict=False):
+        assert proof is not None
+        challenge, signature = parse_proof(proof)
+        text = statement(
+            challenge,
+            method=method,
+            target=target,
+            if_match=match,
+            content_type="application/json" if body else "",
+            body=body,
+        )
+        assert challenge == "a.challenge"
+        assert is_signed(keys_of(TOKEN).verifying, text, signature)
+    assert server.proofs[2] is None
+    assert all(shown == SHOWN for _method, _path, shown in server.seen)

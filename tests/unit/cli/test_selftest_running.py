@@ -11,7 +11,7 @@ from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
 
 OURS = SimpleNamespace(
-    sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest", id="0192-ours", host="10.0.0.1")
+    sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest_00c0ffee", id="0192-ours", host="10.0.0.1")
 )
 NOT_OURS = SimpleNamespace(sequence=6, record=SimpleNamespace(caller_id="/joy", id="0192-other"))
 
@@ -55,6 +55,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
         return now[0]
 
     monkeypatch.setattr(selftest_running, "time", SimpleNamespace(monotonic=monotonic, sleep=sleep))
+    monkeypatch.setattr(selftest_running, "secrets", SimpleNamespace(token_hex=lambda _bytes: "00c0ffee"))
     monkeypatch.setattr(selftest_running, "call", lambda *_arguments: None)
     yield Log()
 

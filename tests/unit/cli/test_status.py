@@ -18,7 +18,14 @@ def rows(count: int = len(ROLES), restarts: int = 0) -> list[dict[str, Any]]:
     """Processes as the status has them."""
     since = (datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=30)).isoformat()
     return [
-        {"role": role, "pid": 4_194_300 - number, "since": since, "restarts": restarts}
+        {
+            "role": role,
+            "pid": 4_194_300 - number,
+            "since": since,
+            "restarts": restarts,
+            "walls": "listed calls, Landlock 7" if number else "",
+            "lacks": [],
+        }
         for number, role in enumerate(ROLES[:count])
     ]
 
@@ -27,7 +34,8 @@ def body() -> dict[str, Any]:
     """A large appliance: everything there is, names as long as they get."""
     return {
         "version": "0.1.0", "since": time.time() - 100_000, "master": "http://10.113.11.1:11311", "processes": rows(),
-        "isolation": "netns", "relaying": "all", "mediation": "full", "firewall": {"backend": "nft"}, "probe": "passed",
+        "isolation": "netns", "relaying": "all", "mediation": "full", "probe": "passed",
+        "firewall": {"backend": "nft", "translations": ["one", "another"], "obstacles": ["a third"]},
         "policy": {"revision": 12, "file": "/etc/rosrv/policies/robot.ini", "source": "x", "who": "alice",
                    "differs_from_file": True, "warnings": 3, "confirm_by": None},
         "ipsec": {"esp": "kernel", "up": 3, "enrolled": 4, "troubles": [], "key_exchange": ["x25519"],
@@ -65,6 +73,7 @@ def test_a_large_appliance_fits_one_screen(
         "4194300",
         "61 nodes (2 lost, awaited)",
         "probe passed",
+        "2 chains to translate addresses, not towards the appliance; 1 chain to drop what is forwarded",
     ):
         assert words in text
 
@@ -119,3 +128,16 @@ def test_that_not_everything_is_carried_is_said(
     monitored = " ".join(screen(monkeypatch, capsys, 160, body() | {"relaying": "monitored"}))
     assert "only what is monitored: NO BOUNDARY" in monitored
     assert "NO BOUNDARY" not in " ".join(screen(monkeypatch, capsys, 160, body()))
+
+
+def test_what_a_kernel_lacks_of_the_walls_is_shown(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where all stand that is said in two words; else the first that is lacking is named, and how many more."""
+    shown = body()
+    assert any("processes walled in" in line for line in screen(monkeypatch, capsys, 80, shown))
+    for row in shown["processes"][2:4]:
+        row["lacks"] = ["no Landlock"]
+    lines = "\n".join(screen(monkeypatch, capsys, 100, shown))
+    assert "walled in" not in lines
+    assert "signer: no Landlock and 1 more (rosrv status --json)" in lines

@@ -2,10 +2,12 @@
 
 import errno
 import io
+import json
 import stat
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 from structlog.testing import capture_logs
 
@@ -35,6 +37,21 @@ def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     said = capsys.readouterr()
     assert said.out.count("\n") == 1
     assert str(kept) in said.err
+
+
+def test_the_policys_warnings_are_told_at_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On standard error for a person, ten at most; all of them in the object of `--json`, which is one line."""
+    said = msgspec.structs.replace(
+        READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
+    )
+    settings = Settings(state=tmp_path, api="off", policy=Path("p.ini"))
+    _announce(said, settings, as_json=False)
+    shown = capsys.readouterr()
+    assert shown.out.count("\n") == 1
+    assert "p.ini:9:1: warning\nand 2 more warnings: rosrv policy check p.ini\n" in shown.err
+    _announce(said, settings, as_json=True)
+    event = json.loads(capsys.readouterr().out)
+    assert event["warnings"] == [*said.warnings]
 
 
 def test_a_first_token_that_cannot_be_written_is_an_error_in_words(

@@ -19,7 +19,9 @@ from appliance.forwarding.forwarder import Chosen, Forwarder
 from appliance.forwarding.syslog import Formatter
 from tests.support.audit import decision, settle
 from tests.support.syslog import Message, parse
-from tests.unit.forwarding.conftest import MakeLog
+from tests.unit.forwarding.conftest import MakeLog, Notary
+
+_DAY = 86_400_000_000_000
 
 
 class Kept:
@@ -199,8 +201,9 @@ def test_checkpoints_at_the_receiver_are_proof(
             seen = int(message.fields["sequence"])
 
 
-def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept) -> None:
+def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
     """Records that were removed before they could be sent are counted, not passed over in silence."""
+    notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
     first = forwarder(path, kept)
@@ -209,6 +212,7 @@ def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept) -
     record(log, 400, time=1)
     log.close()
     before = kept.sequences()[-1]
+    notary.ago = 0
     log = make_log(checkpoint_every=20, retention=Retention(days=1))
     for _ in range(200):
         record(log, 1)
@@ -222,11 +226,13 @@ def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept) -
     assert one.progress.behind == 0
 
 
-def test_a_log_that_was_there_long_before(make_log: MakeLog, path: Path, kept: Kept) -> None:
+def test_a_log_that_was_there_long_before(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
     """What retention removed before forwarding was ever asked for is not missed."""
+    notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
     log.close()
+    notary.ago = 0
     log = make_log(checkpoint_every=20, retention=Retention(days=1))
     for _ in range(200):
         record(log, 1)

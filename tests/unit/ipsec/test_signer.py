@@ -49,6 +49,7 @@ from appliance.channel.messages import (
     Stop,
 )
 from appliance.ipsec.authority import Authority
+from appliance.ipsec.removals import Kept
 from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle
 
@@ -243,7 +244,7 @@ def test_whatever_a_request_does_to_the_parser_is_answered(
         own = Channel(child, Lifeline)
         authority = Authority(tmp_path)
         monkeypatch.setattr(authority, "issue", fail)
-        signer = Signer(own, tmp_path, load_or_create_key(tmp_path), authority)
+        signer = Signer(own, tmp_path, load_or_create_key(tmp_path), authority, Kept())
         running = asyncio.create_task(signer.run())
         supervisor, link = Channel(lifeline, Lifeline), Channel(ours, SignerLink)
         supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))

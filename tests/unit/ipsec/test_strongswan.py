@@ -70,3 +70,12 @@ def test_ml_kem_is_offered_where_charon_has_it() -> None:
         Tunnel("a", "10.0.0.2", "1f"), address="10.0.0.1", certificate=b"", authority=b"", proposals=found
     ).values()
     assert row["proposals"] == list(found.ike)
+
+
+def test_two_hundred_addresses_leave_handshakes_for_hosts() -> None:
+    """However many handshakes each of them begins, they have at most half of those that may be under way."""
+    said = configuration(Path("/state/ipsec"), "kernel")
+    limits = dict(line.strip().split(" = ") for line in said.splitlines() if " = " in line)
+    each, whole = int(limits["block_threshold"]), int(limits["init_limit_half_open"])
+    assert 200 * each * 2 <= whole
+    assert int(limits["cookie_threshold"]) < whole

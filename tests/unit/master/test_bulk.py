@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.master.bulk import AT_ONCE, Bulk, bulk_turns, weigh
-from appliance.master.parameters import measure
+from appliance.master.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
+from appliance.master.parameter_charges import measure
 from appliance.ros.xmlrpc import Value, build_response
+from appliance.shares.pool import Standing
 
 HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 5)]
 VALUES: st.SearchStrategy[Value] = st.recursive(
@@ -27,7 +28,7 @@ def test_room_for_one_of_a_host_and_two_in_all() -> None:
     """Who has room keeps it; another host's waits for a free one only, and a host waits for its own."""
 
     async def scene() -> None:
-        turns = bulk_turns()
+        turns = bulk_turns(lambda _host: Standing.REGISTERED)
         inside: list[Any] = []
         go = asyncio.Event()
 
@@ -54,7 +55,7 @@ def test_room_comes_back_after_a_failure() -> None:
     """A request that fails or is cancelled gives back what it took; one that took nothing gives back nothing."""
 
     async def scene() -> None:
-        turns = bulk_turns()
+        turns = bulk_turns(lambda _host: Standing.REGISTERED)
         for _ in range(3):
             with pytest.raises(KeyError):
                 async with Bulk(turns, HOSTS[0]) as bulk:
@@ -87,3 +88,35 @@ def test_weight_is_about_what_is_written() -> None:
     """Within a factor of two of the bytes on the wire."""
     value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": "x" * 5000}
     assert 0.5 < weigh(value, 1 << 30) / len(build_response(value)) < 2
+
+
+def test_large_values_of_a_host_go_one_at_a_time() -> None:
+    """A guest's second large value waits for its first; its small one and another host's large one do not."""
+
+    async def scene() -> None:
+        large = LargeWrites(1000, lambda _host: Standing.REGISTERED)
+        inside: list[str] = []
+        go = asyncio.Event()
+
+        async def write(name: str, host: Any, size: int) -> None:
+            async with large.turn(host, ["x" * size]):
+                inside.append(name)
+                await go.wait()
+                inside.remove(name)
+
+        guest, robot = HOSTS[:2]
+        wanted = (
+            ("first", guest, 2000),
+            ("second", guest, 2000),
+            ("small", guest, 10),
+            ("robot", robot, 2000),
+        )
+        tasks = [asyncio.create_task(write(*one)) for one in wanted]
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert inside == ["first", "small", "robot"]
+        go.set()
+        await asyncio.gather(*tasks)
+        assert not inside
+
+    asyncio.run(scene())

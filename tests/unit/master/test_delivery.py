@@ -1,6 +1,7 @@
 """The queues of calls to nodes: their bounds, and what becomes of a call that does not arrive."""
 
 import asyncio
+import ipaddress
 from typing import Any, cast
 
 import pytest
@@ -9,6 +10,8 @@ from appliance.master.client import CallFailedError
 from appliance.master.delivery import Delivery, NodeCall
 from appliance.master.registry import Incarnation
 from appliance.ros.xmlrpc import FaultReceived, Limits, Value
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import NODE_CALLS_UNDER_WAY
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -35,15 +38,27 @@ class Node:
 class Post:
     """A delivery to one node, and what could not be delivered."""
 
-    def __init__(self, **bounds: int) -> None:
+    def __init__(self, **bounds: Any) -> None:
         self.node, self.lost = Node(), list[tuple[str, Value]]()
-        self.delivery = Delivery(timeout=1.0, limits=Limits(), troubled=self._troubled, **bounds)
+        self.delivery = Delivery(
+            timeout=1.0,
+            limits=Limits(),
+            troubled=self._troubled,
+            standing=lambda _host: Standing.REGISTERED,
+            **bounds,
+        )
         cast(Any, self.delivery).client = lambda _incarnation: self.node
         self.world = ControlParts()
         self.incarnation = self.world.node("/n")
 
     def _troubled(self, incarnation: Incarnation, call: NodeCall, _why: str) -> None:
         self.lost.append((incarnation.name, call.parameters[0]))
+
+    def node_on(self, host: str, name: str) -> Incarnation:
+        """A node of another host."""
+        node = self.world.node(name)
+        node.host = ipaddress.ip_address(host)
+        return node
 
     def push(self, *topics: str, publishers: list[str]) -> None:
         """A list of publishers for each of these topics."""
@@ -53,7 +68,7 @@ class Post:
 
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
     """What waits for a node that stands still has a bound, whatever it is made of; it is told what was dropped."""
-    post = Post(bound_bytes=100_000)
+    post = Post(queued=Bounds(100_000, 100_000, 0, 0))
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
     assert post.delivery.waiting < 8
     assert len(post.lost) == 50 - post.delivery.waiting
@@ -93,3 +108,38 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
     post.push("/a", publishers=[])
     await post.world.settle()
     assert post.lost == []
+
+
+async def test_a_host_loses_only_calls_of_its_own() -> None:
+    """Many queues of a guest fill the whole: none of the robot's calls goes, though its queue is the longest of all."""
+    post = Post(queued=Bounds(400_000, 400_000, 0, 0))
+    post.push("/a", "/b", publishers=LONG)
+    for number in range(200):
+        guest = post.node_on("10.0.0.66", f"/guest_{number}")
+        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", list[Value](LONG[:100]))))
+    assert post.delivery.weight <= 400_000
+    assert post.lost
+    assert {name.partition("_")[0] for name, _topic in post.lost} == {"/guest"}
+    post.node.answers.set()
+    await post.world.settle()
+    assert {"/a", "/b"} <= set(post.node.heard)
+
+
+async def test_silent_nodes_of_a_host_delay_no_call_to_anothers() -> None:
+    """All that a guest may have under way waits for its nodes; the robot's node hears what it is told at once."""
+    post = Post()
+    robot = Node()
+    robot.answers.set()
+    cast(Any, post.delivery).client = lambda incarnation: robot if incarnation.name == "/robot" else post.node
+    for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
+        guest = post.node_on("10.0.0.66", f"/guest_{number}")
+        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", [])))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    post.delivery.push(post.node_on("10.0.0.5", "/robot"), NodeCall("publisherUpdate", ("/t", [])))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert robot.heard == ["/t"]
+    assert not post.node.heard
+    post.node.answers.set()
+    await post.world.settle()

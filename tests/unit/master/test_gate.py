@@ -8,13 +8,13 @@ import pytest
 from appliance.master.arguments import ApiUri
 from appliance.master.call import Caller
 from appliance.master.calls import MASTER_CALLS
-from appliance.master.gate import Contest, Gate, HostLimits
+from appliance.master.gate import Contest, Gate, HostLimits, Presence, Probe, contested
 from appliance.master.http import Peer
 from appliance.master.node_calls import NODE_CALLS
-from appliance.master.parameters import Tree
 from appliance.master.registry import Incarnation, Kind, Registry
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
+from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
@@ -136,17 +136,20 @@ def held(name: str, host: str, *, own: bool) -> Registry:
 
 
 @pytest.mark.parametrize(
-    ("method", "arguments"),
+    ("method", "arguments", "does"),
     [
-        ("registerPublisher", ("/rosout_agg", "rosgraph_msgs/Log", API)),
-        ("unregisterPublisher", ("/rosout_agg", API)),
-        ("setParam", ("/key", 1)),
+        ("registerPublisher", ("/rosout_agg", "rosgraph_msgs/Log", API), True),
+        ("unregisterPublisher", ("/rosout_agg", API), True),
+        ("setParam", ("/key", 1), False),
     ],
 )
 def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
-    method: str, arguments: tuple[Any, ...]
+    method: str, arguments: tuple[Any, ...], does: bool
 ) -> None:
-    """Without isolation the robot's nodes and the appliance's come from one address: the listener tells them apart."""
+    """Without isolation the robot's nodes and the appliance's come from one address: the listener tells them apart.
+
+    At that listener the policy is not asked: what the appliance's node does is known (`does`).
+    """
     policy = compile_policy(
         "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Commands]\ndefault = *\n", file="test.ini"
     )
@@ -161,7 +164,7 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
         assert decision.allowed is not own
         itself = here.decide(Caller(loopback, "/rosout", 0, own=True), call, given, {})
         assert isinstance(itself, Decision)
-        assert itself.allowed
+        assert itself.allowed is does
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
@@ -189,3 +192,49 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
         decision = here.decide(caller, NODE_CALLS["requestTopic"], (topic, [["TCPROS"]]), {})
         assert isinstance(decision, Decision)
         assert decision.allowed is allowed
+
+
+@pytest.mark.parametrize(
+    ("presence", "words"),
+    [
+        (Presence.GONE, None),
+        (
+            Presence.SILENT,
+            "does not answer (it hangs, or was stopped); unless it answers it is unregistered in 8 s",
+        ),
+        (Presence.ANSWERS, "is held by a running node on 10.0.0.9"),
+    ],
+)
+def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words: str | None) -> None:
+    """Gone: the name is given over. Silent: the refusal says when to ask again. Of another holder nothing is known."""
+    holder, other = (next(iter(held(name, "10.0.0.9", own=False).live())) for name in ("/voice", "/other"))
+    contest = Contest(holder, Decision(True, None, "granted"))
+    decision = contested(contest, Probe(holder, presence, 7.2))
+    assert (decision.allowed, words is None or words in decision.reason) == (words is None, True)
+    assert not contested(contest, Probe(other, presence, 7.2)).allowed
+    assert not contested(contest, None).allowed
+
+
+def test_a_host_has_as_many_registrations_as_are_left() -> None:
+    """Three times as many: however many hosts register all they can, the next finds room."""
+    policy = compile_policy(BASE + LIMITED + "[Publishers]\ndefault = *\n", file="test.ini")
+    registry = Registry(NobodyIsKept())
+    limits = HostLimits(nodes=500, registrations=60, registrations_in_all=100)
+    gate = Gate(lambda: policy, registry, limits)
+    counts = []
+    for number in range(4):
+        host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000/"
+        caller = Caller(Peer(ipaddress.ip_address(host), host, "10.0.0.1"), f"/n{number}", 0)
+        api = ApiUri(uri, parse_node_uri(uri))
+        node = Incarnation(f"k{number}", f"/n{number}", caller.peer.host, api.uri, uri, "", 1, 2)
+        registry.add(node)
+        for turn in range(100):
+            call = MASTER_CALLS["registerPublisher"]
+            decision = gate.decide(caller, call, (f"/t{turn}", "std_msgs/String", api), {})
+            assert isinstance(decision, Decision)
+            if not decision.allowed:
+                assert "registrations" in decision.reason
+                break
+            registry.register(node, Kind.PUBLICATION, f"/t{turn}", "std_msgs/String")
+        counts.append(registry.registrations_of(caller.peer.host))
+    assert counts == [60, 30, 8, 2]

@@ -6,7 +6,7 @@ import ipaddress
 import socket
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -17,19 +17,44 @@ from appliance.master.http import (
     HttpLimits,
     HttpRequest,
     HttpServer,
+    NoAnswerError,
     Peer,
-    Visitors,
     listen,
     plain_address,
 )
 from appliance.master.turns import Turns
+from appliance.master.visitors import Visitors
 from appliance.ros.xmlrpc import FaultReceived, parse_response
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import (
+    RVMASTER_BYTES,
+    RVMASTER_CONNECTIONS,
+    RVMASTER_FAREWELLS,
+    RVMASTER_REQUESTS,
+)
 
 LIMITS = HttpLimits()
-HOST = ipaddress.ip_address("10.0.0.1")
-OTHER = ipaddress.ip_address("10.0.0.2")
 WAIT = 20.0
 LARGE = 24 << 20  # more than the kernel's buffers take
+
+
+def _of(host: int) -> Bounds:
+    """A pool in which one host may have so much, and another as much again."""
+    return Bounds(whole=2 * host, host=host, strangers=0, kept=0)
+
+
+def _named(_host: object) -> Standing:
+    return Standing.NAMED
+
+
+@dataclass(frozen=True)
+class Shares:
+    """The pools of a server of a test."""
+
+    connections: Bounds = RVMASTER_CONNECTIONS.bounds
+    held: Bounds = RVMASTER_BYTES.bounds
+    farewells: Bounds = RVMASTER_FAREWELLS.bounds
+    requests: Bounds = RVMASTER_REQUESTS.bounds
 
 
 def post(body: bytes, *headers: str, path: str = "/", length: int | None = None) -> bytes:
@@ -87,11 +112,15 @@ class Client:
 class Server:
     """A server of a test, what it was asked, and what it complained of."""
 
-    def __init__(self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None) -> None:
+    def __init__(
+        self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"
+    ) -> None:
         self.requests: list[HttpRequest] = []
         self.troubles: list[str] = []
-        self.visitors = Visitors(limits)
-        self.turns = Turns(limits.slots, limits.slots_per_host)
+        self.visitors = Visitors(
+            _named, connections=shares.connections, held=shares.held, farewells=shares.farewells
+        )
+        self.turns = Turns(shares.requests, _named)
         self._handler = handler
         self.socket = listen("127.0.0.1", 0)
         self.port: int = self.socket.getsockname()[1]
@@ -102,10 +131,17 @@ class Server:
             limits=limits,
             visitors=self.visitors,
             turns=self.turns,
-            refuse=lambda peer: refusal,
+            refuse=lambda peer: None if refusal is None else self._refuse,
             troubled=self._complain,
         )
         self.complained = asyncio.Event()
+        self._refusal = refusal
+        self.beginnings: list[bytes] = []
+
+    def _refuse(self, beginning: bytes) -> bytes:
+        self.beginnings.append(beginning)
+        assert self._refusal is not None
+        return self._refusal
 
     def _complain(self, _peer: Peer, reason: str) -> None:
         self.troubles.append(reason)
@@ -132,10 +168,13 @@ class Server:
 
 @contextlib.asynccontextmanager
 async def serving(
-    handler: Handler | None = None, limits: HttpLimits = LIMITS, refusal: bytes | None = None
+    handler: Handler | None = None,
+    limits: HttpLimits = LIMITS,
+    refusal: bytes | None = None,
+    shares: "Shares | None" = None,
 ) -> AsyncIterator[Server]:
     """A running server; afterwards nothing of any client is left in its books."""
-    server = Server(handler, limits, refusal)
+    server = Server(handler, limits, refusal, shares or Shares())
     await server.http.start()
     sweep = asyncio.get_running_loop().create_task(server.visitors.sweep())
     try:
@@ -144,9 +183,8 @@ async def serving(
         for client in server.clients:
             await client.close()
         await until(lambda: not server.visitors.connections)
-        await until(lambda: not server.visitors._held)
-        assert server.visitors._total == server.visitors._held_in_all == 0
-        assert not server.visitors._per_host
+        await until(lambda: not server.visitors.held.total)
+        assert server.visitors.connected.total == server.visitors.farewells.total == 0
         sweep.cancel()
         server.http.close()
 
@@ -313,6 +351,22 @@ def test_a_defect_in_the_handler() -> None:
     run(test())
 
 
+def test_a_handler_without_an_answer() -> None:
+    """The peer finds its connection reset, not ended in good order; nothing of it stays counted."""
+
+    async def handler(_request: HttpRequest) -> bytes:
+        raise NoAnswerError
+
+    async def test() -> None:
+        async with serving(handler) as server:
+            client = await server.connect()
+            await client.send(post(b"x"))
+            with pytest.raises(ConnectionResetError):
+                await client.reader.readexactly(1)
+
+    run(test())
+
+
 # --- what is refused ---
 
 
@@ -397,12 +451,41 @@ def test_large_refused_body_still_gets_its_answer() -> None:
             status, headers, body = await client.response()
             assert (status, headers["connection"], body) == (200, "close", b"<fault/>")
             assert not server.requests
+            assert server.beginnings == [b"x" * 4096]
+
+    run(test())
+
+
+def test_a_refusal_sees_what_was_asked_for() -> None:
+    """The beginning of the body is given to what makes the answer, in one piece or in several; nothing is served."""
+
+    async def test() -> None:
+        async with serving(refusal=b"<fault/>") as server:
+            for pieces in ([post(b"<methodCall/>")], [post(b"", length=13), b"<method", b"Call/>"]):
+                client = await server.connect()
+                for piece in pieces:
+                    await client.send(piece)
+                assert (await client.response())[2] == b"<fault/>"
+            assert server.beginnings == [b"<methodCall/>"] * 2
+            assert not server.requests
+
+    run(test())
+
+
+def test_who_waits_to_be_asked_for_the_body_is_refused_at_once() -> None:
+    """`Expect: 100-continue` of a peer that no rule names is answered with the refusal."""
+
+    async def test() -> None:
+        async with serving(refusal=b"<fault/>") as server:
+            client = await server.connect()
+            await client.send(post(b"", "Expect: 100-continue", length=1000))
+            assert (await client.response())[2] == b"<fault/>"
 
     run(test())
 
 
 def test_refused_before_the_body() -> None:
-    """A peer that no rule names is answered as soon as the head of its request is there."""
+    """A peer that no rule names is answered, too, when the rest of its request does not come."""
 
     async def test() -> None:
         async with serving(refusal=b"<fault/>") as server:
@@ -525,8 +608,8 @@ def test_answers_that_are_not_taken() -> None:
         async with serving(handler, limits=replace(LIMITS, stall_seconds=0.5)) as server:
             client = await server.connect()
             client.writer.write(post(b"") * 50)
-            await until(lambda: len(server.requests) == 1 and bool(server.visitors._held))
-            assert server.visitors._held_in_all <= LARGE + 50 * 500
+            await until(lambda: len(server.requests) == 1 and bool(server.visitors.held.total))
+            assert server.visitors.held.total <= LARGE + 50 * 4200
             await until(lambda: not server.visitors.connections)  # the sweep gives up on him
             assert len(server.requests) == 1
 
@@ -569,7 +652,7 @@ def test_next_request_after_a_slow_answer() -> None:
         async with serving(handler) as server:
             client = await server.connect()
             await client.send(post(b"large") + post(b"small"))
-            await until(lambda: bool(server.visitors._held))
+            await until(lambda: bool(server.visitors.held.total))
             assert len((await client.response())[2]) == LARGE
             assert (await client.response())[2] == b"small"
             await client.send(post(b"again"))
@@ -582,16 +665,19 @@ def test_connections_per_host() -> None:
     """One host has so many connections and no more; the others are not touched, and a closed one counts no more."""
 
     async def test() -> None:
-        async with serving(limits=replace(LIMITS, connections_per_host=3)) as server:
+        async with serving(shares=Shares(connections=_of(3))) as server:
             clients = [await server.connect() for _ in range(3)]
             for client in clients:
                 await client.send(post(b"x"))
                 await client.response()
             status, _headers, body = await (await server.connect()).response()
-            assert (status, fault(body)) == (503, "127.0.0.1 has 3 connections open, the limit for one host")
+            assert (status, fault(body)) == (
+                503,
+                "127.0.0.1 has 3 connections open; the share of one host is 3",
+            )
             assert "127.0.0.1 has 3 connections open" in await server.trouble()
             await clients[0].close()
-            await until(lambda: server.visitors._total == 2)
+            await until(lambda: server.visitors.connected.total == 2)
             late = await server.connect()
             await late.send(post(b"x"))
             assert (await late.response())[0] == 200
@@ -603,8 +689,8 @@ def test_connections_that_are_too_many_do_not_stay() -> None:
     """A few at a time are told why; the others are cut, and so are those that do not leave."""
 
     async def test() -> None:
-        limits = replace(LIMITS, connections_per_host=1, turned_away_per_host=2, linger_seconds=0.2)
-        async with serving(limits=limits) as server:
+        limits, shares = replace(LIMITS, linger_seconds=0.2), Shares(connections=_of(1), farewells=_of(2))
+        async with serving(limits=limits, shares=shares) as server:
             first = await server.connect()
             await first.send(post(b"x"))
             await first.response()
@@ -613,19 +699,10 @@ def test_connections_that_are_too_many_do_not_stay() -> None:
             assert told.count(b"HTTP/1.1 503") == 2
             assert told.count(b"") == 4
             await until(lambda: len(server.visitors.connections) == 1)
-            assert not server.visitors._turned_away
+            assert not server.visitors.farewells.total
             assert (await (await server.connect()).response())[0] == 503
 
     run(test())
-
-
-def test_connections_turned_away_in_all() -> None:
-    """All hosts together have a limit there as well."""
-    visitors = Visitors(replace(LIMITS, turned_away=1))
-    assert visitors.turn_away(HOST)
-    assert not visitors.turn_away(OTHER)
-    visitors.turned_away(HOST)
-    assert visitors.turn_away(OTHER)
 
 
 def test_bytes_per_host() -> None:
@@ -637,7 +714,7 @@ def test_bytes_per_host() -> None:
         return b"done"
 
     async def test() -> None:
-        async with serving(handler, limits=replace(LIMITS, held_bytes_per_host=250_000)) as server:
+        async with serving(handler, shares=Shares(held=_of(250_000))) as server:
             clients = [await server.connect() for _ in range(2)]
             for client in clients:
                 await client.send(post(b"x" * 100_000))
@@ -645,7 +722,7 @@ def test_bytes_per_host() -> None:
             third = await server.connect()
             await third.send(post(b"x" * 100_000))
             assert (await third.response())[0] == 503
-            assert "the limit for one host" in await server.trouble()
+            assert "the share of one host" in await server.trouble()
             release.set()
             for client in clients:
                 assert (await client.response())[2] == b"done"
@@ -662,18 +739,39 @@ def test_small_requests_that_wait_are_counted() -> None:
         return b"done"
 
     async def test() -> None:
-        async with serving(handler, limits=replace(LIMITS, held_bytes_per_host=100_000)) as server:
+        async with serving(handler, shares=Shares(held=_of(100_000))) as server:
             client = await server.connect()
-            await client.send(b"POST / HTTP/1.1\r\n\r\n" * 3000)
-            assert "the limit for one host" in await server.trouble()
+            await client.send(b"POST / HTTP/1.1\r\n\r\n" * 500)
+            assert "the share of one host" in await server.trouble()
             assert len(server.requests) == 1
             release.set()
             await client.close()
-            await until(lambda: not server.visitors._held)
+            await until(lambda: not server.visitors.held.total)
             again = await server.connect()
-            await again.send(b"POST / HTTP/1.1\r\n\r\n" * 100)
-            for _ in range(100):
+            await again.send(b"POST / HTTP/1.1\r\n\r\n" * 20)
+            for _ in range(20):
                 assert (await again.response())[2] == b"done"
+
+    run(test())
+
+
+def test_requests_that_nobody_waits_for_are_not_read() -> None:
+    """Who sends more than 512 while one is being answered is told so; what else came is not even looked at."""
+    release = asyncio.Event()
+
+    async def handler(_request: HttpRequest) -> bytes:
+        await release.wait()
+        return b"done"
+
+    async def test() -> None:
+        async with serving(handler) as server:
+            client = await server.connect()
+            await client.send(post(b"x") * 2000)
+            status, _headers, body = await client.response()
+            assert (status, "512 requests more" in fault(body)) == (400, True)
+            assert await client.ended() == b""
+            release.set()
+            await until(lambda: not server.visitors.held.total)
 
     run(test())
 
@@ -687,7 +785,7 @@ def test_gone_before_his_turn() -> None:
         return b"done"
 
     async def test() -> None:
-        async with serving(handler, limits=replace(LIMITS, slots=1, slots_per_host=1)) as server:
+        async with serving(handler, shares=Shares(requests=_of(1))) as server:
             first = await server.connect()
             await first.send(post(b"first"))
             await until(lambda: len(server.requests) == 1)
@@ -695,7 +793,7 @@ def test_gone_before_his_turn() -> None:
                 gone = await server.connect()
                 await gone.send(post(b"x" * 1000))
                 await gone.close()
-            await until(lambda: server.visitors._total == 1)
+            await until(lambda: server.visitors.connected.total == 1)
             release.set()
             assert (await first.response())[2] == b"done"
             assert len(server.requests) == 1
@@ -706,17 +804,7 @@ def test_gone_before_his_turn() -> None:
     run(test())
 
 
-# --- visitors and turns by themselves ---
-
-
-def test_connections_in_all() -> None:
-    """All hosts together have a limit as well."""
-    visitors = Visitors(replace(LIMITS, connections=2))
-    assert visitors.enter(HOST) is None
-    assert visitors.enter(OTHER) is None
-    assert "the limit for all hosts" in str(visitors.enter(ipaddress.ip_address("10.0.0.3")))
-    visitors.leave(OTHER)
-    assert visitors.enter(HOST) is None
+# --- addresses and listening ---
 
 
 @pytest.mark.parametrize(

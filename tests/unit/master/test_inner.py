@@ -1,61 +1,51 @@
-"""The inner face: what ROSMaster tells a node is passed on to that node, and ROSMaster learns nothing of it."""
+"""The inner face: what ROSMaster tells a node is acknowledged, and nothing follows from it."""
 
-import asyncio
 import ipaddress
 from typing import Any
 
 import pytest
 
-from appliance.master.delivery import NodeCall
 from appliance.master.http import HttpRequest, Peer
 from appliance.master.inner import InnerFace
-from appliance.ros.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
+from appliance.master.registry import PUBLISHER_PATH, Kind
+from appliance.ros.xmlrpc import FaultReceived, Value, build_call, parse_response
+from tests.support.control_parts import ControlParts
 
 MASTER = ipaddress.ip_address("127.0.0.1")
+CALLS: list[tuple[str, tuple[Value, ...]]] = [
+    ("paramUpdate", ("/master", "/limits/speed/", 666)),
+    ("publisherUpdate", ("/master", "/topic", ["http://10.0.0.66:1/"])),
+    ("shutdown", ("/master", "another has the name")),
+    ("requestTopic", ("/master", "/topic", [["TCPROS"]])),
+    ("getPid", ("/master",)),
+]
 
 
-class Site:
-    """An inner face for one node, and what was passed on."""
-
-    def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
-        nodes: Any = self  # for registry and delivery
-        self.face = InnerFace(nodes, nodes, Limits(), tell_parameter=self._tell)
-
-    def by_key(self, key: str) -> Any:
-        """As `Registry`."""
-        return "node" if key == "key" else None
-
-    def push(self, node: Any, call: NodeCall) -> None:
-        """As `Delivery`."""
-        self.told.append((node, call.method, *call.parameters))
-
-    def _tell(self, node: Any, key: str, value: Value, size: int) -> None:
-        self.told.append((node, "paramUpdate", key, value))
-        assert size > len(str(value))
-
-    def call(self, path: str, method: str, *params: Value) -> Any:
-        """A call of ROSMaster."""
-        request = HttpRequest(Peer(MASTER, "127.0.0.1", "127.0.0.1"), path, build_call(method, params), 0)
-        return parse_response(asyncio.run(self.face.handle(request)))
+async def call(face: InnerFace, path: str, method: str, params: tuple[Value, ...]) -> Any:
+    """A call of ROSMaster."""
+    request = HttpRequest(Peer(MASTER, "127.0.0.1", "127.0.0.1"), path, build_call(method, params), 0)
+    return parse_response(await face.handle(request))
 
 
-def test_parameters_and_shutdowns_are_passed_on() -> None:
-    """Each to the node that the path stands for; lists of publishers are made elsewhere."""
-    site = Site()
-    assert site.call("/key/", "paramUpdate", "/master", "/arm/", {"max": 5}) == [1, "", 0]
-    assert site.call("/key/", "shutdown", "/master", "another has the name") == [1, "", 0]
-    assert site.call("/key/", "publisherUpdate", "/master", "/topic", ["http://a:1/"]) == [1, "", 0]
-    assert site.told == [
-        ("node", "paramUpdate", "/arm/", {"max": 5}),
-        ("node", "shutdown", "another has the name"),
-    ]
+@pytest.mark.anyio
+@pytest.mark.parametrize(("method", "params"), CALLS)
+async def test_what_rosmaster_says_is_told_to_nobody(method: str, params: tuple[Value, ...]) -> None:
+    """A key, a value, a publisher or an order that ROSMaster sends reaches no node; ROSMaster is content."""
+    world = await ControlParts.begun()
+    node = world.node("/robot")
+    await world.register(node, Kind.PARAMETER, "/limits/speed", "")
+    await world.register(node, Kind.SUBSCRIPTION, "/topic")
+    world.deliveries.told.clear()
+    face = InnerFace(world.registry)
+    for path in (f"/{node.key}/", PUBLISHER_PATH):
+        assert await call(face, path, method, params) == [1, "", 0]
+    assert not world.deliveries.told
 
 
-def test_nobody_and_nonsense() -> None:
-    """A path that stands for nobody is a fault; a call that no master makes is refused."""
-    site = Site()
+@pytest.mark.anyio
+async def test_nobody() -> None:
+    """A path that stands for nobody is a fault."""
     with pytest.raises(FaultReceived, match="nobody is here"):
-        site.call("/other/", "shutdown", "/master", "reason")
-    assert site.call("/key/", "requestTopic", "/master", "/topic", [])[0] == 0
-    assert not site.told
+        await call(
+            InnerFace((await ControlParts.begun()).registry), "/other/", "shutdown", ("/master", "reason")
+        )

@@ -1,12 +1,16 @@
 """Nodes that go away and come back: what they had, what others got meanwhile, what the policy took."""
 
 import asyncio
+import ipaddress
+from typing import Any, cast
 
 import pytest
 
 from appliance.master import liveness
+from appliance.master.client import RefusedError
 from appliance.master.delivery import NodeCall
 from appliance.master.registry import Kind, Life
+from appliance.ros.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -190,3 +194,35 @@ async def test_a_node_that_returns_while_the_master_is_new_is_told_by_the_rebuil
     assert not world.rosmaster.reachable
     await world.round()
     assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]
+
+
+async def test_silent_nodes_of_a_host_delay_no_look_at_anothers() -> None:
+    """Four hundred and fifty nodes of a guest answer nothing; a robot's node that is dead is lost at the first look."""
+    world = await ControlParts.begun()
+    silence = asyncio.Event()
+    robot = world.node("/robot", 1)
+    await world.register(robot, Kind.PUBLICATION, "/t")
+    guests = [world.node(f"/guest_{number}", 2 + number) for number in range(450)]
+    for guest in guests:
+        guest.host = ipaddress.ip_address("10.0.0.66")
+
+    class Silent:
+        async def call(self, _method: str, *_params: Value) -> Value:
+            await silence.wait()
+            return [1, "", 1]
+
+    class Gone:
+        async def call(self, _method: str, *_params: Value) -> Value:
+            raise RefusedError("nobody is there")
+
+    cast(Any, world.liveness).client = lambda node: Gone() if node is robot else Silent()
+    for guest in guests:
+        world.liveness.look_at(guest)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    world.liveness.look_at(robot)
+    async with asyncio.timeout(5):
+        while robot.life is Life.LIVE:
+            await asyncio.sleep(0.01)
+    silence.set()
+    await world.settle()

@@ -39,7 +39,7 @@ def test_few_topics_have_a_histogram_of_their_own() -> None:
 def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that restarts is another incarnation: its topic counts on, bounded in names."""
     monkeypatch.setattr(carried, "MOST_RESOURCES", 2)
-    counted = Carried(cast(Any, None), lambda _key: "/node", 1)
+    counted = Carried(cast(Any, None), lambda _key: "/node", 1, is_own=lambda *_: False)
     for number in range(4):
         rows = [
             TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),

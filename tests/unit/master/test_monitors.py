@@ -19,6 +19,8 @@ from appliance.store.state import StateStore
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
 B = "hold b() { event said() /other std_msgs/String '{}' { } }"
 
+C = "c() { event said() /third std_msgs/String '{}' { } }"
+
 
 class Desk:
     """The monitors of one control over its life times, with a relay that takes everything."""
@@ -96,11 +98,43 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     assert replaced.began == ["b"]
     restarted = desk.monitors()
     assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
-    back = await restarted.reload(who="operator")
+    back = await restarted.reload(who="operator", prune=True)
     assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
     loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
     assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
     assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
+
+
+async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
+    """What was loaded while the robot runs stays, over restarts, too; what the folder brought goes with its file."""
+    monitors = desk.monitors()
+    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    (desk.folder / "c.rv").write_text(C)
+    kept = await monitors.reload(who="operator")
+    assert (kept.added, kept.removed, kept.kept) == (["c.rv"], [], ["b.rv"])
+    assert monitors.names() == ["a", "b", "c"]
+    await desk.store.settled()
+    restarted = desk.monitors()
+    assert restarted.names() == ["a", "b", "c"]
+    (desk.folder / "c.rv").unlink()
+    again = await restarted.reload(who="operator")
+    assert (again.removed, again.kept, restarted.names()) == (["c.rv"], ["b.rv"], ["a", "b"])
+    pruned = await restarted.reload(who="operator", prune=True)
+    assert (pruned.removed, pruned.kept, restarted.differs_from_folder) == (["b.rv"], [], False)
+
+
+async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
+    """Nothing is removed, the words say what to do, and nothing is said to differ from a folder that is not there."""
+    desk = Desk(tmp_path)
+    monitors = desk.monitors(folder=False)
+    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    assert not monitors.differs_from_folder
+    for prune in (False, True):
+        with pytest.raises(SpecificationsRefusedError, match="no folder of specifications is configured"):
+            await monitors.reload(who="operator", prune=prune)
+    assert monitors.names() == ["b"]
+    desk.store.close()
+    desk.log.close()
 
 
 async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:

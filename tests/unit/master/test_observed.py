@@ -21,7 +21,10 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     log = AuditLog(tmp_path / "audit.db")
     records = MonitorRecords(Recorder(log, strict=False, deny_when_failed=False))
     detail = {"logic": "fsm", **{name: f"its {name}" for name in NAMES}}
-    records.reported([MonitorEvent(kind, "gun", "key", "/trigger", 10**18, "told", detail)] * 2, lost=0)
+    event = MonitorEvent(
+        kind, "gun", "key", "/trigger", 10**18, "told", detail, host="10.0.0.7", caller_id="/joystick"
+    )
+    records.reported([event] * 2, lost=0)
     settle(log)
     assert records.counts == {(kind, "gun"): 2}
     found = [
@@ -31,5 +34,6 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     ]
     assert len(found) == 2
     assert found[0].category == "monitor"
+    assert (found[0].host, found[0].caller_id) == ("10.0.0.7", "/joystick")
     assert (found[0].detail["category"], found[0].detail["logic"]) == ("its category", "fsm")
     log.close()

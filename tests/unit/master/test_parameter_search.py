@@ -9,9 +9,10 @@ import pytest
 from appliance.master.call import Answer, Caller
 from appliance.master.http import Peer
 from appliance.master.parameter_search import search_param
-from appliance.master.parameters import ParameterMirror, standing_at
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
+from appliance.ros.parameter_tree import standing_at
+from tests.support.parameters import mirror
 
 HOST = "10.0.0.5"
 RULES = "[Parameters]\nread default = 10.0.0.5\nread /secret/** = 10.0.0.9\nread /arm/key = 10.0.0.9\n"
@@ -23,7 +24,7 @@ class Site:
     def __init__(self, tree: Any, rules: str = RULES) -> None:
         policy = compile_policy(rules, file="test.ini")
         self.policy = lambda: policy
-        self.parameters = ParameterMirror(tree, lambda: None)
+        self.parameters = mirror(tree)
         self.rosmaster = self.recorder = self
         self.asked: list[str] = []
         self.records: list[tuple[str, Decision]] = []

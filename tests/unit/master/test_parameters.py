@@ -14,10 +14,13 @@ from hypothesis import strategies as st
 from appliance.master.call import Caller, LimitReachedError
 from appliance.master.client import CallFailedError
 from appliance.master.http import Peer
-from appliance.master.parameters import ParameterMirror, in_order, measure, set_param
+from appliance.master.parameter_charges import measure
+from appliance.master.parameters import ParameterMirror, in_order, set_param
 from appliance.ros.errors import EncodingError, ProtocolError
 from tests.support.nodes import PYTHON
+from tests.support.parameters import mirror, put
 
+HOST = ipaddress.ip_address("10.0.0.1")
 ORACLE = """
 import json, sys
 from rosmaster.paramserver import ParamDictionary
@@ -66,46 +69,54 @@ def test_the_mirror_is_what_rosmaster_has(oracle: Any, steps: list[Any]) -> None
     """After any sequence of settings and deletions both trees are equal, and the weight is that of the tree."""
     oracle.stdin.write(json.dumps(steps) + "\n")
     oracle.stdin.flush()
-    mirror = ParameterMirror({}, lambda: None)
+    there = mirror()
     for do, key, value in json.loads(json.dumps(steps)):
         if do == "set":
-            mirror.set(key, value)
+            put(there, key, value, HOST)
         else:
-            mirror.delete(key)
-    assert mirror.tree == json.loads(oracle.stdout.readline())
-    assert mirror.weight == measure(mirror.tree)[0]
+            there.delete(key)
+    assert there.tree == json.loads(oracle.stdout.readline())
+    assert there.weight == measure(there.tree)[0]
 
 
 def test_what_would_be_too_much_is_refused_before_it_is_set() -> None:
     """All parameters together are bounded; what is deleted makes room."""
-    mirror = ParameterMirror({}, lambda: None, bytes_limit=1000)
-    mirror.check("/a", "x" * 500)
-    mirror.set("/a", "x" * 500)
-    with pytest.raises(LimitReachedError, match="the limit is 1000"):
-        mirror.check("/b", "x" * 500)
-    mirror.delete("/a")
-    mirror.check("/b", "x" * 500)
+    there = mirror(whole=1000)
+    put(there, "/a", "x" * 500, HOST)
+    with pytest.raises(LimitReachedError, match="the share of one host is 1000"):
+        put(there, "/b", "x" * 500, HOST)
+    there.delete("/a")
+    put(there, "/b", "x" * 500, HOST)
 
 
 def test_key_and_value_together_are_bounded_in_depth() -> None:
     """ROSMaster answers recursively: what it could not tell any more never gets there."""
-    mirror = ParameterMirror({}, lambda: None, depth_limit=5)
-    mirror.check("/a/b/c", {"d": [1]})
+    there = mirror(depth_limit=5)
+    there.check("/a/b/c", measure({"d": [1]})[1])
     with pytest.raises(ProtocolError, match="nest deeper"):
-        mirror.check("/a/b/c", {"d": [[1]]})
+        there.check("/a/b/c", measure({"d": [[1]]})[1])
     with pytest.raises(ProtocolError, match="nil"):
-        mirror.check("/a", {"b": [None]})
+        measure({"b": [None]})
 
 
 class OrderedServer:
     """ROSMaster's parameters, and how the calls reached it."""
 
-    def __init__(self, mirror: ParameterMirror) -> None:
-        self.tree = ParameterMirror({}, lambda: None)
+    def __init__(self, there: ParameterMirror) -> None:
+        self.tree = mirror()
         self.requests: list[list[str]] = []
-        self.parameters = mirror
-        self.rosmaster = self
+        self.parameters = there
+        self.rosmaster = self.graph = self
         self.broken: Exception | None = None
+        self.told: list[tuple[str, str | None]] = []
+
+    def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
+        """As `Graph`."""
+        self.told.append((key, caller_id))
+
+    def parameter_deleted(self, key: str) -> None:
+        """As `Graph`."""
+        self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
         """One call by itself."""
@@ -121,7 +132,7 @@ class OrderedServer:
         answers: list[Any] = []
         for method, (_caller, key, *value) in calls:
             if method == "setParam":
-                self.tree.set(key, copy.deepcopy(value[0]))
+                put(self.tree, key, copy.deepcopy(value[0]), HOST)
             elif method == "deleteParam":
                 self.tree.delete(key)
             elif key == "/fault":
@@ -141,7 +152,7 @@ def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
 
 def test_a_run_is_one_request_in_its_order() -> None:
     """Calls of one run travel as one, in their order, and the mirror has what ROSMaster has."""
-    server = OrderedServer(ParameterMirror({}, lambda: None))
+    server = OrderedServer(mirror())
     answers = ordered(
         server,
         ("setParam", "/a", {"b": 1}),
@@ -152,6 +163,7 @@ def test_a_run_is_one_request_in_its_order() -> None:
     assert server.requests == [["setParam /a", "deleteParam /a/b", "hasParam /a/b", "setParam /c"]]
     assert [one[1] for one in answers] == ["setParam", "deleteParam", "hasParam", "setParam"]
     assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
+    assert server.told == [("/a", "/me"), ("/a/b", None), ("/c", "/me")]
 
 
 @settings(max_examples=100, deadline=None)
@@ -159,7 +171,7 @@ def test_a_run_is_one_request_in_its_order() -> None:
 def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]]) -> None:
     """Whatever the calls, together they leave the tree that they leave one by one."""
     calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
-    together, single = (OrderedServer(ParameterMirror({}, lambda: None)) for _ in range(2))
+    together, single = (OrderedServer(mirror()) for _ in range(2))
     ordered(together, *copy.deepcopy(calls))
     for call in copy.deepcopy(calls):
         ordered(single, call)
@@ -169,7 +181,7 @@ def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]])
 
 def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
     """The one that no request can carry fails by itself; those before and after it are carried out in order."""
-    server = OrderedServer(ParameterMirror({}, lambda: None))
+    server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
     assert isinstance(answers[1], EncodingError)
     assert server.parameters.tree == {"a": 1, "c": 3}
@@ -178,7 +190,7 @@ def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
 
 def test_a_value_that_is_too_much() -> None:
     """The limit holds for the sum of a run; what takes the place of something else is no addition."""
-    server = OrderedServer(ParameterMirror({}, lambda: None, bytes_limit=1100))
+    server = OrderedServer(mirror(whole=1100))
     big = "x" * 400
     answers = ordered(
         server,
@@ -194,7 +206,7 @@ def test_a_value_that_is_too_much() -> None:
 
 def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
     """A fault of one part is that part's; without an answer each part has the failure, and the mirror stays."""
-    server = OrderedServer(ParameterMirror({}, lambda: None))
+    server = OrderedServer(mirror())
     answers = ordered(server, ("hasParam", "/fault"), ("setParam", "/a", 1))
     assert isinstance(answers[0], CallFailedError)
     assert answers[1][0] == 1
@@ -202,6 +214,7 @@ def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
     answers = ordered(server, ("setParam", "/b", 1), ("deleteParam", "/a"))
     assert [type(one) for one in answers] == [CallFailedError, CallFailedError]
     assert server.parameters.tree == {"a": 1}
+    assert server.told == [("/a", "/me")]
 
 
 @settings(max_examples=200, deadline=None)
@@ -211,21 +224,19 @@ def test_changes_made_once_more_leave_the_same_tree(
 ) -> None:
     """A tree kept at any moment, with the changes from then or from any moment before it on, is the last tree."""
     noted: list[tuple[str, Any]] = []
-    mirror = ParameterMirror(
-        {}, lambda: None, note=lambda key, value: noted.append((key, copy.deepcopy(value)))
-    )
+    there = mirror(note=lambda key, value: noted.append((key, copy.deepcopy(value))))
     kept = []
     for do, key, value in [("", "", None), *steps]:
         if do == "set":
-            mirror.set(key, copy.deepcopy(value))
+            put(there, key, copy.deepcopy(value), HOST)
         elif do == "delete":
-            mirror.delete(key)
-        kept.append((len(noted), copy.deepcopy(mirror.tree)))
+            there.delete(key)
+        kept.append((len(noted), copy.deepcopy(there.tree)))
     count, tree = data.draw(st.sampled_from(kept))
     first = data.draw(st.integers(0, count))
-    again = ParameterMirror(tree, lambda: None, since=noted[first:])
-    assert again.tree == mirror.tree
-    assert again.weight == mirror.weight
+    again = mirror(tree, since=noted[first:])
+    assert again.tree == there.tree
+    assert again.weight == there.weight
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
@@ -245,7 +256,7 @@ def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
             keys = [key for key, _ in steps]
             return [[codes[keys.index(params[1])], method, 0] for method, params in calls]
 
-    server = Failing(ParameterMirror({}, lambda: None))
+    server = Failing(mirror())
     calls = [("setParam", key, copy.deepcopy(value)) for key, value in steps]
     if together:
         ordered(server, *calls)

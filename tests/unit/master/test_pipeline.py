@@ -13,12 +13,15 @@ from appliance.master import pipeline
 from appliance.master.calls import MASTER_CALLS
 from appliance.master.gate import Gate, HostLimits
 from appliance.master.http import HttpRequest, Peer
-from appliance.master.parameters import ParameterMirror
 from appliance.master.pipeline import Pipeline
 from appliance.master.registry import Registry
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
+from appliance.shares.pool import Standing
+from tests.support.parameters import mirror, put
+
+HOST = ipaddress.ip_address("10.0.0.9")
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
 THIRD = "10.0.0.7"
@@ -54,12 +57,21 @@ class Records:
     def __init__(self) -> None:
         self.strict = False
         self.obstacle: str | None = None
+        self.debt = ""
         self.meter = Anything()
         self.decisions: list[tuple[str, str, Decision]] = []
         self.events: list[str] = []
 
+    def shut_out(self, _host: str) -> str:
+        """As `Recorder`."""
+        return ""
+
+    def owing(self, _host: str) -> str:
+        """As `Recorder`."""
+        return self.debt
+
     def decided(
-        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **_more: str
+        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **_more: Any
     ) -> str:
         """As `Recorder`."""
         self.decisions.append((method, resource, decision))
@@ -80,18 +92,24 @@ class Site:
         self.policy = lambda: policy
         self.gate = Gate(self.policy, Registry(Anything()), HostLimits())
         self.recorder = Records()
-        self.parameters = ParameterMirror(copy.deepcopy(tree or {}), lambda: None, bytes_limit=bytes_limit)
-        self.there = ParameterMirror(copy.deepcopy(tree or {}), lambda: None)
+        self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
+        self.there = mirror(copy.deepcopy(tree or {}))
         self.rosmaster = self
+        self.graph = Anything()
         self.addresses = self
         self.arrived: list[str] = []
         self.go = asyncio.Event()
         self.go.set()
-        served = Pipeline(self, limits=Limits(), offload=OFFLOAD)  # type: ignore[arg-type]  # stands for the master
+        served = Pipeline(self, limits=Limits(), offload=OFFLOAD, standing=lambda _host: Standing.REGISTERED)  # type: ignore[arg-type]  # stands for the master
         self.serve = served.handler(MASTER_CALLS)
 
     async def learn(self, _peer: Peer) -> None:
         """As `Addresses`."""
+
+    @property
+    def reachable(self) -> bool:
+        """ROSMaster is not: a test's calls get to it, or wait for it."""
+        return False
 
     async def call(self, method: str, *params: Any) -> Any:
         """ROSMaster: one call."""
@@ -105,7 +123,7 @@ class Site:
 
     def _done(self, method: str, key: str, *value: Any) -> Any:
         if method == "setParam":
-            self.there.set(key, copy.deepcopy(value[0]))
+            put(self.there, key, copy.deepcopy(value[0]), HOST)
             return [1, "set", 0]
         if method == "deleteParam":
             self.there.delete(key)
@@ -212,7 +230,7 @@ def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
 
     async def scene() -> None:
         site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
-        site.there.set("/arm", {"speed": 4711})  # and the mirror does not know yet
+        put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not know yet
         answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
         assert answer[0] == 0
         assert "4711" not in str(answer)
@@ -292,5 +310,33 @@ def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
         threads.clear()
         await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
         assert threads == [("parse_call", False), ("build_response", True)]
+
+    play(scene)
+
+
+@pytest.mark.parametrize(
+    ("tell", "told"),
+    [
+        (
+            "",
+            "10.0.0.5 is not among the hosts that may write the parameter /arm/max, by [Parameters] write /arm/max",
+        ),
+        (
+            "full",
+            "10.0.0.5 is not among the hosts that may write the parameter /arm/max: only adm (10.0.0.9) may, by",
+        ),
+        ("id", "refused [id]"),
+    ],
+)
+def test_a_denied_host_is_told_as_much_as_the_policy_says(tell: str, told: str) -> None:
+    """The answer has what `[Options] tell` lets be told, and the record; the record has the whole reason each time."""
+
+    async def scene() -> None:
+        site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
+        answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
+        assert answer[0] == 0
+        assert answer[1].startswith(told), answer
+        assert answer[1].endswith("[id]")
+        assert "only adm (10.0.0.9) may" in site.recorder.decisions[-1][2].reason
 
     play(scene)

@@ -37,6 +37,46 @@ async def test_what_was_granted_and_not_written_down_is_adopted() -> None:
     assert node.resources(Kind.PUBLICATION) == ["/first", "/second"]
 
 
+@pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
+async def test_what_rosmaster_has_is_no_right(kind: Kind) -> None:
+    """A registration that ROSMaster says a node has, and that the policy does not grant, is ended, not adopted."""
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, kind, "/first")
+    world.reload(NO_SECRET)
+    await world.reconciler._register(node, Registration(kind, "/secret", "t", 0))
+    await world.round()
+    assert node.resources(kind) == ["/first"]
+    assert world.hidden.has(kind, "/secret") == []
+
+
+async def test_a_registration_under_another_name_is_no_nodes() -> None:
+    """ROSMaster says that a node has a topic under a name that is not its own: it is ended, and nobody has it."""
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/first")
+    forged = ("/m", "/second", "t", world.faces.inner_uri(node))
+    await world.rosmaster.call_now("registerPublisher", *forged)
+    assert (await world.ask("lookupNode", "/asker", "/m")) == [-1, "unknown node [/m]", ""]
+    await world.round()
+    assert node.resources(Kind.PUBLICATION) == ["/first"]
+    assert world.hidden.has(Kind.PUBLICATION, "/second") == []
+
+
+async def test_a_parameter_that_was_set_when_control_died_is_told() -> None:
+    """A new control finds ROSMaster as it was: subscribers hear the values that it has, whatever was under way."""
+    world = ControlParts()
+    node = world.node("/n")
+    for key in ("/speed", "/unset"):
+        world.registry.register(node, Kind.PARAMETER, key, "")
+    world.hidden.parameters["speed"] = 2
+    await world.round()
+    assert world.deliveries.told == [
+        ("/n", "paramUpdate", ("/speed/", 2)),
+        ("/n", "paramUpdate", ("/unset/", {})),
+    ]
+
+
 async def test_a_parameter_that_changed_while_its_node_was_away_is_told() -> None:
     """What a returned node subscribed to has the value it has now; an unset one is told as ROSMaster tells it."""
     world = ControlParts()

@@ -43,6 +43,20 @@ async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> Non
     assert world.relay.rows == []
 
 
+async def test_what_a_tool_unregisters_by_what_it_was_told() -> None:
+    """`rosnode cleanup` speaks for a node by the URIs that the lookups told it, on the node's own host."""
+    world = await ControlParts.begun()
+    await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", URI)
+    await world.ask("registerService", "/n", "/s", SERVICE_URI, URI)
+    node = world.registry.all()[0]
+    await world.ask("unregisterPublisher", "/other", "/t", node.outer_uri("10.0.0.1"))
+    assert len(node.registrations) == 2
+    await world.ask("unregisterPublisher", "/n", "/t", node.outer_uri("10.0.0.1"))
+    await world.ask("unregisterService", "/n", "/s", f"rosrpc://10.0.0.1:{node.relay_port}")
+    assert not node.registrations
+    assert (world.hidden.has(Kind.PUBLICATION, "/t"), world.hidden.has(Kind.SERVICE, "/s")) == ([], [])
+
+
 @pytest.mark.parametrize(
     ("register", "unregister", "kind", "detail"),
     [
@@ -85,3 +99,17 @@ async def test_a_parameter_that_a_node_gives_up_is_not_given_back() -> None:
     await world.ask("unsubscribeParam", "/n", URI, "/secret")
     assert not node.shelf
     await world.settle()
+
+
+async def test_a_question_for_one_value_does_not_wait_for_the_master() -> None:
+    """It is answered from the mirror, which has what ROSMaster took; a namespace is asked of ROSMaster."""
+    world = await ControlParts.begun()
+    await world.ask("setParam", "/n", "/arm/speed", 3)
+    before = len(world.hidden.calls)
+    assert await world.ask("getParam", "/n", "/arm/speed") == [1, "Parameter [/arm/speed]", 3]
+    assert await world.ask("hasParam", "/n", "/arm") == [1, "/arm", True]
+    assert await world.ask("hasParam", "/n", "/arm/speed/x") == [1, "/arm/speed/x", False]
+    assert await world.ask("getParam", "/n", "/nothing") == [-1, "Parameter [/nothing] is not set", 0]
+    assert world.hidden.calls[before:] == []
+    await world.ask("getParam", "/n", "/arm")
+    assert [call[0] for call in world.hidden.calls[before:]] == ["getParam"]

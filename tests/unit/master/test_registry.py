@@ -101,6 +101,27 @@ def test_the_one_that_was_lost_first_makes_room() -> None:
     assert registry.spare_of(HOSTS[1]) is None
 
 
+def test_who_has_nothing_makes_room_first() -> None:
+    """A node that gave up all it had goes before one that is lost, and for other hosts, too; not one that asks now."""
+    registry = Registry(Journal())
+    lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
+    for one in (lost, idle, busy):
+        registry.add(one)
+        registry.register(one, Kind.PUBLICATION, "/x", "t")
+    registry.overshadow(lost, 5.0)
+    assert registry.spare(HOSTS[1]) is None
+    for one in (idle, busy):
+        registry.unregister(one, Kind.PUBLICATION, "/x")
+    busy.calls = 1
+    assert registry.spare_of(HOSTS[0]) is idle
+    assert registry.spare(HOSTS[1]) is idle
+    registry.forget(idle)
+    assert registry.spare(HOSTS[1]) is None
+    assert registry.spare(HOSTS[0]) is lost
+    busy.calls = 0
+    assert registry.spare(HOSTS[1]) is busy
+
+
 def test_forgetting_one_life_leaves_the_next_findable() -> None:
     """Two incarnations of one identity (name, host and URI again): the later one is found when the first is dropped."""
     registry = Registry(Journal())

@@ -15,7 +15,10 @@ from appliance.master.places import Places
 from appliance.master.recorder import Recorder
 from appliance.master.registry import Incarnation, Kind, Registry
 from appliance.master.relays import RelayControl
+from appliance.policy import Policy, compile_policy
 from appliance.ros.uris import parse_node_uri
+from appliance.shares.pool import Bounds
+from appliance.shares.table import GRANTS
 from appliance.store.state import StateStore
 
 pytestmark = pytest.mark.anyio
@@ -66,13 +69,19 @@ class Link:
         return told
 
 
+def policy(*limits: str) -> Policy:
+    """A policy with these limits."""
+    return compile_policy("\n".join(["[Limits]", *limits]), file="p.ini")
+
+
 class World:
     """Two relays; /left and the service /serve belong to the first, /right to the second."""
 
-    def __init__(self) -> None:
+    def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
         self.registry = Registry(cast(Any, Nothing()))
         self.allocation = Allocation(2)
+        self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
         self.relay = RelayControl(
@@ -82,7 +91,9 @@ class World:
             cast(Delivery, Nothing()),
             cast(Recorder, self),
             allocation=self.allocation,
+            policy=lambda: self.policy,
             broken=lambda _incarnation: None,
+            grants=grants,
         )
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
@@ -171,15 +182,15 @@ async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -
     """Not on the relay it came from either, should the topic come back to it; so it is with a service."""
     world = World()
     relay, (first, second) = world.relay, world.links
-    relay.grant_service(world.node, "/serve", HOST)
+    relay.grant_service(world.node, "/serve", HOST, "/c")
     first.heard()
     away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
     relay.withdraw_moving(away)
-    assert messages.ClientRevoked("key", "/serve", "10.0.0.5") in first.heard()
+    assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
     world.allocation.adopt(Plan({}, {(SERVICE, "/serve"): 1}))
     relay.place_moved(away)
     relay.revoke(relay.permissions()[0])
-    assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5")
+    assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
     relay.withdraw_moving(back)
     world.put()
     relay.place_moved(back)
@@ -229,4 +240,67 @@ async def test_what_a_relay_could_not_tell_is_said() -> None:
     ((event, reason, fields),) = world.records
     assert (event, fields["lost"]) == ("records lost", 7)
     assert "7 connections" in reason
+    world.close()
+
+
+async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change() -> None:
+    """With publications and grants, to the relay that carries the topic; what has not changed is not said again."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_topic(world.node, "/right", HOST, "/ear")
+    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    first.heard()
+    second.heard()
+    line = "/right = publisher 10.0.0.5 30 Hz, topic 1 MB/s, subscriber 5 Hz"
+    before, world.policy = world.policy, policy(line)
+    relay.policy_changed(before, world.policy)
+    placed = messages.PublicationPlaced(
+        "key", "/right", "std_msgs/String", messages.FlowLimit(30), messages.FlowLimit(bytes=1e6)
+    )
+    grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", messages.FlowLimit(5))
+    assert (first.heard(), second.heard()) == ([], [placed, grant])
+    relay.policy_changed(world.policy, policy(line))
+    assert second.heard() == []
+    relay.attach(1, cast(Channel, second))
+    told = second.heard()
+    assert placed in told
+    assert grant in told
+    before, world.policy = world.policy, policy()
+    relay.policy_changed(before, world.policy)
+    assert second.heard() == [
+        messages.PublicationPlaced("key", "/right", "std_msgs/String"),
+        messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
+    ]
+    world.close()
+
+
+async def test_what_a_limit_dropped_is_a_record_with_the_limits_line() -> None:
+    """Of publishers a warning, of what is throttled on purpose a note; both are counted."""
+    world = World()
+    world.policy = policy("/left = publisher 30 Hz, subscriber 5 Hz")
+    rows = [
+        messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
+        messages.LimitedRow("key", "/left", "subscriber", "10.0.0.6", "/ear", 3, 30),
+    ]
+    world.links[0].say(messages.MessagesLimited(rows), ())
+    [(event, _reason, one), (_event, _other_reason, other)] = world.records[-2:]
+    assert (event, one["severity"].value, other["severity"].value) == ("rate limited", "warning", "info")
+    assert (str(one["rule"]), one["count"], one["bytes"]) == ("[Limits] /left (p.ini:2)", 7, 70)
+    assert (other["host"], other["caller_id"], other["publisher"]) == ("10.0.0.6", "/ear", "/node")
+    assert world.relay.carried.limited_messages == {("/left", "publisher"): 7, ("/left", "subscriber"): 3}
+    world.close()
+
+
+async def test_grants_of_all_hosts_are_bounded() -> None:
+    """A host at its share, and of all hosts that with most, loses what nobody is connected by; others lose nothing."""
+    world = World(Bounds(whole=100, host=60, strangers=0, kept=0))
+    robot = ipaddress.ip_address("10.0.0.9")
+    world.relay.grant_topic(world.node, "/left", robot, "/ear")
+    for number in range(200):
+        world.relay.grant_topic(world.node, "/left", ipaddress.ip_address("10.1.0.1"), f"/ear{number}")
+        for guest in range(2, 5):
+            address = ipaddress.ip_address(f"10.1.0.{guest}")
+            world.relay.grant_topic(world.node, "/left", address, f"/ear{number}")
+        assert len(world.relay.permissions()) <= 100
+    assert "10.0.0.9" in {row.host for row in world.relay.permissions()}
     world.close()

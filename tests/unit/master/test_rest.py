@@ -2,20 +2,34 @@
 
 import asyncio
 import socket
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import msgspec
 
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AnyRequest, HostAdd, PolicyLoad, StatusWanted
+from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.channel.messages import TokenKept
+from appliance.channel.messages import Asked, TokenKept
 from appliance.master.rest import RestLink
+from appliance.store.tokens import TokenRow, make_token
 from tests.support.heard import Heard
 
-TOKEN = TokenKept("0123456789ab", "alice", "viewer", b"s", b"h", 1e12)
-ADMIN = TokenKept("0123456789ac", "w", "admin", b"s", b"h", 1e12)
+VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=600)
+ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=600)
+
+
+def kept(row: TokenRow) -> TokenKept:
+    """What the api is told of a token."""
+    assert row.keys is not None
+    return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, row.keys.reading)
+
+
+def loading(number: int, text: str, shown: str = TOKEN) -> messages.RequestMade:
+    """A policy to load, as an honest api passes it on."""
+    asked = Asked("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
+    return messages.RequestMade(number, PolicyLoad(text), shown, asked)
 
 
 class Everything:
@@ -42,7 +56,11 @@ class Everything:
 
     def usable(self) -> list[TokenKept]:
         """Two tokens."""
-        return [TOKEN, ADMIN]
+        return [kept(VIEWER), kept(ADMIN)]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """One of them."""
+        return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
         """Note a record."""
@@ -74,7 +92,7 @@ def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:
 
     async def whole() -> None:
         world = Everything()
-        link = RestLink(world, world, world)  # type: ignore[arg-type]  # stands in for all three
+        link = RestLink(world, world, world, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
         try:
             await play(world, link)
         finally:
@@ -89,7 +107,7 @@ def test_tokens_are_told_at_once_and_after_every_change() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        assert await api.until(1) == [messages.TokensStated([TOKEN, ADMIN])]
+        assert await api.until(1) == [messages.TokensStated([kept(VIEWER), kept(ADMIN)])]
         world.changed()
         assert len(await api.until(2)) == 2
 
@@ -104,8 +122,8 @@ def test_enrolments_hold_nobody_up() -> None:
         world.go.clear()
         api = Api(world, link)
         for number in range(20):
-            api.channel.send(messages.RequestMade(number, "w", HostAdd(f"h{number}", "request")))
-        api.channel.send(messages.RequestMade(99, "w", StatusWanted()))
+            api.channel.send(messages.RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
+        api.channel.send(messages.RequestMade(99, StatusWanted(), TOKEN))
         heard = (await api.until(6))[1:]
         assert [one.answer.trouble for one in heard if one.number != 99] == ["busy"] * 4
         assert [one.answer.ok for one in heard if one.number == 99] == [True]
@@ -124,7 +142,7 @@ def test_what_it_is_recognised_by_is_passed_on() -> None:
         api = Api(world, link)
         pin = "sha256//" + "A" * 43 + "="
         api.channel.send(messages.RestServed(pin))
-        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
         await api.until(2)
         assert pins == [pin]
         api.channel.send(messages.RestServed("$(reboot)"))
@@ -141,11 +159,13 @@ def test_answers_bear_their_numbers_in_order() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
         for number in (7, 3, 9):
-            api.channel.send(messages.RequestMade(number, f"who{number}", StatusWanted()))
+            api.channel.send(
+                messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN)
+            )
         heard = await api.until(4)
         assert [one.number for one in heard[1:]] == [7, 3, 9]
         assert [one.answer.body["number"] for one in heard[1:]] == [1, 2, 3]
-        assert [who for _request, who in world.asked] == ["who7", "who3", "who9"]
+        assert [who for _request, who in world.asked] == ["w", "alice", "w"]
 
     run(play)
 
@@ -157,7 +177,7 @@ def test_more_than_may_wait_are_told_so_at_once() -> None:
         world.go.clear()
         api = Api(world, link)
         for number in range(200):
-            api.channel.send(messages.RequestMade(number, "w", StatusWanted()))
+            api.channel.send(messages.RequestMade(number, StatusWanted(), TOKEN))
         heard = await api.until(1 + 200 - 65)
         assert {one.answer.trouble for one in heard[1:]} == {"busy"}
         world.go.set()
@@ -172,8 +192,8 @@ def test_a_defect_is_one_answer() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        api.channel.send(messages.RequestMade(1, "w", PolicyLoad("defect")))
-        api.channel.send(messages.RequestMade(2, "w", StatusWanted()))
+        api.channel.send(loading(1, "defect"))
+        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
         _tokens, failed, served = await api.until(3)
         assert (failed.answer.ok, failed.answer.trouble) == (False, "failed")
         assert "secret" not in failed.answer.error
@@ -188,8 +208,8 @@ def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         world.obstacle = "the audit log cannot be written: disk full"
         api = Api(world, link)
-        api.channel.send(messages.RequestMade(1, "w", PolicyLoad("[Nodes]")))
-        api.channel.send(messages.RequestMade(2, "w", StatusWanted()))
+        api.channel.send(loading(1, "[Nodes]"))
+        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
         _tokens, refused, served = await api.until(3)
         assert (refused.answer.trouble, refused.answer.error) == ("failed", world.obstacle)
         assert served.answer.ok
@@ -203,10 +223,10 @@ def test_a_change_in_a_name_that_may_not_is_refused() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        for number, who in enumerate(("operator", "disk", "", "alice")):
-            api.channel.send(messages.RequestMade(number, who, PolicyLoad("[Nodes]")))
-        api.channel.send(messages.RequestMade(8, "alice", StatusWanted()))
-        api.channel.send(messages.RequestMade(9, "w", PolicyLoad("[Nodes]")))
+        for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
+            api.channel.send(loading(number, "[Nodes]", shown))
+        api.channel.send(messages.RequestMade(8, StatusWanted(), VIEWER_TOKEN))
+        api.channel.send(loading(9, "[Nodes]"))
         answers = (await api.until(7))[1:]
         assert [one.answer.trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
         assert [who for _request, who in world.asked] == ["alice", "w"]
@@ -218,7 +238,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
     """A request that makes a token, a message of another link and nonsense close it; another api is served."""
 
     async def play(world: Everything, link: RestLink) -> None:
-        token = {"message": "RequestMade", "number": 1, "who": "w", "request": {"verb": "token add"}}
+        token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
         for body in (
             msgspec.msgpack.encode(token),
             msgspec.msgpack.encode(messages.Stop()),
@@ -232,7 +252,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
                 await api.closed.wait()
         assert world.asked == []
         api = Api(world, link)
-        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
         assert (await api.until(2))[1].answer.ok
 
     run(play)
@@ -245,15 +265,15 @@ def test_the_next_api_does_not_wait_for_the_last_ones_request() -> None:
         world.go.clear()
         first = Api(world, link)
         for number in range(3):
-            first.channel.send(messages.RequestMade(number, "first", StatusWanted()))
+            first.channel.send(messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN))
         await first.until(1)
         first.channel.close()
         second = Api(world, link)
-        second.channel.send(messages.RequestMade(9, "second", StatusWanted()))
+        second.channel.send(messages.RequestMade(9, StatusWanted(), TOKEN))
         await second.until(1)
         world.go.set()
         assert (await second.until(2))[1].number == 9
-        assert [who for _request, who in world.asked].count("first") <= 1
+        assert [who for _request, who in world.asked].count("alice") <= 1
 
     run(play)
 
@@ -289,7 +309,7 @@ def test_calls_are_recorded_with_their_outcome() -> None:
         api = Api(world, link)
         api.channel.send(messages.RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
         api.channel.send(messages.RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
-        api.channel.send(messages.RequestMade(1, "w", StatusWanted()))
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
         await api.until(2)
         served, refused = world.recorded
         assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")

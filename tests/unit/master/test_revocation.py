@@ -124,7 +124,7 @@ async def test_only_what_one_caller_has_is_decided_again() -> None:
     for one in (node, other):
         await world.register(one, Kind.PUBLICATION, "/secret")
     mine = PermissionRow(other.key, "topic", "/secret", str(node.host), "/n")
-    called = PermissionRow(other.key, "service", "/secret", str(node.host), "")
+    called = PermissionRow(other.key, "service", "/secret", str(node.host), "/n")
     theirs = PermissionRow(node.key, "topic", "/secret", str(node.host), "/m")
     world.relay.rows = [mine, called, theirs]
     world.current = compile_policy(NO_SECRET + "[Clients]\n", file="policy")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.firewall.rules import Chain, Family, PortRange, Verdict
+from appliance.network.firewall.rules import HOOKS, Chain, Family, PortRange, Verdict
 from appliance.network.isolation import Ends, IsolationSettings, isolation_rules
 
 ENDS: dict[Family, Ends] = {
@@ -35,6 +35,17 @@ def test_tunnels_are_forwarded_when_they_are_asked_for() -> None:
         ("500", None, "fd52::2"),
         ("4500", None, "fd52::2"),
     }
+
+
+def test_nobody_translates_towards_the_appliance() -> None:
+    """What enters the link keeps its source, on both families, before any other chain; only loopback is translated."""
+    rules = [rule for rule in isolation_rules(SETTINGS, ENDS, ()) if rule.chain is Chain.KEPT_SOURCE]
+    kept = [rule.family for rule in rules if rule.verdict is Verdict.KEEP_SOURCE]
+    assert kept == [4, 6]
+    assert [rule.source for rule in rules if rule.verdict is Verdict.MASQUERADE] == ["127.0.0.0/8"]
+    assert [hook.priority for hook in HOOKS[Chain.KEPT_SOURCE]] == [-199], (
+        "the smallest that the kernel takes"
+    )
 
 
 def test_a_host_that_routed_before_is_not_cut_off() -> None:

@@ -15,7 +15,7 @@ RANGE = PortRange(32768, 60999)
 
 
 def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
-    """Loopback, the appliance of each family and the services come first, then TCP by SYN and new UDP."""
+    """Loopback, the appliances and the services come first, then TCP by SYN and new UDP, then what leaves."""
     services = parse_services(["tcp/40022,udp/40123", "tcp/41000-41009", "tcp/40022"])
     text = protection(["192.168.1.20", "fd00::20"], RANGE, services)
     rules = [line.strip() for line in text.splitlines() if line.startswith("        ")]
@@ -29,6 +29,9 @@ def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
         "tcp dport 41000-41009 accept",
         "tcp dport 32768-60999 tcp flags & (syn | ack) == syn counter reject with tcp reset",
         "udp dport 32768-60999 ct state { new, invalid } counter drop",
+        "type filter hook postrouting priority 300; policy accept;",
+        "ip daddr { 192.168.1.20 } tcp flags & (syn | ack) == syn iif != 0 fib saddr type local counter drop",
+        "ip6 daddr { fd00::20 } tcp flags & (syn | ack) == syn iif != 0 fib saddr type local counter drop",
     ]
     assert text.count("delete table inet rosrv_protect") == 1
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from appliance.policy import Policy, PolicyError, Severity, compile_policy
 from appliance.policy.findings import MAXIMUM_FINDINGS
+from appliance.policy.model import TELLS
 from appliance.policy.reader import MAXIMUM_CHARACTERS
 
 SAMPLE_OF_ROSRV = """# machine-a: 192.168.15.69
@@ -146,6 +147,7 @@ def test_policy_of_rosrv_with_a_group_commented_out_is_refused_for_that() -> Non
         ("[Ports]\nrang = 1-2\n", '2:1: unknown key "rang"; did you mean range?'),
         ("[Monitor]\ntopic = chatter\n", '2:9: "chatter" is not a resolved name'),
         ("[Monitor]\ntopic = /a\ntopic = /b\n", '3:1: the key "topic" stands already at line 2'),
+        ("[Options]\ntell = ful\n", '2:8: tell is rule or full or id, not "ful"; did you mean full?'),
         ("[Options]\ntakeover = same host\n", '2:12: takeover is same-host or granted, not "same host"'),
         (
             "[Options]\naudit-only = Publisher\n",
@@ -245,6 +247,8 @@ def test_options_and_ports_have_their_documented_defaults() -> None:
     assert policy.takeover == "same-host"
     assert policy.monitored_services == frozenset()
     assert compile_policy("[Options]\ntakeover = granted\n", file="p").takeover == "granted"
+    assert policy.tell == "rule"
+    assert {compile_policy(f"[Options]\ntell = {one}\n", file="p").tell for one in TELLS} == set(TELLS)
 
 
 def test_lines_may_end_as_on_windows() -> None:

@@ -4,6 +4,7 @@ import ipaddress
 
 from appliance.policy import Category, Explanation, Request, compile_policy, explain
 from appliance.policy.explain import render
+from appliance.policy.rights import decide, rights_of
 
 POLICY = compile_policy(
     """[Groups]
@@ -52,7 +53,7 @@ def test_node_rule_is_part_of_the_answer() -> None:
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
     assert found.decision.allowed
     assert not found.allowed
-    assert POLICY.decide_with_node(found.request).allowed == found.allowed
+    assert decide(POLICY, rights_of(found.request)).allowed == found.allowed
     assert any(line.startswith("together: denied") for line in render(found))
 
 

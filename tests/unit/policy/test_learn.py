@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from appliance.policy import Category, Policy, Request, compile_policy
 from appliance.policy.commands import COMMANDS
-from appliance.policy.learn import Learned, Observation, learn, rights_of
+from appliance.policy.learn import Learned, Observation, learn
+from appliance.policy.rights import decide, rights_of, rights_of_call
 
 ROBOT = ipaddress.ip_address("192.0.2.10")
 HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]
@@ -31,7 +32,7 @@ def test_what_was_done_is_granted_and_nothing_else() -> None:
     """The topic, the node name that goes with it, to the host that used it; not the other direction, name or host."""
     policy = compiled(learn([seen("10.0.0.1", Category.PUBLISH, "/cmd_vel", node="/joy")]))
     host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
-    assert policy.decide_with_node(Request(host, "/joy", Category.PUBLISH, "/cmd_vel")).allowed
+    assert decide(policy, rights_of(Request(host, "/joy", Category.PUBLISH, "/cmd_vel"))).allowed
     for request in (
         Request(other, "/joy", Category.PUBLISH, "/cmd_vel"),
         Request(host, "/joy2", Category.PUBLISH, "/cmd_vel"),
@@ -43,7 +44,7 @@ def test_what_was_done_is_granted_and_nothing_else() -> None:
         Request(host, "/joy", Category.READ, "/p"),
         Request(host, "/joy", Category.WRITE, "/p"),
     ):
-        assert not policy.decide_with_node(request).allowed, request
+        assert not decide(policy, rights_of(request)).allowed, request
 
 
 def test_anonymous_names_become_patterns() -> None:
@@ -131,8 +132,8 @@ def test_the_same_run_passes_under_what_was_learned(observations: list[Observati
     """Whatever was observed, the learned policy is right and grants every right that was used."""
     policy = compiled(learn(observations, [ROBOT]))
     for observation in observations:
-        for request in rights_of(observation):
-            assert policy.decide_with_node(request).allowed, (request, policy.text)
+        rights = rights_of_call(observation.request, observation.call, observation.key or None)
+        assert decide(policy, rights).allowed, (observation, policy.text)
 
 
 @given(st.lists(_observations, min_size=1, max_size=20), _observations)
@@ -142,4 +143,4 @@ def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation],
     stranger = Request(
         ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource
     )
-    assert not policy.decide_with_node(stranger).allowed
+    assert not decide(policy, rights_of(stranger)).allowed

@@ -1,11 +1,14 @@
 """Deciding requests by a compiled policy."""
 
 import ipaddress
+import re
 
 import pytest
 
 from appliance.policy import Address, Category, Decision, Policy, Request, compile_policy
 from appliance.policy.commands import COMMANDS, DECIDED_ELSEWHERE, NAMED_ONLY
+from appliance.policy.model import told_of
+from appliance.policy.rights import decide, rights_of
 
 FIGURE = """
 [Groups]
@@ -52,6 +55,44 @@ def test_figure_of_the_thesis_decides_as_the_thesis_says() -> None:
     assert not ask(policy, "127.0.0.1", "node", "/landshark_radar").allowed
     assert ask(policy, "10.0.0.5", "command", "getSystemState").allowed
     assert not ask(policy, "10.0.0.5", "command", "shutdown").allowed
+
+
+@pytest.mark.parametrize("host", ["10.0.0.9", "2001:db8::9", "127.0.0.1"])
+def test_what_a_denied_host_is_told_names_nobody_else(host: str) -> None:
+    """By default no text for a denied host has an address or a host's name but its own, whatever denies it."""
+    people = "10.0.0.1 10.7.0.0/16 2001:db8::/40 host:bot robot"
+    text = f"""
+[Groups]
+few = {people}
+[Nodes]
+/a = {people}
+/b = few
+[Publishers]
+/a = few, host:bot
+/b =
+[Parameters]
+read /a = few
+read /a/b = host:bot
+write default = robot
+[Commands]
+default = few
+"""
+    policy = compiled(
+        text, hosts={"bot": ipaddress.ip_address("10.9.9.9")}, robot=[ipaddress.ip_address("10.8.8.8")]
+    )
+    denied = 0
+    for category in Category:
+        for resource in ("/a", "/b", "/c", "/a/b", "shutdown", "getPid", "nonsense"):
+            request = Request(ipaddress.ip_address(host), "/b", category, resource)
+            for decision in (policy.decide(request), decide(policy, rights_of(request))):
+                if decision.allowed:
+                    continue
+                denied += 1
+                told = told_of(decision, policy.tell).replace(host, "")
+                assert not re.search(r"[0-9]+\.[0-9]+\.[0-9]+|2001:|few|bot|robot", told), told
+                assert told_of(decision, "full") == decision.reason
+                assert told_of(decision, "id") == "refused"
+    assert denied > 20
 
 
 def test_denial_names_who_may_and_the_rule() -> None:
@@ -331,13 +372,12 @@ def test_audit_only_passes_unresolved_names_never() -> None:
 
 
 def test_node_rule_is_asked_for_calls_that_make_a_node() -> None:
-    """decide_with_node needs both rights for publishing, and only its own for reading calls."""
+    """A decision on all rights needs both for publishing, and only its own for reading calls."""
     policy = compiled(FIGURE)
 
     def both(host: str, node: str, category: str, resource: str) -> Decision:
-        return policy.decide_with_node(
-            Request(ipaddress.ip_address(host), node, Category(category), resource)
-        )
+        request = Request(ipaddress.ip_address(host), node, Category(category), resource)
+        return decide(policy, rights_of(request))
 
     trigger = "/landshark_control/trigger"
     assert both("10.0.0.5", "/ocu", "publish", trigger).allowed

@@ -11,12 +11,13 @@ from appliance.relay.frames import (
     SCRATCH,
     Batch,
     FrameReceiver,
-    MemoryBudget,
     boundary_at,
     equal_frames,
     last_frame,
 )
+from appliance.relay.memory import HostShare
 from appliance.ros.errors import LimitExceededError, PeerError
+from tests.support.relay_memory import share
 
 LIMIT = 16 << 20
 
@@ -26,9 +27,9 @@ def frame(size: int, fill: int = 7) -> bytes:
     return struct.pack("<I", size) + bytes([fill % 256]) * size
 
 
-def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, MemoryBudget]:
+def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, HostShare]:
     """A receiver with a scratch area of its own."""
-    budget = MemoryBudget(memory)
+    budget = share(memory)
     return FrameReceiver(memoryview(bytearray(SCRATCH)), limit, budget), budget
 
 
@@ -67,6 +68,8 @@ def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int
     assert sum(messages for _view, messages, _last in batches) == len(lengths)
     for view, _messages, last in batches:
         assert struct.unpack_from("<I", view, last)[0] == len(view) - last - 4
+    one.rest()
+    one.rest()
     assert budget.used == 0
 
 
@@ -79,7 +82,7 @@ def test_a_torn_frame_is_never_part_of_a_batch() -> None:
 
 def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
     """A torn frame of one connection survives what another receives meanwhile."""
-    scratch, budget = memoryview(bytearray(SCRATCH)), MemoryBudget(1 << 30)
+    scratch, budget = memoryview(bytearray(SCRATCH)), share(1 << 30)
     one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
     data = frame(100, 1)
     assert feed(one, data[:50], [50]) == []

@@ -18,7 +18,7 @@ NODE = NodePlaced("k", "/talker", "10.0.0.1")
 TOPIC = PublicationPlaced("k", "/chatter", "std_msgs/String")
 GRANT = GrantInstalled("k", "/chatter", "10.0.0.2", "/listener")
 SERVICE = ServicePlaced("k", "/add", "10.0.0.1", 4000)
-CLIENT = ClientGranted("k", "/add", "10.0.0.2")
+CLIENT = ClientGranted("k", "/add", "10.0.0.2", "/c")
 EVERYTHING = (NODE, TOPIC, GRANT, SERVICE, CLIENT)
 
 
@@ -38,19 +38,19 @@ def test_a_grant_is_for_one_host_one_caller_one_topic_and_one_incarnation() -> N
     assert not table.may_subscribe("k", "/secret", "10.0.0.2", "/listener")
     assert not table.may_subscribe("k", "/chatter", "10.0.0.3", "/listener")
     assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/stranger")
-    assert table.may_call("k", "/add", "10.0.0.2")
-    assert not table.may_call("k", "/add", "10.0.0.3")
+    assert table.may_call("k", "/add", "10.0.0.2", "/c")
+    assert not table.may_call("k", "/add", "10.0.0.3", "/c")
 
 
 def test_what_is_withdrawn_is_gone() -> None:
     """Each kind of statement can be taken back."""
     table = stated()
     table.withdraw(GrantRevoked("k", "/chatter", "10.0.0.2", "/listener"))
-    table.withdraw(ClientRevoked("k", "/add", "10.0.0.2"))
+    table.withdraw(ClientRevoked("k", "/add", "10.0.0.2", "/c"))
     table.withdraw(PublicationWithdrawn("k", "/chatter"))
     table.withdraw(ServiceWithdrawn("k", "/add"))
     assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
-    assert not table.may_call("k", "/add", "10.0.0.2")
+    assert not table.may_call("k", "/add", "10.0.0.2", "/c")
     assert table.publication("k", "/chatter") is None
     assert table.service("k", "/add") is None
     assert table.node("k") == NODE
@@ -63,7 +63,7 @@ def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
     table.withdraw(NodeWithdrawn("k"))
     assert table.publication("k", "/chatter") is None
     assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
-    assert not table.may_call("k", "/add", "10.0.0.2")
+    assert not table.may_call("k", "/add", "10.0.0.2", "/c")
     assert table.may_subscribe("other", "/chatter", "10.0.0.2", "/listener")
 
 
@@ -71,7 +71,7 @@ def test_the_latest_place_of_a_service_counts() -> None:
     """A service that is placed again is where it was placed last."""
     table = stated()
     table.state(ServicePlaced("k", "/add", "10.0.0.1", 5000))
-    assert table.service("k", "/add") == Service("k", "/add", "10.0.0.1", 5000)
+    assert table.service("k", "/add") == Service("k", "/add", "10.0.0.1", 5000, "/talker")
 
 
 def test_a_restatement_withdraws_what_is_not_said_again_and_only_at_its_end() -> None:

@@ -26,9 +26,10 @@ from appliance.channel.messages import (
 from appliance.relay.compiling import Compiler
 from appliance.relay.frames import Batch
 from appliance.relay.lane import TOO_LONG
+from appliance.relay.places import Place
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from appliance.rosmop.engine import MonitorSet
-from tests.unit.relay.test_engine import ASK, HEADER, LOOPBACK, Peer, World
+from tests.unit.relay.world import ASK, HEADER, LOOPBACK, Peer, World
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 SET_BOOL_MD5 = "09fb03525b03e7ea1fd3992bafd87e16"
@@ -121,10 +122,13 @@ def test_a_monitor_drops_and_changes_messages_and_control_is_told_before_and_aft
     drop = world.event("drop", monitor="guard", count=0)
     assert (drop.key, drop.resource, drop.before, drop.size) == ("k", "/chatter", string("bad")[4:], 7)
     assert drop.text == "guard.said dropped it: no such word"
+    assert (drop.host, drop.caller_id, drop.detail["number"]) == (LOOPBACK, "/talker", 2)
     change = world.event("change", monitor="guard", count=0)
     assert (change.before, change.after) == (string("one")[4:], string("two")[4:])
+    assert (change.caller_id, change.detail["number"]) == ("/talker", 3)
     assert world.event("log", monitor="guard").text == "no such word"
-    assert world.event("drop", count=1).monitor == "guard"
+    again = world.event("drop", count=1)
+    assert (again.monitor, again.host, again.caller_id) == ("guard", LOOPBACK, "/talker")
     assert world.event("change", count=1).resource == "/chatter"
 
 
@@ -355,7 +359,7 @@ def test_messages_that_cost_much_are_seen_by_the_clock_at_once(world: Monitored)
     text = """a() { int n; event e() /chatter std_msgs/String '{}' { for (int i = 0; i < 60000; i++) n += i; } }"""
     world.load(text)
     middle = world.engine._middle
-    lane = middle.lane("k", "/chatter")
+    lane = middle.lane(Place("k", "/chatter"))
     seen: list[float] = []
     process = MonitorSet.process
 
@@ -573,7 +577,8 @@ def test_a_request_that_is_refused_never_reaches_the_service(world: Monitored) -
     world.gets(client, answer)
     client.send(encode_frame(b"\x01"))
     world.gets(client, encode_service_error("the request is refused by the monitor gate: it is open"))
-    assert world.event("drop", resource="/mode").monitor == "gate"
+    drop = world.event("drop", resource="/mode")
+    assert (drop.monitor, drop.host, drop.caller_id) == ("gate", LOOPBACK, "/client")
     assert not service.data
     once, _service = _called(world, persistent=False)
     once.send(encode_frame(b"\x00"))
@@ -584,10 +589,10 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
     """The fault, as well as what a monitor says; services whose monitors are off are not judged."""
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
     middle = world.engine._middle
-    refused = middle.request("k", "/mode", b"\0").refused
+    refused = middle.request(Place("k", "/mode"), b"\0").refused
     assert refused == "the request is refused by the monitor gate: division by zero"
     world.state(MonitorSwitched("gate", False))
-    assert middle.request("k", "/mode", b"\0").refused is None
+    assert middle.request(Place("k", "/mode"), b"\0").refused is None
 
 
 def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Monitored) -> None:
@@ -595,9 +600,9 @@ def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Moni
     world.load(LATCH)
     middle = world.engine._middle
     middle.spent = 99.0
-    assert middle.request("k", "/plain", b"x").body == b"x"
-    assert middle.request("k", "/mode", b"\1").refused == TOO_LONG
-    assert middle.response("k", "/plain", b"y").body == b"y"
+    assert middle.request(Place("k", "/plain"), b"x").body == b"x"
+    assert middle.request(Place("k", "/mode"), b"\1").refused == TOO_LONG
+    assert middle.response(Place("k", "/plain"), b"y").body == b"y"
 
 
 def test_a_service_with_another_definition_is_refused(world: Monitored) -> None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.outbox import Outbox
+from tests.support.relay_memory import share
 
 LIMITS = replace(Limits(), queue_messages=5, queue_bytes=100)
 
@@ -56,7 +56,7 @@ steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
     """Whatever is queued, sent in parts and trimmed: same bytes, same counts, and memory accounted for."""
-    budget = MemoryBudget(1 << 30)
+    budget = share(1 << 30)
     outbox, naive, number = Outbox(LIMITS, budget), NaiveOutbox(), 0
     for step in script:
         if step is None:
@@ -84,7 +84,7 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
     """The oldest are dropped, but what the subscriber has begun to read is finished."""
-    outbox = Outbox(LIMITS, MemoryBudget(1 << 30))
+    outbox = Outbox(LIMITS, share(1 << 30))
     outbox.append(memoryview(b"".join(frame(4, index) for index in range(20))), 20, 3)
     assert outbox.full
     assert outbox.trim() == 14
@@ -95,7 +95,7 @@ def test_a_message_that_has_been_started_is_never_dropped() -> None:
 
 def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
     """The byte bound holds for a single message too."""
-    outbox = Outbox(LIMITS, MemoryBudget(1 << 30))
+    outbox = Outbox(LIMITS, share(1 << 30))
     outbox.append(memoryview(frame(500)), 1)
     assert outbox.trim() == 1
     assert not outbox
@@ -103,7 +103,7 @@ def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
 
 def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
     """The bound of the whole process comes before a subscriber's own."""
-    budget = MemoryBudget(10)
+    budget = share(10)
     outbox = Outbox(LIMITS, budget)
     outbox.append(memoryview(frame(4) + frame(4)), 2)
     assert outbox.trim() == 2
@@ -112,7 +112,7 @@ def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
 
 def test_the_rest_of_a_connection_header_goes_first() -> None:
     """A header that the socket did not take whole precedes all messages and is not counted as one."""
-    outbox = Outbox(LIMITS, MemoryBudget(1 << 30))
+    outbox = Outbox(LIMITS, share(1 << 30))
     outbox.begin(memoryview(b"header"))
     outbox.append(memoryview(frame(4)), 1)
     assert b"".join(outbox.vectors()) == b"header" + frame(4)

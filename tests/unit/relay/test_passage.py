@@ -10,17 +10,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow, SpecificationsStated
-from appliance.relay.frames import FrameReceiver, MemoryBudget
+from appliance.relay.frames import FrameReceiver
 from appliance.relay.lane import Lane
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
 from appliance.relay.middle import Middle
+from appliance.relay.places import Place
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.batch import Walked
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.relay_memory import share
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
 
@@ -66,14 +68,17 @@ class Monitored:
         self.middle.close()
         self._loop.close()
 
-    def through(self, traffic: Traffic) -> tuple[int, bytes, bytes]:
+    def through(self, traffic: Traffic, first: int = 1) -> tuple[int, bytes, bytes]:
         """What is left of the messages: how many, all of them, the last."""
-        receiver = FrameReceiver(memoryview(bytearray(1 << 20)), 1 << 20, MemoryBudget(1 << 30))
+        receiver = FrameReceiver(memoryview(bytearray(1 << 20)), 1 << 20, share(1 << 30))
         receiver.buffer()[: len(traffic.frames)] = traffic.frames
         batch = receiver.received(len(traffic.frames))
         assert batch is not None
         assert batch.messages == traffic.messages
-        lane = self._lanes.setdefault(traffic.topic, self.middle.lane("key", traffic.topic))
+        batch.first = first
+        lane = self._lanes.setdefault(
+            traffic.topic, self.middle.lane(Place("key", traffic.topic, "10.0.0.7", "/talker"))
+        )
         left = lane.through(batch)
         if left is None:
             return 0, b"", b""

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from appliance.relay.context import RelayContext
-from appliance.relay.frames import MemoryBudget
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.memory import HostShares
+from appliance.relay.memory import Memory
 from appliance.relay.middle import Middle
 from appliance.relay.presence import Presences, looks_for_names
 from appliance.relay.report import Reporter
 from appliance.ros.tcpros import HeaderParser
+from appliance.shares.pool import Standing
 
 TOPIC = "/fibonacci/goal"
 
@@ -40,10 +40,9 @@ def presences(loop: Loop) -> Iterator[Presences]:
     """The presences of one topic."""
     limits = Limits()
     reporter = Reporter(limits)
-    budget = MemoryBudget(1 << 20)
-    shares = HostShares(budget)
+    memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
     scratch = memoryview(bytearray(64))
-    context = RelayContext(loop, limits, reporter, budget, scratch, Middle(loop, reporter), shares, shares)
+    context = RelayContext(loop, limits, reporter, memory, scratch, Middle(loop, reporter))
     presences = Presences(context, TOPIC)
     yield presences
     presences.close()

@@ -64,19 +64,19 @@ def reporter(control: Control) -> Reporter:
 def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: Reporter) -> None:
     """The first at once, the rest with the next tick."""
     for _ in range(5):
-        reporter.refused("k", "/chatter", "10.0.0.2", "/x", "no grant")
-    assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
-    reporter.tick(list)
-    assert control.heard() == [ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 4)]
-    reporter.tick(list)
+        reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", "/x", "no grant")
+    assert control.heard() == [ConnectionRefused("k", "topic", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
+    reporter.tick(list, {})
+    assert control.heard() == [ConnectionRefused("k", "topic", "/chatter", "10.0.0.2", "/x", "no grant", 4)]
+    reporter.tick(list, {})
     assert control.heard() == []
 
 
 def test_many_different_refusals_are_bounded(control: Control, reporter: Reporter) -> None:
     """Beyond the bound they are counted together, and none is lost from the count."""
     for number in range(1000):
-        reporter.refused("k", "/chatter", "10.0.0.2", f"/x{number}", "no grant")
-    reporter.tick(list)
+        reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", f"/x{number}", "no grant")
+    reporter.tick(list, {})
     heard = control.heard()
     assert len(heard) == 4
     assert sum(message.count for message in heard) == 1000
@@ -84,7 +84,7 @@ def test_many_different_refusals_are_bounded(control: Control, reporter: Reporte
 
 def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:
     """What a stranger writes into a header does not fill the link."""
-    reporter.refused("k", "/" + "t" * 60_000, "10.0.0.2", "/" + "c" * 60_000, "r" * 60_000)
+    reporter.refused("k", ("topic", "/" + "t" * 60_000), "10.0.0.2", "/" + "c" * 60_000, "r" * 60_000)
     (message,) = control.heard()
     assert max(len(message.resource), len(message.caller_id), len(message.reason)) <= 300
 
@@ -111,8 +111,8 @@ def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Re
 
 def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -> None:
     """And none when nothing has moved."""
-    reporter.tick(lambda: [ROW, ROW])
-    reporter.tick(list)
+    reporter.tick(lambda: [ROW, ROW], {})
+    reporter.tick(list, {})
     assert control.heard() == [TrafficReported([ROW, ROW])]
 
 
@@ -121,16 +121,16 @@ def test_refusals_without_a_control_are_told_to_the_next_one(control: Control, r
     reporter.attach(None)
     taken: list[int] = []
     for _ in range(3):
-        reporter.refused("k", "/chatter", "10.0.0.2", "/x", "no grant")
-        reporter.tick(lambda: taken.append(1) or [ROW])  # type: ignore[func-returns-value]  # it is told if it is asked
+        reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", "/x", "no grant")
+        reporter.tick(lambda: taken.append(1) or [ROW], {})  # type: ignore[func-returns-value]  # it is told if it is asked
     assert taken == []
     reporter.attach(control.link)
-    reporter.tick(lambda: [ROW])
+    reporter.tick(lambda: [ROW], {})
     assert control.heard() == [
-        ConnectionRefused("k", "/chatter", "10.0.0.2", "/x", "no grant", 3),
+        ConnectionRefused("k", "topic", "/chatter", "10.0.0.2", "/x", "no grant", 3),
         TrafficReported([ROW], 4.0),
     ]
-    reporter.tick(lambda: [ROW])
+    reporter.tick(lambda: [ROW], {})
     assert control.heard() == [TrafficReported([ROW])]
 
 
@@ -152,6 +152,6 @@ def test_connections_that_ended_without_a_control_are_told_or_counted(
         heard += control.heard()
     assert (type(heard[0]), heard[1]) == (ConnectionOpened, ConnectionClosed(before, "gone"))
     assert len(heard) == 2000
-    reporter.tick(list)
-    reporter.tick(list)
+    reporter.tick(list, {})
+    reporter.tick(list, {})
     assert control.heard() == [TrafficReported([], 1.0, 2)]

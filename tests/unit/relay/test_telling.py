@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
+from appliance.relay.places import Place
 from tests.unit.relay.test_passage import Monitored
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Traffic, definitions
@@ -63,6 +64,7 @@ def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None
     assert change.detail == {
         "events": ["stop.drive", "turn.drive", "look.drive", "look.on"],
         "changed_by": ["stop.drive"],
+        "number": 1,
     }
     assert told.counts() == {"stop": (0, 1), "turn": (0, 0), "look": (0, 0)}
 
@@ -153,3 +155,49 @@ def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: T
     assert [one.kind for one in events.events] == ["drop"]
     rows = {row.name: (row.events, row.drops) for row in counters.rows}
     assert rows == {"stop": (1, 0), "turn": (1, 0), "look": (1, 1)}
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["one by one", "together"])
+@pytest.mark.parametrize("equal", [False, True], ids=["of any length", "equally long"])
+def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -> None:
+    """Caller id and host, the number in the publication, and the header as it was received."""
+    look = """look() { event far(int seq) /scan geometry_msgs/PoseStamped '{header:{seq:seq}}' {
+        if (seq == 7 || seq == 9) { seq = 0; return; } if (seq == 8) { int zero = 0; seq = 1 / zero; } } }"""
+    told = Told(together=together, texts=(look,), on_fault="pass")
+    header: dict[str, object] = {"header__stamp__sec": 1_700_000_000, "header__stamp__nanosec": 5}
+    bodies = []
+    for seq in range(1, 11):
+        frame = "m" * (3 if equal else seq)
+        header |= {"header__seq": seq, "header__frame_id": frame}
+        bodies.append(message("geometry_msgs/PoseStamped", **header))
+    frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+    told.monitored.through(Traffic("/scan", frames, len(bodies)), first=101)
+    told.monitored.middle.tick()
+    told.monitored.middle.observations._flush()
+    found: list[Any] = [one for one in told.monitored._events() if isinstance(one, MonitorEvent)]
+    [drop, more] = [one for one in found if one.kind == "drop"]
+    [fault] = [one for one in found if one.kind == "fault"]
+    assert {(one.host, one.caller_id) for one in (drop, more, fault)} == {("10.0.0.7", "/talker")}
+    places = [(one.detail["number"], one.detail["seq"], one.detail["stamp"]) for one in (drop, fault)]
+    assert places == [(107, 7, "1700000000.000000005"), (108, 8, "1700000000.000000005")]
+    assert (more.count, "number" in more.detail) == (1, False)
+    told.monitored.close()
+
+
+def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> None:
+    """A client that calls itself by ever new names makes no record for each; the first is named, hosts are apart."""
+    told = Told(together=True)
+    observations = told.monitored.middle.observations
+    for number in range(50):
+        for host in ("10.0.0.1", "10.0.0.2"):
+            observations.note("drop", "gate", Place("k", "/mode", host, f"/client{number}"), 1, "no")
+    first, second, *counts = told.events("drop")
+    assert [(one.host, one.caller_id, one.count) for one in (first, second)] == [
+        ("10.0.0.1", "/client0", 0),
+        ("10.0.0.2", "/client0", 0),
+    ]
+    assert [(one.host, one.caller_id, one.count) for one in counts] == [
+        ("10.0.0.1", "", 49),
+        ("10.0.0.2", "", 49),
+    ]
+    told.monitored.close()

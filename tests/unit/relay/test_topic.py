@@ -5,9 +5,10 @@ from collections.abc import Mapping
 
 import pytest
 
-from appliance.channel.messages import DELAY_BOUNDS, TopicTraffic
-from appliance.relay.frames import Batch, MemoryBudget
+from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.relay.frames import Batch
 from appliance.relay.topic import RelayedTopic
+from tests.support.relay_memory import share
 
 HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
 
@@ -46,6 +47,10 @@ class RecordedUpstream:
         """These are served."""
         self.announced = (sorted(names), type_name)
 
+    def give_again(self) -> None:
+        """The latched message is wanted once more."""
+        self.asked.append("give again")
+
 
 class RecordedMember:
     """A subscriber that takes everything until it is told that it is behind."""
@@ -54,6 +59,7 @@ class RecordedMember:
         self.caller_id = caller_id
         self.header: Mapping[str, str] = {}
         self.received = b""
+        self.missed = False
         self.behind_since: float | None = None
         self.was_cut = ""
         self.trimmed = 0
@@ -64,9 +70,10 @@ class RecordedMember:
         self.header = header
         return self._fits
 
-    def deliver(self, batch: Batch) -> None:
+    def deliver(self, batch: Batch) -> int:
         """Take the frames."""
         self.received += bytes(batch.view)
+        return 0
 
     @property
     def full(self) -> bool:
@@ -78,6 +85,9 @@ class RecordedMember:
         self.trimmed += 1
         return 3
 
+    def look(self) -> None:
+        """Nothing is looked at."""
+
     def cut(self, reason: str) -> None:
         """Remember why."""
         self.was_cut = reason
@@ -86,11 +96,23 @@ class RecordedMember:
 class Story:
     """A topic with a clock that a test sets."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, memory: int = 1 << 30, fresh: bool = True) -> None:
         self.now = 100.0
-        self.budget = MemoryBudget(1 << 30)
+        self.share = share(memory)
+        self.refused: list[LatchRefused] = []
+        self.limited: list[tuple[str, int, int]] = []
         self.topic = RelayedTopic(
-            "k", "/chatter", "/talker", grace=0.05, clock=lambda: self.now, budget=self.budget
+            "k",
+            "/chatter",
+            "/talker",
+            "10.0.0.1",
+            grace=0.05,
+            clock=lambda: self.now,
+            share=self.share,
+            fresh=fresh,
+            limited=lambda *row: self.limited.append(row),
+            make_room=lambda _size: None,
+            refused=self.refused.append,
         )
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream
@@ -127,6 +149,51 @@ def test_everybody_gets_every_message_in_order() -> None:
     assert second.received == bytes(batch(b"2", b"3").view)
 
 
+def test_what_is_beyond_a_limit_goes_to_no_monitor_and_to_no_subscriber() -> None:
+    """And the last message of a latching publisher goes on later, to both."""
+    story, judged = Story(), []
+    member = story.join()
+    story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # it is told if it is asked
+    story.topic.flow.set(FlowLimit(messages=2), None, story.now)
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    for number in range(4):
+        story.receive(batch(b"%d" % number))
+    assert (member.received, judged) == (bytes(batch(b"0").view), [1])
+    assert story.limited == [("publisher", 1, 5)] * 3
+    story.topic.tidy()
+    assert judged == [1]
+    story.now += 1
+    story.topic.tidy()
+    assert (member.received, judged) == (bytes(batch(b"0", b"3").view), [1, 4])
+    assert story.join().received == bytes(batch(b"3").view)
+
+
+def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
+    """At the next look, and once."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"1"))
+    story.topic.tidy()
+    assert member.received == bytes(batch(b"1").view)
+    member.missed = True
+    story.topic.tidy()
+    assert member.received == bytes(batch(b"1", b"1").view)
+
+
+def test_messages_are_numbered_as_they_come() -> None:
+    """Over batches and over connections: a record says which message of the publication it is about."""
+    story = Story()
+    story.topic.upstream_opened(HEADER)
+    batches = [batch(b"1", b"2"), batch(b"3"), batch(b"4")]
+    for one in batches[:2]:
+        story.receive(one)
+    story.topic.upstream_closed()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batches[2])
+    assert [one.first for one in batches] == [1, 3, 4]
+
+
 def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
     """Not before."""
     story = Story()
@@ -158,32 +225,62 @@ def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
     assert story.join().received == b""
 
 
-def monitored(*, latching: str = "0") -> Story:
+def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
     """A topic that a monitor wants, with its publisher connected and nobody else."""
-    story = Story()
+    story = Story(fresh=fresh)
     story.topic.monitor(lambda batch: batch, wanted=True)
     story.topic.upstream_opened(HEADER | {"latching": latching})
     return story
 
 
-def test_what_came_just_before_the_first_subscriber_is_not_lost_to_a_monitor() -> None:
-    """A second's messages, without a gap to what follows; who comes soon after the first gets them as well."""
+def test_what_a_new_publisher_said_first_is_not_lost_to_a_monitor() -> None:
+    """Subscribers on their way get it, without a gap to what follows; nobody twice, and nobody who comes later."""
     story = monitored()
-    for number in range(4):
-        story.receive(batch(b"%d" % number))
-        story.now += 0.4
+    story.receive(batch(b"0"))
+    story.now += 0.2
+    story.receive(batch(b"1"))
     first = story.join()
-    story.receive(batch(b"4"))
-    assert first.received == bytes(batch(b"2", b"3", b"4").view)
+    assert first.received == bytes(batch(b"0", b"1").view)
     second = story.join("/second")
-    assert second.received == bytes(batch(b"2", b"3", b"4").view)
+    assert second.received == bytes(batch(b"0", b"1").view)
     story.topic.leave(second)
     assert story.join("/second").received == b""
-    story.now += 1.1
-    story.receive(batch(b"5"))
+    story.now += 0.9
     assert story.join("/third").received == b""
-    assert first.received.endswith(bytes(batch(b"5").view))
-    assert story.budget.used == 0
+    story.topic.tidy()
+    assert story.share.used == 0
+
+
+@pytest.mark.parametrize("seconds", [0.3, 2.0, 60.0])
+def test_of_a_stream_that_nobody_hears_the_next_subscriber_gets_nothing_old(seconds: float) -> None:
+    """As in plain ROS: what comes from then on. A gun that is started anew acts on no old command."""
+    story = monitored()
+    for _ in range(int(seconds * 20) + 1):
+        story.receive(batch(b"old"))
+        story.now += 0.05
+    assert story.share.used == 0
+    member = story.join()
+    story.receive(batch(b"new"))
+    assert member.received == bytes(batch(b"new").view)
+
+
+@pytest.mark.parametrize("case", ["relay restarted", "connected again", "monitor loaded late", "came back"])
+def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
+    """Only one that has just appeared may have spoken because of the monitor."""
+    story = monitored(fresh=case != "relay restarted") if case != "monitor loaded late" else Story()
+    if case == "connected again":
+        story.topic.upstream_closed()
+        story.topic.upstream_opened(HEADER)
+    elif case == "monitor loaded late":
+        story.now += 6
+        story.topic.monitor(lambda batch: batch, wanted=True)
+        story.topic.upstream_opened(HEADER)
+    elif case == "came back":
+        member = story.join()
+        story.now += 6
+        story.topic.leave(member)
+    story.receive(batch(b"1"))
+    assert story.join("/next").received == b""
 
 
 def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
@@ -191,10 +288,34 @@ def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
     story = monitored()
     story.receive(batch(b"1"))
     story.topic.tidy()
-    assert story.budget.used > 0
+    assert story.share.used > 0
     story.now += 1.5
     story.topic.tidy()
-    assert story.budget.used == 0
+    assert story.share.used == 0
+
+
+def test_a_latched_message_beyond_the_share_is_passed_on_and_not_kept() -> None:
+    """Control is told once; who comes later gets it from the publisher, as soon as there is room for it."""
+    story = Story(memory=100)
+    early = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.share.add(50)
+    for _ in range(2):
+        story.receive(batch(bytes(60)))
+    assert early.received == 2 * bytes(batch(bytes(60)).view)
+    assert story.refused == [LatchRefused("k", "/chatter", 64)]
+    assert (story.join().received, story.share.used) == (b"", 50)
+    assert "give again" not in story.upstream.asked
+    story.topic.repeat()
+    assert len(story.refused) == 2
+    story.share.add(-50)
+    late = story.join()
+    assert story.upstream.asked.count("give again") == 1
+    story.receive(batch(bytes(60)))
+    assert (late.received, story.share.used) == (bytes(batch(bytes(60)).view), 64)
+    assert story.join().received == late.received
+    story.topic.repeat()
+    assert len(story.refused) == 2
 
 
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
@@ -211,26 +332,6 @@ def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscr
     assert story.join().received == b""
 
 
-def test_who_comes_back_gets_what_it_missed_and_nothing_twice() -> None:
-    """What comes while nobody is there is kept again; without monitor or publisher nothing is."""
-    story = monitored()
-    first = story.join()
-    story.receive(batch(b"1"))
-    story.topic.leave(first)
-    story.now += 2
-    story.receive(batch(b"3"))
-    second = story.join()
-    assert second.received == bytes(batch(b"3").view)
-    story.topic.leave(second)
-    story.receive(batch(b"4"))
-    story.topic.upstream_closed()
-    assert story.budget.used == 0
-    story.topic.upstream_opened(HEADER)
-    story.receive(batch(b"5"))
-    story.topic.monitor(None, wanted=False)
-    assert story.budget.used == 0
-
-
 def test_a_latched_message_is_forgotten_with_the_connection() -> None:
     """The publisher sends it again when it is reached again; an old one is not made up for it."""
     story = Story()
@@ -238,10 +339,10 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
     story.topic.upstream_opened(HEADER | {"latching": "1"})
     story.receive(batch(b"1"))
     story.receive(batch(b"12"))
-    assert story.budget.used == len(batch(b"12").view)
+    assert story.share.used == len(batch(b"12").view)
     story.topic.upstream_closed()
     assert story.join().received == b""
-    assert story.budget.used == 0
+    assert story.share.used == 0
 
 
 def test_subscribers_survive_the_loss_of_the_publisher() -> None:

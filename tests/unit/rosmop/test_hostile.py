@@ -142,6 +142,25 @@ def test_a_value_of_less_than_the_limit_is_held() -> None:
     assert act("std::string s(16000000, 'x'); ROS_INFO(\"%d\", (int) s.size());").log[0].text == "16000000"
 
 
+GROWN = [
+    "s += 'x';", 's += "x";', "s.push_back('x');", 's.append("x");', 's.insert(0, "x");', 's.replace(0, 1, "xy");',
+    "s.resize(15000001);", "s[0] = 'y'; s.push_back('x');", "s.erase(0, 1); s.resize(15000001);",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", GROWN)
+def test_a_value_that_takes_the_place_of_another_counts_once(change: str) -> None:
+    """A long string is changed up to the limit, though Python makes a new one of it."""
+    outcome = act(f"std::string s(15000000, 'x'); {change} ROS_INFO(\"%d\", (int) s.size());")
+    assert outcome.faults == ()
+    assert outcome.log[0].text == "15000001"
+
+
+def test_a_string_that_grows_beyond_the_limit_is_a_fault() -> None:
+    """What takes the place of another value is counted itself."""
+    assert MEMORY in act("std::string s(10000000, 'x'); s += std::string(7000000, 'y');").faults[0].text
+
+
 REFUSED = [
     ("x = " + "(" * 300 + "1" + ")" * 300 + ";", "nested more than 100 deep"),
     ("x = " + "!" * 5000 + "1;", "nested more than 100 deep"),

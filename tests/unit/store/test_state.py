@@ -62,6 +62,9 @@ def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
     store.save_registration(registration)
     store.save_permission(grant)
     store.note_parameter("/a", 1)
+    store.parameter_owned("/a", "10.0.0.8")
+    store.parameters_disowned("/a")
+    store.parameter_owned("/a/b", "10.0.0.9")
     store.save_revision(RevisionRow(1, "text", "p.ini", 1.0, "disk", "note"))
     store.save_setting("name", "value")
     store.save_incarnation(node)
@@ -130,6 +133,23 @@ def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> N
     again.note_parameter("/d", 3)
     assert reopened(tmp_path).parameter_changes()[-1] == ("/d", 3)
     for one in (killed, again):
+        one.close()
+
+
+def test_who_set_parameters_outlasts_the_process(tmp_path: Path) -> None:
+    """Owners of keys are there for the next control; with a key go those below it, and no other that looks like it."""
+    killed = reopened(tmp_path)
+    for key in ("/", "/a", "/a/b", "/a/b/c", "/a/bc", "/ab", "/a-", "/b"):
+        killed.parameter_owned(key, "10.0.0.9")
+    killed.parameters_disowned("/a/b")
+    killed.parameter_owned("/b", "10.0.0.8")
+    again = reopened(tmp_path)
+    kept = dict.fromkeys(("/", "/a", "/a/bc", "/ab", "/a-"), "10.0.0.9") | {"/b": "10.0.0.8"}
+    assert dict(again.parameter_owners()) == kept
+    again.parameters_disowned("/")
+    last = reopened(tmp_path)
+    assert last.parameter_owners() == []
+    for one in (killed, again, last):
         one.close()
 
 

@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.ports import free_port, require_free
+from appliance.supervisor.ports import first_free, free_port, require_free, spare_ports
 
 
 def test_a_free_port_is_free() -> None:
@@ -37,3 +37,26 @@ def test_an_address_of_another_machine_is_an_error() -> None:
     """Listening where this machine has no address is refused in words."""
     with pytest.raises(StartError, match=r"cannot listen on 192\.0\.2\.1:1"):
         require_free("192.0.2.1", 1)
+
+
+def test_the_first_port_that_nobody_keeps() -> None:
+    """A port that is listened on, or that connections of its last owner still keep, is passed over."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        assert first_free(range(port, port + 20)) > port
+        client = socket.create_connection(("127.0.0.1", port))
+        served, _address = listener.accept()
+        served.close()
+        client.close()
+    assert first_free(range(port, port + 20)) > port
+    with pytest.raises(OSError, match=f"none of the ports {port} to {port} is free"):
+        first_free(range(port, port + 1))
+
+
+def test_spare_ports_overlap_none_that_are_taken() -> None:
+    """They are neighbours, outside of every range that is somebody's, or the policy's range is too large."""
+    within = range(1024, 65_536)
+    assert spare_ports(64, [range(32_768, 61_000)], within) == range(65_472, 65_536)
+    assert spare_ports(64, [range(65_500, 65_501), range(60_000, 65_490)], within) == range(59_936, 60_000)
+    with pytest.raises(StartError, match=r"make \[Ports\] range in the policy smaller"):
+        spare_ports(64, [range(1024, 32_768), range(32_800, 65_536)], within)

@@ -144,3 +144,14 @@ def test_a_lock_of_somebody_else_makes_no_state_directory(tmp_path: Path) -> Non
     with pytest.raises(StartError, match="is no state directory"):
         StateDirectory(theirs)
     assert stat.S_IMODE(theirs.stat().st_mode) == 0o755
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives folders to other users")
+def test_a_start_that_was_killed_in_its_middle_is_taken_up(tmp_path: Path) -> None:
+    """A folder that was made and not yet given to its user is given at the next start."""
+    (tmp_path / "lock").touch()
+    (tmp_path / "control").mkdir()
+    state = StateDirectory(tmp_path)
+    state.prepare(ROLES)
+    assert (tmp_path / "control").stat().st_uid == account_of("rosrv").uid
+    state.close()

@@ -3,11 +3,12 @@
 import asyncio
 import errno
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
+from structlog.testing import capture_logs
 
 from appliance.channel.messages import RouteWanted
 from appliance.supervisor import supervisor as module
@@ -32,6 +33,8 @@ class StandIn:
         self.told: list[str] = []
         self.killed = False
         self.pid = 1
+        self.ready = False
+        self.still_seconds = 0.0
 
     def kill(self) -> None:
         """Noted."""
@@ -137,3 +140,35 @@ def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) ->
     control, asked = asyncio.run(scene())
     assert control.killed
     assert 1000 < asked < 5000
+
+
+def test_a_slow_start_is_waited_for_with_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a process gets on, the log says what is waited for; when nothing gets on, the end names it."""
+    monkeypatch.setattr(module, "_START_SECONDS", 0.0)
+    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
+
+    async def scene() -> tuple[list[str], list[MutableMapping[str, Any]]]:
+        supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
+        supervisor._posts[0].life = cast(Life, slow)
+
+        def stop(reason: str) -> None:
+            reasons.append(reason)
+            supervisor._stopping.set()
+
+        monkeypatch.setattr(supervisor, "stop", stop)
+        with capture_logs() as said:
+            waiting = asyncio.create_task(supervisor._until_ready())
+            async with asyncio.timeout(20):
+                while len(said) < 2:
+                    await asyncio.sleep(0)
+                assert reasons == []
+                slow.still_seconds = 1000.0
+                await waiting
+        return reasons, said
+
+    reasons, said = asyncio.run(scene())
+    assert {**said[0], "seconds": 0} == {
+        "event": "still starting", "waits_for": "control", "seconds": 0, "log_level": "info",
+    }  # fmt: skip
+    (reason,) = reasons
+    assert "it waited for control" in reason

@@ -1,5 +1,6 @@
 /** Requests to the appliance's REST interface, and only there: paths, never addresses. */
 
+import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
 import { end, session } from "./session.js";
 
@@ -9,19 +10,29 @@ import { end, session } from "./session.js";
  */
 
 /**
- * The answer, once its headers are there. Throws `Problem`.
+ * The answer, once its headers are there. What has `match` is an order: it is signed. Throws `Problem`.
  * @param {string} method @param {string} path @param {Options} [options]
  */
 export async function send(method, path, { query, json, text, match, token, headers = {}, signal } = {}) {
   const holder = token ?? session.get().current?.token;
-  if (holder) headers = { ...headers, Authorization: `Bearer ${holder}` };
-  if (match !== undefined) headers["If-Match"] = match;
-  if (json !== undefined) headers["Content-Type"] = "application/json";
-  else if (text !== undefined) headers["Content-Type"] = "text/plain; charset=utf-8";
+  const at = new URL(path + queryText(query), location.origin);
+  const body = json !== undefined ? JSON.stringify(json) : text;
+  const type = json !== undefined ? "application/json" : text !== undefined ? "text/plain; charset=utf-8" : "";
+  headers = { ...headers };
+  if (type) headers["Content-Type"] = type;
+  if (holder) headers.Authorization = `Bearer ${await readingKey(holder)}`;
+  if (match !== undefined) {
+    headers["If-Match"] = match;
+    if (holder) {
+      const { challenge } = (await ask("GET", "/v1/challenge", { token, signal })).body;
+      const order = { method, target: at.pathname + at.search, match, type, body: body ?? "" };
+      headers["ROSRV-Proof"] = await proof(holder, challenge, order);
+    }
+  }
   let response;
   try {
-    response = await fetch(path + queryText(query), {
-      method, headers, signal, body: json !== undefined ? JSON.stringify(json) : text,
+    response = await fetch(at, {
+      method, headers, signal, body,
       cache: "no-store", credentials: "omit", redirect: "error", referrerPolicy: "no-referrer",
     });
   } catch (error) {

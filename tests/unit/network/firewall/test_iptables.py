@@ -36,7 +36,7 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
             verdict=Verdict.DROP,
             arrives_on=Interface("lo", other=True),
             tcp_ports=ports,
-            opening=True,
+            answered=True,
             above=RateLimit(10, 20),
         )
         for ports in (PortRange(1, 1), PortRange(5, 9))
@@ -44,7 +44,9 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
     first, second = (dict(render_rule(rule)[0].matches) for rule in rules)
     assert first["hashlimit"] == second["hashlimit"]
     assert ("hashlimit-name", "rosrv-10-20") in first["hashlimit"]
-    assert second["tcp"] == (("dport", "5:9"), SYN)
+    assert second["tcp"] == (("dport", "5:9"),)
+    assert second["conntrack"] == (("ctstatus", "ASSURED"), ("ctdir", "ORIGINAL"))
+    assert second["connmark"] == (("mark", "0x0/0x40000000"),)
     assert ("in_interface", "!lo") in render_rule(rules[0])[0].attributes
 
 

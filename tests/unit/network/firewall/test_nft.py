@@ -58,7 +58,7 @@ def test_each_chain_is_jumped_to_from_its_hooks() -> None:
     commands = render(appliance_rules(FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=11312)))
     added = [one["add"] for one in commands]
     chains = {body["chain"]["name"]: body["chain"] for body in added if "chain" in body}
-    assert set(chains) == {"ROSRV-IN", "ROSRV-OUT", "filter-INPUT", "filter-OUTPUT"}
+    assert set(chains) == {"ROSRV-IN", "ROSRV-OUT", "ROSRV-IN-INPUT", "ROSRV-OUT-OUTPUT"}
     assert {chain["policy"] for chain in chains.values() if "hook" in chain} == {"accept"}
     jumps = [
         part["jump"]["target"]
@@ -89,7 +89,7 @@ def test_a_rate_limit_has_one_set_for_each_family() -> None:
             purpose=f"p{port}",
             verdict=Verdict.DROP,
             tcp_ports=PortRange.one(port),
-            opening=True,
+            answered=True,
             above=RateLimit(10, 20),
         )
         for port in (1, 2)
@@ -126,7 +126,12 @@ def listed(rules: tuple[Rule, ...], *, without: int | None = None) -> str:
 def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
     """Each family has a rule for hosts with a bucket and one for those without: they are one in the report."""
     rule = Rule(
-        chain=Chain.IN, purpose="p", verdict=Verdict.DROP, tcp_ports=PortRange.one(1), above=RateLimit(10, 20)
+        chain=Chain.IN,
+        purpose="p",
+        verdict=Verdict.DROP,
+        tcp_ports=PortRange.one(1),
+        answered=True,
+        above=RateLimit(10, 20),
     )
     (status,) = statuses((rule,), NftBackend(Machine(listed((rule,)))).counters())
     assert (status.in_force, status.packets) == (True, 1 + 2 + 3 + 4)

@@ -11,6 +11,7 @@ from appliance.network.firewall.rules import (
     FirewallSettings,
     Forwarder,
     Interface,
+    OwnNode,
     PortRange,
     RateLimit,
     Rule,
@@ -29,12 +30,25 @@ FULL = FirewallSettings(
     api_port=8443,
     api_networks=("10.0.0.0/8", "fd00::/8"),
     tunnel_only=("10.9.9.1", "fd77::1"),
+    own_node=OwnNode(
+        uid=61018, relay_uid=61013, address="127.87.79.1", ports=PortRange(900, 963), master_port=5555
+    ),
 )
 
 
 def test_the_rules_only_ever_refuse() -> None:
     """No rule of the appliance's namespace accepts a packet over the head of another firewall."""
-    assert {rule.verdict for rule in appliance_rules(FULL)} == {Verdict.RETURN, Verdict.RESET, Verdict.DROP}
+    refusing = {Verdict.RETURN, Verdict.RESET, Verdict.DROP}
+    assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {Verdict.COUNTED}
+
+
+def test_nobody_is_counted_before_he_has_answered() -> None:
+    """A limit for each host looks at what came after the handshake: a first packet may bear anybody's address."""
+    limited = [rule for rule in appliance_rules(FULL) if rule.above is not None]
+    assert len(limited) == 3
+    assert all(rule.answered and not rule.opening for rule in limited)
+    with pytest.raises(ValueError, match="who has answered"):
+        replace(limited[0], answered=False)
 
 
 def test_the_one_user_is_let_pass_before_all_others_are_refused() -> None:
@@ -58,6 +72,13 @@ def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
     assert appliance_rules(bare) == ()
 
 
+def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
+    """What a router passed on under such an address is dropped before any other rule, on both families."""
+    first, second, *_ = appliance_rules(replace(FULL, neighbours=("10.111.0.1", "fd52::1")))
+    assert [rule.families() for rule in (first, second)] == [(4,), (6,)]
+    assert all(rule.distant and rule.opening and rule.verdict is Verdict.DROP for rule in (first, second))
+
+
 def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
     """The rules of tunnelled hosts come first, by IPsec policy or by the tunnel's interface."""
     first, second = appliance_rules(FULL)[:2]
@@ -76,6 +97,7 @@ def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
     purposes = [rule.purpose for rule in appliance_rules(FULL) if rule.purpose.startswith("REST")]
     assert purposes == [
         "REST port: new connections per host",
+        "REST port: counted",
         "REST port: 10.0.0.0/8 may",
         "REST port: fd00::/8 may",
         "REST port: no other network",
@@ -112,6 +134,8 @@ def test_families_follow_the_addresses() -> None:
             lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, tunnel_only=("10.0.0.1/8",)),
             "'10.0.0.1/8' is no address",
         ),
+        (lambda: OwnNode(uid=-1, relay_uid=1, address="127.0.0.9", ports=PortRange.one(9)), "own node: -1"),
+        (lambda: OwnNode(uid=1, relay_uid=1, address="here", ports=PortRange.one(9)), "'here' is no address"),
         (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.RESET), "only TCP can be reset"),
         (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP, uid=5), "has an owner"),
         (lambda: Rule(chain=Chain.NAT, purpose="x", verdict=Verdict.DNAT), "DNAT and its address"),
@@ -171,6 +195,40 @@ def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
         (Verdict.RETURN, PortRange(50000, 50000)),
         (Verdict.RETURN, PortRange(40000, 40099)),
     ]
+
+
+def test_the_own_node_is_called_by_control_alone() -> None:
+    """Control reaches it at one address, the relay at its ports for messages; any other connection it never answers."""
+    of_node = [rule for rule in appliance_rules(FULL) if "own node" in rule.purpose]
+    calls = [rule for rule in of_node if rule.destination == "127.87.79.1"]
+    assert [(rule.uid, rule.verdict) for rule in calls] == [(61011, Verdict.RETURN), (None, Verdict.RESET)]
+    assert all(rule.chain is Chain.OUT and rule.tcp_ports == PortRange(1, 65535) for rule in calls)
+    answers = [rule for rule in of_node if rule.accepting]
+    assert [(rule.source, rule.from_ports, rule.verdict) for rule in answers] == [
+        ("127.87.79.1", None, Verdict.RETURN),
+        (None, PortRange(900, 963), Verdict.RETURN),
+        (None, None, Verdict.DROP),
+    ]
+    assert {rule.uid for rule in answers} == {61018}
+    assert answers[1].describe() == "from tcp 900-963, uid 61018, syn ack -> RETURN"
+
+
+def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
+    """The programs that are not ours connect to what they are for; nothing of theirs leaves the machine."""
+    rules = appliance_rules(FULL)
+    for uid, port in ((61012, 4444), (61018, 5555)):
+        opened = [rule for rule in rules if rule.uid == uid and rule.opening]
+        passed = {rule.tcp_ports for rule in opened if rule.verdict is Verdict.RETURN}
+        assert passed == {PortRange.one(port)}
+        assert Rule(
+            chain=Chain.OUT,
+            purpose=opened[0].purpose,
+            verdict=Verdict.DROP,
+            leaves_on=Interface("lo", other=True),
+            uid=uid,
+        ) in {replace(rule, purpose=opened[0].purpose) for rule in rules}
+    refused = {rule.tcp_ports for rule in rules if rule.uid == 61018 and rule.verdict is Verdict.RESET}
+    assert refused == {PortRange.one(11311), PortRange.one(8443), PortRange(1, 1023)}
 
 
 def test_a_rule_is_for_tcp_or_for_udp() -> None:

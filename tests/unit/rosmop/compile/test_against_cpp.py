@@ -10,6 +10,7 @@ from random import Random
 
 import pytest
 
+from appliance.rosmop.runtime.numbers import MATH
 from tests.support.requirements import need_program
 from tests.unit.rosmop.acting import act
 
@@ -66,6 +67,46 @@ def program(random: Random) -> str:
         lines.append(f"{name} {operator} {value if exact else f'ii({value})'};")
         lines.append(f'printf("%.9g\\n", (double) {name});')
     return "\n".join(lines)
+
+
+def float_program(random: Random) -> str:
+    """Every function of `<math.h>` on floats, by its plain name and with `f`; and with a double or an int beside."""
+    lines = []
+    for name, (count, _) in MATH.items():
+        for _ in range(20):
+            spread = random.choice((1.0, 3.0, 50.0, 1e6))
+            given = ", ".join(f"{random.uniform(-spread, spread):.6f}f" for _ in range(count))
+            lines += [
+                f'printf("%.17g\\n", (double) {name}({given}));',
+                f'printf("%.17g\\n", (double) {name}f({given}));',
+            ]
+    mixed = (
+        "pow(y, 2)",
+        "pow(y, y)",
+        "fmin(y, 0.3)",
+        "atan2(y, 1)",
+        "sqrt(y) == sqrtf(y)",
+        "labs(-2.5)",
+        "abs(-y)",
+    )
+    lines += [f'printf("%.17g\\n", (double) ({one}));' for one in mixed]
+    return "float y = 0.1;\n" + "\n".join(lines)
+
+
+def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
+    """C++ takes the overload for floats, whose results are not those for doubles, rounded; here, to the last bit."""
+    compiler = need_program("g++", "g++")
+    body = float_program(Random(1))  # noqa: S311  draws examples, not keys
+    source = tmp_path / "program.cpp"
+    source.write_text(f"#include <math.h>\n#include <stdlib.h>\n{HEADERS}int main() {{\n{body}\n}}\n")
+    program = str(tmp_path / "program")
+    subprocess.run([compiler, "-w", "-O0", "-fno-builtin", "-o", program, str(source)], check=True)
+    expected = subprocess.run([program], check=True, capture_output=True, text=True).stdout
+    outcome = act(body)
+    assert not outcome.faults
+    assert [line.text.replace("-nan", "nan") for line in outcome.log] == expected.replace(
+        "-nan", "nan"
+    ).split()
 
 
 @pytest.mark.parametrize("seed", range(6))

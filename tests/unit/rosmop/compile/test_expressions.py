@@ -4,7 +4,7 @@
 
 import pytest
 
-from tests.unit.rosmop.acting import act, refused_action, shown
+from tests.unit.rosmop.acting import act, load, refused_action, shown
 
 INTEGERS = [
     ("1 + 2", 3),
@@ -175,6 +175,16 @@ def test_a_floating_expression(expression: str, value: str) -> None:
     assert shown(expression, conversion="%g") == value
 
 
+def test_a_decimal_that_only_unsigned_long_holds() -> None:
+    """It is one, with a warning, as g++ warns; behind a minus it is the least long."""
+    assert shown("18446744073709551615", conversion="%lu") == "18446744073709551615"
+    assert shown("-9223372036854775808", conversion="%ld") == "-9223372036854775808"
+    warnings = load("s() { event e() /t std_msgs/Int32 '{}' { auto x = 9223372036854775808; } }").warnings
+    assert [one.text for one in warnings] == [
+        "`9223372036854775808` is larger than `long` holds, and an `unsigned long` here; write `9223372036854775808u`"
+    ]
+
+
 def test_a_float_is_rounded_to_32_bits() -> None:
     """A `float` holds what 32 bits hold, also between two operations."""
     assert shown("0.1f", conversion="%.10f") == "0.1000000015"
@@ -281,6 +291,10 @@ REFUSED = [
     ("x = rand();", 3, 5, "there is no function `rand`: verdicts are functions of what was received"),
     ('system("rm -rf /");', 3, 1, "there is no function `system`: there are no programs to start"),
     ("x = 99999999999999999999;", 3, 5, "`99999999999999999999` is larger than any integer type holds"),
+    ("x = 18446744073709551616;", 3, 5, "`18446744073709551616` is larger than any integer type holds"),
+    ("x = -9223372036854775809;", 3, 5, "`-9223372036854775809` is less than any integer type holds"),
+    ("char *p; p = p + 1;", 3, 14, "there is no arithmetic of pointers: write `std::string(…).substr(1)`"),
+    ("char p[9]; p++;", 3, 12, "there is no arithmetic of pointers"),
     ("x = 08;", 3, 5, "`08` is no number; one that begins with 0 is octal"),
     ("switch (x) { case x: break; }", 3, 19, "a case needs a constant: a number or a character"),
     ("switch (x) { case 1: case 1: break; }", 3, 27, "case 1 occurs twice"),

@@ -121,6 +121,17 @@ def test_durations(text: str, nanoseconds: int) -> None:
     assert trigger.period_ns == nanoseconds
 
 
+def test_a_comma_may_end_a_pattern() -> None:
+    """`'{data:v,}'`, nested ones too, as ROSMOP takes it."""
+    paths = []
+    for comma in (",", ""):
+        pattern = f"'{{a:x, b:{{c:y{comma}}}{comma}}}'"
+        trigger = event(head=f"event e(int x, int y) /t p/T {pattern}").trigger
+        assert isinstance(trigger, tree.MessageTrigger)
+        paths.append([[step.name for step in binding.path] for binding in trigger.pattern])
+    assert paths == [[["a"], ["b", "c"]]] * 2
+
+
 def test_patterns_are_paths() -> None:
     """Nested patterns and dotted paths come to the same, with indexes and constants."""
     head = "event e(int a, int b) /t p/T '{x.y[2]:a, z:{w:{v:b}, c:-1.5}, s: \"on\", k: p::T::K, t: true}'"
@@ -208,6 +219,19 @@ REFUSALS = [
     ("// nothing", 1, 1, "there is no specification in this file"),
     ("a() {", 1, 6, "found the end of the file, expected a declaration, an `event`"),
     ("a() { int x }", 1, 13, "found `}`, expected"),
+    (
+        "a() {\n evnt e() /t p/T '{}' { } }",
+        2,
+        11,
+        "found `evnt` where an event begins with `event`; write `event e(…)`",
+    ),
+    ("a() {\n events e(int x) every 1s { } }", 2, 18, "found `events` where an event begins with `event`"),
+    (
+        "a() {\n dL: { x > 0 } }",
+        2,
+        6,
+        "found `{`, expected a formula; a property is `logic: formula @category",
+    ),
     ("a() {\n int x;\n\n  \n", 2, 8, "found the end of the file, expected a declaration, an `event`"),
     ("a() { std::map<int, int> m; }", 1, 15, "there is no `map`; use a `std::vector`"),
     ("a() { double d[2][3]; }", 1, 18, "there are no arrays of arrays; use a `std::vector` of vectors"),

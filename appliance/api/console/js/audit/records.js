@@ -8,6 +8,11 @@ const PAGE = 100;
 const KEPT = 2000; // while it is followed; what the reader asked for by hand comes on top
 const PAUSE = 250; // after the last key of a search
 
+/** What is asked: calls of REST that only looked (this page's own, above all) only where they are asked for. */
+export function askedOf(/** @type {Record<string, string>} */ { looks, ...filter }) {
+  return looks || filter.event || filter.category ? filter : { ...filter, looks: "0" };
+}
+
 /** @param {Record<string, string>} filter @param {boolean} following */
 export function useRecords(filter, following) {
   const key = JSON.stringify(filter);
@@ -21,7 +26,7 @@ export function useRecords(filter, following) {
     setState((state) => ({ ...state, loading: true }));
     const timer = setTimeout(async () => {
       try {
-        const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE }, controller.signal);
+        const { records, cursor } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE }, controller.signal);
         setState({ records, cursor, most: KEPT, error: null, loading: false });
       } catch (error) {
         if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
@@ -37,7 +42,7 @@ export function useRecords(filter, following) {
   const ready = state.records !== null && !state.loading;
   useEffect(() => {
     if (!following || !ready) return undefined;
-    const { until, since, ...rest } = filter;
+    const { until, since, ...rest } = askedOf(filter);
     const newest = state.records?.[0]?.sequence;
     const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
       if (event === "record") setState((state) => ({ ...state, ...added(state, record) }));
@@ -51,7 +56,7 @@ export function useRecords(filter, following) {
   const older = useCallback(async () => {
     if (!state.cursor) return;
     try {
-      const { records, cursor } = await get("/v1/audit", { ...filter, limit: PAGE, cursor: state.cursor });
+      const { records, cursor } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, cursor: state.cursor });
       setState((state) => ({ ...state, records: [...(state.records ?? []), ...records], cursor, most: state.most + records.length, error: null }));
     } catch (error) {
       setState((state) => ({ ...state, error }));

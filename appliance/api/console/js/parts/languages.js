@@ -1,6 +1,6 @@
 /** What the words of a policy and of a specification are, for their colours. */
 
-const PLAIN_KEY = /^(default|read|write|range|topic|service|takeover|audit-only)\b/;
+const PLAIN_KEY = /^(default|read|write|range|topic|service|takeover|audit-only|tell)\b/;
 
 /** The access policy (INI): sections, keys, values. */
 export const policyLanguage = {

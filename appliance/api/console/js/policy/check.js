@@ -15,7 +15,7 @@ export function Check({ pick }) {
   const ours = findings.filter((one) => one.file === "policy" || !one.file.includes(".tests."));
   const ofTests = findings.filter((one) => !ours.includes(one));
   if (!error && !report && !findings.length) {
-    return html`<${Empty} icon="policy" title=${text === base ? "This is the policy in force" : "No error in this text"}>${text === base ? "Change the text; errors appear at their place while you write." : "A dry run shows what is registered now and would be decided differently."}</${Empty}>`;
+    return html`<${Empty} icon="policy" title=${text === base ? "This is the policy in force" : "No error in this text"}>${text === base ? "Change the text; errors appear at their place while you write." : "A dry run shows what is live now and would end, or be decided differently."}</${Empty}>`;
   }
   return html`<div class="panel-body stack">
     ${error && !errors.length ? html`<${Failure} error=${error} />` : null}
@@ -25,10 +25,14 @@ export function Check({ pick }) {
     ${report && html`<${Report} report=${report} />`}</div>`;
 }
 
-function Report(/** @type {{report: any}} */ { report }) {
-  const title = report.loaded ? `Revision ${report.revision} is in force` : "It can be loaded";
+/** What a text would do, or did. @param {{report: any}} given */
+export function Report({ report }) {
+  const ends = report.ends.length;
+  const what = counted(ends, "live connection");
+  const title = report.loaded ? `Revision ${report.revision} is in force${ends ? `, and ended ${what}` : ""}` : ends ? `It can be loaded, and would end ${what}` : "It can be loaded";
   const taken = report.revoked === null ? "" : ` ${counted(report.revoked, "registration or connection", "registrations and connections")} taken back.`;
-  return html`<${Notice} tone="allow" role="status" title=${title}>${report.changes.length ? `${counted(report.changes.length, "live registration")} ${report.loaded ? "are" : "would be"} decided differently.` : "Nothing that is registered now is decided differently."}${taken}</${Notice}>
+  return html`<${Notice} tone=${ends ? "warn" : "allow"} role="status" title=${title}>${report.changes.length ? `${counted(report.changes.length, "live request")} ${report.loaded ? "are" : "would be"} decided differently.` : "Nothing that is live now is decided differently."}${taken}
+      ${ends > 0 && html`<ul class="plain-list">${report.ends.slice(0, 50).map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}>${one.what} <${Given} value=${one.resource || "(all)"} mono /> of <${Given} value=${one.caller_id || "a client"} mono /> on <${Given} value=${one.host} mono /></li>`)}${ends > 50 && html`<li>and ${ends - 50} more</li>`}</ul>`}</${Notice}>
     ${report.changes.length > 0 && html`<div class="table-wrap"><table class="table"><thead><tr><th>Now</th><th>Then</th><th>Node</th><th>Wants</th></tr></thead><tbody>
       ${report.changes.slice(0, 200).map((/** @type {any} */ one, /** @type {number} */ index) => html`<tr key=${index}><td><${Badge} word=${one.now} /></td><td><${Badge} word=${one.then} /></td><td><${Given} value=${one.caller_id} mono /><div class="muted small"><${Given} value=${one.host} mono /></div></td>
         <td>${one.category} <${Given} value=${one.resource} mono /><div class="muted small"><${Given} value=${one.reason} most=${300} /></div></td></tr>`)}</tbody></table></div>`}`;

@@ -1,6 +1,6 @@
 /** Bringing the text into force: why, and whether it goes back by itself. */
 
-import { html, useState } from "../html.js";
+import { html, useEffect, useState } from "../html.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Difference } from "../parts/difference.js";
@@ -8,16 +8,20 @@ import { Field } from "../parts/field.js";
 import { Failure } from "../parts/notice.js";
 import { done } from "../parts/toast.js";
 import { useStore } from "../store.js";
-import { draft, load, look } from "./draft.js";
+import { Report } from "./check.js";
+import { draft, dryRun, load, look } from "./draft.js";
 
 const WITHIN = /** @type {[string, string][]} */ ([["", "Stays until it is changed"], ["60", "Goes back in 1 minute unless confirmed"], ["300", "Goes back in 5 minutes unless confirmed"], ["900", "Goes back in 15 minutes unless confirmed"]]);
 
 /** @param {{close: () => void}} given */
 export function LoadDialog({ close }) {
-  const { live, text, etag } = useStore(draft);
+  const { live, text, etag, report } = useStore(draft);
   const [note, setNote] = useState("");
   const [within, setWithin] = useState("");
   const [error, setError] = useState(/** @type {any} */ (null));
+  useEffect(() => {
+    if (!report) dryRun().catch(setError);
+  }, [text]);
   const go = async () => {
     setError(null);
     try {
@@ -35,6 +39,7 @@ export function LoadDialog({ close }) {
     <${Failure} error=${error} />
     ${error?.status === 412 && html`<p>Close this, and look at what is different from revision ${live.revision} under Diff; then load again.</p>`}
     <div class="form-grid"><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" hint="kept with the revision" /><${Field} label="If you lock yourself out" value=${within} set=${setWithin} options=${WITHIN} /></div>
+    ${report && !report.loaded && html`<${Report} report=${report} />`}
     <div><h3>Changes to revision ${live.revision}${etag === `"${live.revision}"` ? "" : `, which is newer than what this text was begun from (${etag})`}</h3>
       <${Difference} old=${live.text} now=${text} same="The text is that of the policy in force." /></div></${Dialog}>`;
 }

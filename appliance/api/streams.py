@@ -1,0 +1,81 @@
+"""Who follows: streams and exports that last, each a place of which there are so many, with a share for everybody.
+
+A place is held by a token and by a peer, and each of both has a share: whoever holds a viewer's token takes neither the
+places of the others nor those that are kept for operators and admins, from however many connections; and one machine
+with many tokens does not, either. Places are given back when the response is over, whatever ended it.
+"""
+
+from collections.abc import Callable
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from appliance.api.access import Bearer, Role
+from appliance.api.problems import ProblemError
+from appliance.shares.pool import Pool, Standing
+from appliance.shares.table import Share
+
+
+def peer_of(request: Request) -> str:
+    """The machine that a request comes from."""
+    return request.client.host if request.client is not None else ""
+
+
+class Streams:
+    """The places of one kind: `tokens` and `peers` are their shares, `whole` is how many there are."""
+
+    def __init__(self, tokens: Share, peers: Share, whole: int) -> None:
+        self._roles: dict[str, Role] = {}
+        part = whole / tokens.bounds.whole
+        self._tokens: Pool[str] = Pool(
+            "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._standing
+        )
+        self._peers: Pool[str] = Pool(
+            "of these",
+            peers.bounds.sized(whole, max(1, int(peers.bounds.host * part))),
+            lambda _peer: Standing.REGISTERED,
+        )
+
+    def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
+        """Take a place; what is returned gives it back. Raises `ProblemError` (503)."""
+        self._roles[bearer.id] = bearer.role
+        busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
+        if busy:
+            self._forget(bearer.id)
+            mine, here = self._tokens.held(bearer.id), self._peers.held(peer)
+            text = f"too many {what}: of {self._tokens.total} the token {bearer.name} has {mine}, your machine {here}"
+            raise ProblemError(503, "busy", text, retry_after=10)
+        self._tokens.charge(bearer.id)
+        self._peers.charge(peer)
+
+        def give_back() -> None:
+            self._tokens.give_back(bearer.id)
+            self._peers.give_back(peer)
+            self._forget(bearer.id)
+
+        return give_back
+
+    def _standing(self, token: str) -> Standing:
+        return Standing.NAMED if self._roles[token] is Role.VIEWER else Standing.REGISTERED
+
+    def _forget(self, token: str) -> None:
+        if not self._tokens.held(token):
+            self._roles.pop(token, None)
+
+
+class Held(Response):
+    """A response that lasts: its place is given back when it is over."""
+
+    def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
+        self._response = response
+        self._give_back = give_back
+        self.status_code = response.status_code
+        self.background = response.background
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        try:
+            await self._response(scope, receive, send)
+        finally:
+            self._give_back()

@@ -1,0 +1,132 @@
+"""Removes old records, a step at a time; where there is a signer, each step when it has signed the removal.
+
+Invariants: nothing goes without a record that says so, in one transaction; of a log that is signed nothing goes without
+the signer's signature over exactly what goes. What the signer refuses is tried again later (`unremoved` says why).
+"""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from appliance.audit.chain import Removal, limit_of_removal
+from appliance.audit.record import Record
+from appliance.audit.retention import Retention, worth_keeping
+from appliance.audit.signatures import RemovalSigner, Signatures
+from appliance.audit.writer import ChainWriter, RemovedRange
+
+_AT_ONCE = 512
+_LOOK_SECONDS = 5.0
+_AGE_SECONDS = 3600.0
+_ANSWER_SECONDS = 30.0
+_REFUSED_SECONDS = 600.0
+
+
+class _Wanted(NamedTuple):
+    """A step that waits for the signer."""
+
+    gone: RemovedRange
+    reason: str
+    by_size: bool
+
+
+class Remover:
+    """Removes by `retention`; `approve(number, checkpoint, newest)` asks the signer. Used on the log's thread.
+
+    `report(reason, detail)` makes the record of a removal.
+    """
+
+    def __init__(
+        self,
+        retention: Retention,
+        signatures: Signatures,
+        approve: RemovalSigner | None,
+        *,
+        clock: Callable[[], int],
+        report: Callable[[str, dict[str, object]], Record],
+    ) -> None:
+        self._retention = retention
+        self._signatures = signatures
+        self._approve = approve
+        self._clock = clock
+        self._report = report
+        self._wanted: _Wanted | None = None
+        self._asked = self._aged = self._refused = 0.0
+        self.due = 0.0
+        self.unremoved: str | None = None
+
+    def step(self, writer: ChainWriter) -> bool:
+        """Remove one step, or ask the signer for it, if records must go; whether some went."""
+        now = time.monotonic()
+        self.due = now + _LOOK_SECONDS
+        if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
+            return False
+        wanted = self._find(writer, now)
+        if wanted is None:
+            return False
+        if not self._signatures.has_signer:
+            self._remove(writer, wanted, {})
+            return True
+        if self._approve is None:
+            self.unremoved = "old records are not removed: nobody signs their removal"
+            return False
+        checkpoint = writer.checkpoint_text(wanted.gone.last_checkpoint)
+        if checkpoint is not None:
+            self._wanted, self._asked = wanted, now
+            self._approve(wanted.gone.last_checkpoint, checkpoint, writer.newest_signed())
+        return False
+
+    def ask_again(self) -> None:
+        """The signer is (back) in service: what was asked before may be lost."""
+        self._wanted, self._aged, self._refused, self.due = None, 0.0, 0.0, 0.0
+
+    def sealed(self) -> None:
+        """There is a new checkpoint: the one before it may go now, if it is old."""
+        self._aged = self.due = 0.0
+
+    def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> bool:
+        """The signer's answer: what it signed goes, if that is what was asked for. Whether records went."""
+        wanted, self._wanted = self._wanted, None
+        if wanted is None or wanted.gone.last_checkpoint != number:
+            return False
+        what = f"the removal up to checkpoint {number}"
+        wrong = self._signatures.wrong(what, text, signature, key)
+        gone = wanted.gone
+        limit = "" if wrong is not None else limit_of_removal(text)
+        expected = Removal(
+            writer.log_id, number, gone.last_sequence, gone.last_hash, gone.last_checkpoint_hash, limit
+        )
+        if wrong is not None or expected.text() != text:
+            self.unremoved = f"old records are not removed: {wrong or f'{what} is not what was signed'}"
+            return False
+        self._remove(writer, wanted, {"limit": limit, "signature": signature.hex(), "key": key.hex()})
+        return True
+
+    def refused(self, number: int, reason: str) -> None:
+        """The signer does not sign this removal now."""
+        if self._wanted is not None and self._wanted.gone.last_checkpoint == number:
+            self._wanted = None
+            self._refused = time.monotonic() + _REFUSED_SECONDS
+            self.unremoved = f"old records are not removed: the signer refuses: {reason}"
+
+    def _find(self, writer: ChainWriter, now: float) -> _Wanted | None:
+        signed = self._signatures.has_signer
+        reason = self._retention.excess(writer.size())
+        if reason is not None:
+            gone = writer.removable(_AT_ONCE, signed=signed)
+            return None if gone is None else _Wanted(gone, reason, by_size=True)
+        if self._retention.days is None or now < self._aged:
+            return None
+        before = self._retention.oldest_kept(self._clock())
+        gone = writer.removable(_AT_ONCE, signed=signed, before=before)
+        if gone is None:
+            self._aged = now + _AGE_SECONDS
+            return None
+        return _Wanted(gone, f"older than {self._retention.days} days", by_size=False)
+
+    def _remove(self, writer: ChainWriter, wanted: _Wanted, proof: dict[str, object]) -> None:
+        gone = wanted.gone
+        count = gone.last_sequence - gone.first_sequence + 1
+        kept = worth_keeping(writer.evidence(gone), count) if wanted.by_size else []
+        detail = gone._asdict() | {"count": count, "kept": len(kept)} | proof
+        writer.remove(gone, self._report(wanted.reason, detail), kept)
+        self.due, self.unremoved = 0.0, None

@@ -1,0 +1,69 @@
+"""What `rosrv up` is given to read, read before anything is started or made: the policy and the specifications.
+
+RVMaster reads both again and has the last word. What it would not read is not required here: a policy or specifications
+that an operator brought into force while the appliance ran outlast a restart, whatever file and folder have.
+"""
+
+import contextlib
+import sqlite3
+from pathlib import Path
+
+from appliance.config import Settings
+from appliance.master.specifications import SpecificationsRefusedError, check, read_folder
+from appliance.policy import PolicyError, compile_policy
+from appliance.policy.policy import DEFAULT_PORTS
+from appliance.supervisor.errors import StartError
+
+_DISK = "disk"
+
+
+def read_inputs(settings: Settings) -> range:
+    """Read them; the ports that the policy's file gives to nodes.
+
+    Raises `StartError` with all that is wrong with the policy, or with the specifications.
+    """
+    state = settings.state / "control" / "state.db"
+    if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
+        _require_specifications(settings.monitors)
+    try:
+        return compile_policy(_text(settings.policy), file=str(settings.policy)).ports
+    except (PolicyError, StartError) as error:
+        if not _is_read_at_start(state, "policy_revision"):
+            return DEFAULT_PORTS
+        if isinstance(error, StartError):
+            raise
+        raise StartError("\n".join(str(one) for one in error.findings)) from None
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        why = error.strerror
+    except UnicodeDecodeError as error:
+        why = f"it is not UTF-8 text: {error.reason}"
+    raise StartError(f"{file}: the policy cannot be read: {why}; nothing was started (--policy FILE)")
+
+
+def _require_specifications(folder: Path) -> None:
+    try:
+        check(read_folder(folder))
+    except SpecificationsRefusedError as error:
+        raise StartError("\n".join(error.findings)) from None
+
+
+def _is_read_at_start(state: Path, table: str) -> bool:
+    """Whether RVMaster will read what is on disk, and not what an operator brought into force since.
+
+    Not where that cannot be told: statements that an earlier life left beside the database may say otherwise.
+    """
+    try:
+        if not state.exists():
+            return True
+        if state.with_suffix(".ahead").stat().st_size:
+            return False
+        with contextlib.closing(sqlite3.connect(f"file:{state}?mode=ro", uri=True)) as database:
+            row = database.execute(f"SELECT who FROM {table} ORDER BY revision DESC LIMIT 1").fetchone()  # noqa: S608  one of two names
+    except (OSError, sqlite3.Error):
+        return False
+    return row is None or row[0] == _DISK

@@ -1,0 +1,212 @@
+"""Which host each parameter is charged to: whoever set it, with the namespaces that came to be for it.
+
+A *place* is a key from which on another host owns the parameters than above it; so there are few places, however many
+parameters there are. What nobody set is the appliance's (loopback): its own parameters, and a tree of an earlier
+version.
+
+Invariants:
+
+1. The weights of all places together are the weight of the tree.
+2. No place has the owner of the nearest place above it.
+3. Every place but the root is in the tree, is kept by the journal, and is gone with its key.
+"""
+
+import ipaddress
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, cast
+
+from appliance.policy.model import Address
+from appliance.ros.errors import ProtocolError
+from appliance.ros.parameter_tree import Tree, parts_of
+from appliance.ros.xmlrpc import Value
+from appliance.shares.pool import Pool
+
+APPLIANCE: Address = ipaddress.ip_address("127.0.0.1")
+NAME_WEIGHT = 40
+"""About what is written around a member of a namespace, without its name and its value."""
+_VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # about what is written around others
+_NUMBERS = frozenset({bool, int, float})
+
+
+class OwnersJournal(Protocol):
+    """Where owners are written that must survive a crash of control."""
+
+    def parameter_owned(self, key: str, host: str) -> None:
+        """From this key on the parameters are this host's."""
+
+    def parameters_disowned(self, key: str) -> None:
+        """This key and those below it are no places any more."""
+
+
+@dataclass(slots=True)
+class _Place:
+    """A key on the way to places below it; with an owner, it is one itself."""
+
+    owner: Address | None = None
+    weight: int = 0  # of what is its own, without the places below it
+    below: "dict[str, _Place]" = field(default_factory=dict)
+
+    def owned(self) -> "Iterator[_Place]":
+        """The places at this key and below."""
+        if self.owner is not None:
+            yield self
+        for place in self.below.values():
+            yield from place.owned()
+
+
+class ParameterCharges:
+    """Charges parameters to a pool of bytes. `owners` are keys and hosts, as the journal kept them."""
+
+    def __init__(
+        self, pool: Pool[Address], journal: OwnersJournal, owners: Iterable[tuple[str, str]] = ()
+    ) -> None:
+        self.pool = pool
+        self._journal = journal
+        self._root = _Place(APPLIANCE)
+        for key, host in owners:
+            place = self._root
+            for part in parts_of(key):
+                place = place.below.setdefault(part, _Place())
+            place.owner = ipaddress.ip_address(host)
+
+    def held(self, parts: Sequence[str], weight: int) -> Counter[Address]:
+        """Who is charged for what is at this key and below, which weighs so much in all."""
+        path = self._path(parts)
+        held: Counter[Address] = Counter()
+        if len(path) > len(parts):
+            for place in path[-1].owned():
+                held[_owner(place)] += place.weight
+        held[_owner(_region(path, parts))] += weight - held.total()
+        return held
+
+    def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
+        """What is at this key weighed `before` in all, and now `after` (0: it is gone), which is this owner's."""
+        self._release(parts, before)
+        if not parts:
+            self._root.owner, self._root.weight = owner, after
+            self._journal.parameter_owned("/", str(owner))
+        elif after:
+            place = _region(self._path(parts), parts)
+            if place.owner != owner:
+                place = self._root
+                for part in parts:
+                    place = place.below.setdefault(part, _Place())
+                place.owner = owner
+                self._journal.parameter_owned(_key(parts), str(owner))
+            place.weight += after
+        self.pool.charge(owner, after)
+
+    def recount(self, tree: Tree, *, final: bool) -> None:
+        """The tree is another one: each place has what is there now. `final`: places that are not there are gone."""
+        self._recount(self._root, tree, measure(tree)[0], (), final=final)
+
+    def _release(self, parts: Sequence[str], weight: int) -> None:
+        path = self._path(parts)
+        region = _region(path, parts)
+        for owner, amount in self.held(parts, weight).items():
+            self.pool.give_back(owner, amount)
+        inside = sum(place.weight for place in path[-1].owned()) if len(path) > len(parts) else 0
+        region.weight -= weight - inside
+        if len(path) <= len(parts):
+            return
+        self._journal.parameters_disowned(_key(parts))
+        path[-1].below.clear()
+        path[-1].owner = None if parts else path[-1].owner
+        for depth in range(len(parts), 0, -1):
+            if path[depth].below or path[depth].owner is not None:
+                return
+            del path[depth - 1].below[parts[depth - 1]]
+
+    def _recount(
+        self, place: _Place, value: Value, weight: int, parts: tuple[str, ...], *, final: bool
+    ) -> int:
+        """What the places at this key and below have, of what weighs so much in all."""
+        owned = 0
+        for name, below in list(place.below.items()):
+            there = isinstance(value, dict) and name in value
+            if there or not final:
+                member = value[name] if isinstance(value, dict) and there else {}
+                size = member_weight(name, member) if there else 0
+                owned += self._recount(below, member, size, (*parts, name), final=final)
+            else:
+                for gone in below.owned():
+                    self.pool.give_back(_owner(gone), gone.weight)
+                del place.below[name]
+                self._journal.parameters_disowned(_key((*parts, name)))
+        if place.owner is None:
+            return owned
+        self.pool.give_back(place.owner, place.weight)
+        place.weight = weight - owned
+        self.pool.charge(place.owner, place.weight)
+        return weight
+
+    def _path(self, parts: Sequence[str]) -> list[_Place]:
+        """The root, and what is known of the keys from there to this one."""
+        path = [self._root]
+        for part in parts:
+            below = path[-1].below.get(part)
+            if below is None:
+                break
+            path.append(below)
+        return path
+
+
+def _region(path: list[_Place], parts: Sequence[str]) -> _Place:
+    """The nearest place above a key; the root is in its own."""
+    return next((place for place in reversed(path[: len(parts)]) if place.owner is not None), path[0])
+
+
+def _owner(place: _Place) -> Address:
+    if place.owner is None:
+        raise ValueError("a key on the way to a place has no owner of its own")
+    return place.owner
+
+
+def _key(parts: Sequence[str]) -> str:
+    return "/" + "/".join(parts)
+
+
+def measure(value: Value) -> tuple[int, int]:
+    """About how many bytes a value takes on the wire, and how deep it is (0: no array or struct).
+
+    Level by level, because values may be large: those of a level that are numbers or texts cost next to nothing.
+    Raises `ProtocolError` for `<nil/>`.
+    """
+    weight, depth = 0, 0
+    level: list[Value] = [value]
+    while True:
+        kinds = set(map(type, level))
+        if kinds <= _NUMBERS:
+            return weight + _VALUE * len(level), depth
+        if kinds == {str}:
+            return weight + _TEXT * len(level) + sum(map(len, cast(list[str], level))), depth
+        below: list[Value] = []
+        for one in level:
+            weight += _own_weight(one, below)
+        if not kinds & {list, dict}:
+            return weight, depth
+        level, depth = below, depth + 1
+
+
+def _own_weight(value: Value, below: list[Value]) -> int:
+    """What a value takes without what is in it, which is added to those `below`."""
+    if isinstance(value, str):
+        return _TEXT + len(value)
+    if isinstance(value, bytes):
+        return _TEXT + len(value) * 4 // 3
+    if isinstance(value, list):
+        below += value
+        return _ARRAY
+    if isinstance(value, dict):
+        below += value.values()
+        return _STRUCT + NAME_WEIGHT * len(value) + sum(map(len, value))
+    if value is None:
+        raise ProtocolError("a value has <nil/> in it, which neither ROSMaster nor roscpp can send")
+    return _VALUE
+
+
+def member_weight(name: str, value: Value) -> int:
+    """About how many bytes a member of a namespace takes, with its name."""
+    return NAME_WEIGHT + len(name) + measure(value)[0]

@@ -1,0 +1,35 @@
+"""What the policy and the registry know of a host: which share of a finite thing is its own (`appliance/shares`)."""
+
+import ipaddress
+from collections.abc import Callable
+
+from appliance.policy import Policy
+from appliance.policy.model import Address
+from appliance.shares.pool import Standing
+
+
+class HostStanding:
+    """The standing of hosts, by the policy in force at that moment and by what is registered.
+
+    `policy()` is the one in force; `registrations(host)` is how many registrations a host has.
+    """
+
+    def __init__(self, policy: Callable[[], Policy], registrations: Callable[[Address], int]) -> None:
+        self._policy = policy
+        self._registrations = registrations
+
+    def __call__(self, host: Address) -> Standing:
+        """The standing of this host now."""
+        if self._registrations(host):
+            return Standing.REGISTERED
+        # The policy need not name the appliance itself, whose own nodes call from loopback.
+        if host.is_loopback or self._policy().knows(host):
+            return Standing.NAMED
+        return Standing.STRANGER
+
+    def of_text(self, host: str) -> Standing:
+        """The same of a host as records have it; what is no address is nobody's that could be a stranger."""
+        try:
+            return self(ipaddress.ip_address(host))
+        except ValueError:
+            return Standing.NAMED

@@ -1,0 +1,168 @@
+"""Who is connected to control's listeners, what the connections hold, and who makes room when there is none.
+
+Invariants:
+
+1. Connections, the bytes they hold (bodies that are not answered, answers that are not taken) and those that are being
+   told that they are too many are pools of `appliance/shares`: no number of addresses has more than its class may.
+2. A host that is within its own share and finds its class or the whole full gets the place of another connection, if
+   there is one: of the lowest standing that is not above its own, an idle one before one whose request is not whole,
+   and the one that is so for the longest. An idle one costs its client nothing: ROS clients connect again.
+3. Of its own standing only what is idle, or unfinished for `_PATIENCE` seconds, makes room; never what is served.
+4. Where bytes are short, the connection that holds most of a host that holds more makes room.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from enum import Enum
+from typing import Protocol
+
+from appliance.policy.model import Address
+from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.shares.queue import Queue
+from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
+
+_PATIENCE = 1.0
+
+
+class Stage(Enum):
+    """Where a connection is in its requests."""
+
+    IDLE = "idle"
+    """Everything it asked is answered."""
+
+    UNFINISHED = "unfinished"
+    """Its next request, or its turn, is awaited, or that it takes its answer."""
+
+    SERVED = "served"
+    """It is being served."""
+
+
+class Connection(Protocol):
+    """What is asked of a connection here; `deadline` is in monotonic seconds."""
+
+    deadline: float
+
+    @property
+    def holding(self) -> int:
+        """The bytes that are held for it and that its end sets free."""
+
+    def expire(self) -> None:
+        """The deadline has passed."""
+
+    def abort(self) -> None:
+        """End now, and `leave`."""
+
+
+class Visitors:
+    """All connections of every listener that shares it. `standing` says what is known of a host now."""
+
+    def __init__(
+        self,
+        standing: Callable[[Address], Standing],
+        *,
+        connections: Bounds = RVMASTER_CONNECTIONS.bounds,
+        held: Bounds = RVMASTER_BYTES.bounds,
+        farewells: Bounds = RVMASTER_FAREWELLS.bounds,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._standing = standing
+        self._clock = clock
+        self.connected: Pool[Address] = Pool("connections open", connections, standing)
+        self.held: Pool[Address] = Pool("bytes in requests and answers under way", held, standing)
+        self.farewells: Pool[Address] = Pool("connections that are turned away", farewells, standing)
+        self._of: dict[Connection, tuple[Address, Pool[Address]]] = {}
+        self._queues: dict[Stage, Queue[Address, Connection]] = {
+            stage: Queue(standing) for stage in (Stage.IDLE, Stage.UNFINISHED)
+        }
+
+    @property
+    def connections(self) -> frozenset[Connection]:
+        """All that are here, those that are being turned away included."""
+        return frozenset(self._of)
+
+    def enter(self, connection: Connection, host: Address) -> str:
+        """Count a connection in; why not, when there is no room and nobody makes it."""
+        why = self._take(self.connected, host, 1)
+        if not why:
+            self._of[connection] = host, self.connected
+            self.file(connection, Stage.UNFINISHED)
+        return why
+
+    def turn_away(self, connection: Connection, host: Address) -> bool:
+        """Whether a connection that is too many may stay until it was told so; it is counted then."""
+        if self.farewells.take(host):
+            return False
+        self._of[connection] = host, self.farewells
+        return True
+
+    def leave(self, connection: Connection) -> None:
+        """Count a connection out, if it is in."""
+        for queue in self._queues.values():
+            queue.remove(connection)
+        host, pool = self._of.pop(connection, (None, self.connected))
+        if host is not None:
+            pool.give_back(host)
+
+    def file(self, connection: Connection, stage: Stage) -> None:
+        """The connection is at this stage from now on."""
+        host, pool = self._of.get(connection, (None, self.farewells))
+        if host is None or pool is not self.connected:
+            return
+        for queue in self._queues.values():
+            queue.remove(connection)
+        if stage in self._queues:
+            self._queues[stage].put(connection, host, self._clock())
+
+    def hold(self, host: Address, size: int) -> str:
+        """Count bytes in that are kept for a host; why not (nothing is counted) when it is too much."""
+        return self._take(self.held, host, size)
+
+    def release(self, host: Address, size: int) -> None:
+        """Count bytes out."""
+        self.held.give_back(host, size)
+
+    async def sweep(self) -> None:
+        """Every second, close the connections whose deadline has passed; runs until cancelled."""
+        while True:
+            await asyncio.sleep(1.0)
+            now = time.monotonic()
+            for connection in [one for one in self._of if one.deadline < now]:
+                connection.expire()
+
+    def _take(self, pool: Pool[Address], host: Address, amount: int) -> str:
+        why = pool.take(host, amount)
+        while why and pool.held(host) + amount <= pool.bounds.host:
+            victim = self._to_make_room(host) if pool is self.connected else self._to_free_bytes(host)
+            if victim is None:
+                break
+            victim.abort()
+            why = pool.take(host, amount)
+        return why
+
+    def _to_make_room(self, host: Address) -> Connection | None:
+        """The connection whose place this host may have."""
+        mine = self._standing(host)
+        for standing in Standing:
+            if standing > mine:
+                return None
+            for stage, queue in self._queues.items():
+                found = queue.longest(standing)
+                if found is None:
+                    continue
+                patient = stage is Stage.UNFINISHED and standing is mine
+                if not (patient and self._clock() - found[2] < _PATIENCE):
+                    return found[0]
+        return None
+
+    def _to_free_bytes(self, host: Address) -> Connection | None:
+        """The connection that holds most of all that may be ended for this host."""
+        mine, most = self._standing(host), self.held.held(host)
+        able = [
+            one
+            for one in self._queues[Stage.UNFINISHED]
+            if one.holding
+            and (self._standing(self._of[one][0]) < mine or self.held.held(self._of[one][0]) > most)
+            and self._standing(self._of[one][0]) <= mine
+        ]
+        return max(able, key=lambda one: one.holding, default=None)

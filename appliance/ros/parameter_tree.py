@@ -1,0 +1,32 @@
+"""The tree of parameters as ROSMaster has it: what stands at a key, and in the way of one."""
+
+from appliance.ros.xmlrpc import Value
+
+Tree = dict[str, Value]
+
+
+def parts_of(key: str) -> list[str]:
+    """The segments of a key."""
+    return [part for part in key.split("/") if part]
+
+
+def holds_others(value: Value) -> bool:
+    """Whether a value is a namespace with something in it: whose rights are asked, too."""
+    return isinstance(value, dict) and bool(value)
+
+
+def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
+    """What `key` (canonical) has, None for nothing; and its parent that has a value and is no namespace, if any.
+
+    Such a parent is in the way: ROSMaster replaces it by a namespace when something below it is set.
+    """
+    node: Value = tree
+    passed = ""
+    for part in parts_of(key):
+        if not isinstance(node, dict):
+            return None, passed
+        node = node.get(part)
+        if node is None:
+            return None, None
+        passed += f"/{part}"
+    return node, None

@@ -1,0 +1,148 @@
+"""Signed orders over REST: by `rosrv`, by a script, and what becomes of those that somebody in between touched."""
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from appliance.store.order_proof import HEADER, proof_of, reading_key, statement
+from tests.support.appliance import ROSRV, Appliance
+from tests.support.relay_driver import wait_until
+from tests.support.rest import Answer, Rest
+
+
+@pytest.fixture(scope="module")
+def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance that takes no change for a bare token."""
+    config = tmp_path_factory.mktemp("strict") / "appliance.yaml"
+    config.write_text("api_require_proof: true\n")
+    with Appliance(options=("--api", "127.0.0.1:0", "--config", str(config))) as appliance:
+        yield appliance
+
+
+class Holder:
+    """Somebody who holds a token and shows it to nobody, as a script of his would be written."""
+
+    def __init__(self, appliance: Appliance) -> None:
+        whole = appliance.rest()
+        assert whole.token is not None
+        self.token = whole.token
+        self.rest = whole.with_token(reading_key(self.token))
+
+    def signed(self, method: str, target: str, body: bytes, headers: dict[str, str]) -> dict[str, str]:
+        """The headers of an order, with its proof."""
+        challenge = self.rest.get("/v1/challenge").json["challenge"]
+        stated = statement(
+            challenge,
+            method=method,
+            target=target,
+            if_match=headers.get("If-Match", ""),
+            content_type=headers.get("Content-Type", ""),
+            body=body,
+        )
+        return headers | {HEADER: proof_of(self.token, challenge, stated)}
+
+    def load(self, text: str, target: str = "/v1/policy") -> tuple[dict[str, str], Answer]:
+        """Load a policy; what was sent, and the answer."""
+        headers = self.signed("POST", target, text.encode(), {"If-Match": "*", "Content-Type": "text/plain"})
+        return headers, self.rest.request("POST", target, text.encode(), headers)
+
+
+def revisions(rest: Rest) -> int:
+    """The revision in force."""
+    return int(rest.get("/v1/policy").json["revision"])
+
+
+def test_a_script_changes_a_policy_and_shows_its_token_to_nobody(running: Appliance) -> None:
+    """A signed order is carried out, under the token's name; without the proof the same request is refused."""
+    holder = Holder(running)
+    text = running.policy_file.read_text() + "\n# signed\n"
+    _headers, answer = holder.load(text)
+    assert (answer.status, answer.json["loaded"]) == (200, True)
+    assert holder.rest.get("/v1/policy").json["who"] == "first"
+    bare = holder.rest.post("/v1/policy", text, match="*")
+    assert (bare.status, "needs its proof" in bare.json["detail"]) == (403, True)
+
+
+def test_what_somebody_in_between_does_to_an_order_is_refused_and_recorded(running: Appliance) -> None:
+    """Sent twice, with another text, address, condition or as another call: 403, and recorded."""
+    holder = Holder(running)
+    text = running.policy_file.read_text() + "\n# once\n"
+    used, answer = holder.load(text, "/v1/policy?confirm_within=600")
+    assert answer.status == 200
+    before, known = revisions(holder.rest), len(running.audit("--event", "order refused"))
+    fresh = holder.signed(
+        "POST", "/v1/policy", text.encode(), {"If-Match": "*", "Content-Type": "text/plain"}
+    )
+    tried = [
+        ("POST", "/v1/policy?confirm_within=600", text, used),
+        ("POST", "/v1/policy", text + " ", fresh),
+        ("POST", "/v1/policy?confirm_within=1", text, fresh),
+        ("POST", "/v1/policy", text, fresh | {"If-Match": f'"{before}"'}),
+        ("POST", "/v1/policy/confirm", "", fresh),
+        ("DELETE", "/v1/tokens/first", "", fresh),
+    ]
+    for method, target, body, headers in tried:
+        refused = holder.rest.request(method, target, body.encode(), headers)
+        assert refused.status == 403, (method, target, refused.body)
+    assert revisions(holder.rest) == before
+    records = running.audit("--event", "order refused")
+    wait_until(lambda: len(running.audit("--event", "order refused")) >= known + 3, "recorded")
+    records = running.audit("--event", "order refused")
+    assert {one["decision"] for one in records} == {"deny"}
+    assert {one["detail"]["who"] for one in records} == {"first"}
+    good = holder.rest.request("POST", "/v1/policy", text.encode(), fresh)
+    assert good.status == 200, good.body
+
+
+def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
+    """An order that was signed, seen and kept back is refused after RVMaster was killed and is back."""
+    holder = Holder(running)
+    text = running.policy_file.read_text() + "\n# kept back\n"
+    kept_back = holder.signed(
+        "POST", "/v1/policy", text.encode(), {"If-Match": "*", "Content-Type": "text/plain"}
+    )
+    running.kill("control")
+    wait_until(lambda: holder.rest.get("/v1/challenge").status == 200, "control is back")
+    refused = holder.rest.request("POST", "/v1/policy", text.encode(), kept_back)
+    assert (refused.status, "since it started" in refused.json["detail"]) == (403, True)
+
+
+def run(appliance: Appliance, *arguments: str) -> dict[str, Any]:
+    """A verb over REST, whose command must succeed; its answer."""
+    certificate = appliance.state / "api" / "certificate.pem"
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
+    done = subprocess.run(
+        [ROSRV, *arguments, "--json", "--api", str(appliance.ready["api"]), "--api-ca", str(certificate)],
+        env=kept | {"ROSRV_TOKEN": str(appliance.ready["token"])}, capture_output=True, text=True, timeout=60,
+        check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def test_where_proofs_are_required_a_bare_token_only_looks(strict: Appliance) -> None:
+    """Every change by a bare token is 403 with what to do; looks are as before; `rosrv` over REST works as ever."""
+    rest = strict.rest()
+    text = strict.policy_file.read_text()
+    for method, path, body in (
+        ("POST", "/v1/policy", text),
+        ("POST", "/v1/policy/reload", ""),
+        ("POST", "/v1/monitors/reload", ""),
+        ("POST", "/v1/hosts/reload", ""),
+        ("DELETE", "/v1/tokens/first", ""),
+    ):
+        headers = {"If-Match": "*", "Content-Type": "text/plain"}
+        refused = rest.request(method, path, body.encode(), headers)
+        assert refused.status == 403, (path, refused.body)
+        assert "api_require_proof" in refused.json["detail"]
+    assert rest.post("/v1/policy?dry_run=1", text).status == 200
+    before = revisions(rest)
+    assert run(strict, "policy", "reload")["revision"] == before + 1
+    assert run(strict, "policy", "rollback", str(before))["revision"] == before + 2
+    strict.rosrv("token", "add", "bob", "--role", "viewer")
+    assert run(strict, "token", "revoke", "bob")["name"] == "bob"

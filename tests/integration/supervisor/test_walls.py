@@ -1,0 +1,218 @@
+"""The walls of each process, tried from inside: as the role's user, in the very walls that its row asks for.
+
+The same is tried by the same user outside of any wall, so that a refusal says something of the walls.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import Lifeline, Walled
+from appliance.supervisor.post import Post
+from appliance.supervisor.roles import Facts, Role, roles_of
+from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.users import Account, account_of
+from appliance.supervisor.walls import landlock
+from tests.integration.supervisor import trying
+from tests.support.appliance import Appliance
+from tests.support.requirements import need_root, needs
+
+ROOT = Path(trying.__file__).parents[3]
+CHILD = "appliance.supervisor.child"
+UNIX, NETWORK, ROUTES = (
+    ["AF_UNIX"],
+    ["AF_UNIX", "AF_INET", "AF_INET6"],
+    ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK"],
+)
+# What each may do of what not all may: families of sockets, listening, connecting to the two ports of the test.
+MAY = {
+    "rosmaster": (ROUTES, False, [True, True]),
+    "signer": (UNIX, False, [False, False]),
+    "relay": (NETWORK, False, [True, True]),
+    "control": (ROUTES, True, [True, True]),
+    "rosout": (ROUTES, True, [True, True]),
+    "api": (UNIX, False, [False, False]),
+    "charon": (ROUTES, False, [False, False]),
+    "syslog": (ROUTES, False, [True, False]),
+}
+WITHOUT_PRIVILEGE = {
+    "ptrace",
+    "unshare",
+    "setns",
+    "keyctl",
+    "add_key",
+    "io_uring_setup",
+    "process_vm_readv",
+    "kcmp",
+}
+PROGRAMS = {"rosmaster", "rosout", "charon"}
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator["Place"]:
+    """A state directory, two listening ports, and a file that everybody may read and write."""
+    need_root()
+    needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
+    # Not pytest's folder: that is closed to the users of the processes.
+    with tempfile.TemporaryDirectory(prefix="rosrv-walls-") as name:
+        directory = Path(name)
+        directory.chmod(0o755)
+        with Place(directory) as place:
+            yield place
+
+
+class Place:
+    """What the roles are started in."""
+
+    def __init__(self, directory: Path) -> None:
+        self.roles = {role.name: role for role in roles_of(syslog=True)}
+        self.state = StateDirectory(directory / "state")
+        self.state.prepare(self.roles.values())
+        self.state.write_config("{}")
+        self.theirs = directory / "theirs"
+        self.theirs.mkdir()
+        (self.theirs / "file").write_text("of somebody else")
+        self.theirs.chmod(0o777)
+        (self.theirs / "file").chmod(0o666)
+        self.servers = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
+        self.ports = [server.getsockname()[1] for server in self.servers]
+
+    def __enter__(self) -> "Place":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for server in self.servers:
+            server.close()
+        self.state.close()
+
+    def trial(self, role: Role, pid: int) -> dict[str, Any]:
+        """What is to be tried as this role, written where it finds it."""
+        part = self.state.path / role.part
+        (self.theirs / "new").unlink(missing_ok=True)
+        wanted = {
+            "ports": self.ports,
+            "reads": [
+                "/etc/hostname",
+                str(self.state.config),
+                str(self.theirs / "file"),
+                "/var/lib/dpkg/status",
+            ],
+            "writes": [str(part / "mine"), str(self.theirs / "new"), str(self.theirs / "file"), "/dev/null"],
+            "pid": pid,
+        }
+        (part / "trial").write_text(json.dumps(wanted))
+        (part / "trial").chmod(0o644)
+        return wanted
+
+    def inside(self, role: Role) -> tuple[dict[str, Any], Walled]:
+        """What comes of it in the role's walls, and what the process says of them."""
+        here, there = socket.socketpair()
+        facts = Facts(
+            self.state.path, self.state.config, self.ports[0], "http://127.0.0.1:1", syslog_port=self.ports[0]
+        )
+        plan = Post(role, 0).plan(facts, there.fileno())
+        walls = replace(plan.walls, reads=(*plan.walls.reads, str(ROOT)))
+        plan = msgspec.structs.replace(
+            plan, walls=walls, argv=(), entry=f"{trying.__name__}:main", secret=None
+        )
+        with here, there:
+            done = subprocess.run(
+                [sys.executable, "-P", "-m", CHILD, role.name, msgspec.json.encode(plan).decode()],
+                env={"PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"], "HOME": plan.home},
+                pass_fds=(there.fileno(),), stderr=subprocess.PIPE, text=True, cwd="/", check=False, timeout=60,
+            )  # fmt: skip
+            ((said, _), *_more) = Channel(here, Lifeline).receive()
+        assert done.returncode == 0, done.stderr
+        assert isinstance(said, Walled)
+        return json.loads(done.stderr.splitlines()[-1]), said
+
+    def outside(self, role: Role, account: Account) -> dict[str, Any]:
+        """What comes of it for the same user without walls."""
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", trying.__name__],
+            user=account.uid, group=account.gid, extra_groups=[], env={"PYTHONPATH": str(ROOT)},
+            cwd=self.state.path / role.part, stdout=subprocess.PIPE, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        found: dict[str, Any] = json.loads(done.stdout)
+        return found
+
+
+@pytest.mark.parametrize("name", MAY)
+def test_what_is_forbidden_is_refused_from_inside(place: Place, name: str) -> None:
+    """Every role is refused what it does not need, by its walls, not for want of privileges; it may what it needs."""
+    role = place.roles[name]
+    account = account_of(role.user, role.group)
+    families, listens, connects = MAY[name]
+    with subprocess.Popen(
+        ["/bin/sleep", "60"], user=account.uid, group=account.gid, extra_groups=[]
+    ) as sleeper:
+        try:
+            place.trial(role, sleeper.pid)
+            found, said = place.inside(role)
+            assert sleeper.poll() is None
+            outside = place.outside(role, account)
+            sleeper.wait(timeout=60)  # of the signal
+        finally:
+            sleeper.kill()
+    assert said == Walled("usual" if name in PROGRAMS else "listed", landlock.version(), [])
+    assert found["filtered"]
+    assert {
+        call: outcome for call, outcome in found["calls"].items() if outcome not in ("EPERM", "not there")
+    } == {}
+    by_the_walls = {call for call in found["calls"] if outside["calls"][call] != found["calls"][call]}
+    assert by_the_walls >= {
+        "ptrace",
+        "unshare",
+        "setns",
+        "keyctl",
+        "add_key",
+        "io_uring_setup",
+        "process_vm_readv",
+        "kcmp",
+    }
+    assert found["new namespace"] in ("EPERM", "ENOSYS")
+    assert (found["fork"], found["program"]) == (
+        ("done", "done")
+        if name == "charon"
+        else ("done", "EACCES")
+        if name in PROGRAMS
+        else ("ENOSYS", found["program"])
+    )
+    assert found["program"] != "done" or name == "charon"
+    assert found["write and execute"] in ("EPERM", "ENOSYS")
+    assert found["execute later"] == "done"
+    assert found["families"] == families
+    assert (found["bind"] == "done") is listens
+    assert [one == "done" for one in found["connect"]] == connects
+    assert [one == "done" for one in found["read"].values()] == [True, True, False, False]
+    assert [one == "done" for one in found["write"].values()] == [True, False, False, True]
+    assert found["signal"] == "EPERM"
+    for what in ("read", "write"):
+        assert set(outside[what].values()) == {"done"}, "its user may, without the walls"
+
+
+def test_status_shows_the_walls() -> None:
+    """`rosrv status` and REST say of each process what it is in; nothing is lacking on this kernel."""
+    need_root()
+    needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
+    with Appliance(options=("--api", "127.0.0.1:0")) as running:
+        rows = {row["role"]: row for row in running.status()["processes"]}
+        rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
+    abi = landlock.version()
+    for name in ("signer", "relay", "control", "api"):
+        assert (rows[name]["walls"], rows[name]["lacks"]) == (f"listed calls, Landlock {abi}", [])
+        assert rest[name]["walls"] == rows[name]["walls"]
+    for name in ("rosmaster", "rosout"):
+        assert (rows[name]["walls"], rows[name]["lacks"]) == (f"usual calls, Landlock {abi}", [])
+    assert rows["supervisor"]["walls"] == ""

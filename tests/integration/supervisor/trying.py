@@ -1,0 +1,122 @@
+"""What somebody would try who took over a process: run as its user, in its walls, and told as JSON."""
+
+import ctypes
+import errno
+import json
+import mmap
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from appliance.supervisor.walls.calls import FORBIDDEN
+from appliance.supervisor.walls.seccomp import LIBRARY
+
+FAMILIES = ("AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", "AF_PACKET", "AF_ALG", "AF_VSOCK", "AF_BLUETOOTH")
+_KINDS = {"AF_NETLINK": socket.SOCK_RAW, "AF_PACKET": socket.SOCK_RAW, "AF_ALG": socket.SOCK_SEQPACKET}
+NEW_USER = 0x10000000
+_PTRACE_ATTACH = 16
+_ENDS_THE_TRIAL = {"reboot", "vhangup"}  # outside of the walls these would do something
+
+
+def main(*_given: Any) -> None:
+    """The entry of a role's stand-in: try everything the file `trial` of its part asks for."""
+    told = sys.stderr  # the launcher has put standard output there
+    told.write(json.dumps(tried(json.loads(Path("trial").read_text()))) + "\n")
+    told.flush()
+
+
+def tried(wanted: dict[str, Any]) -> dict[str, Any]:
+    """What comes of each attempt: "done", or the name of the error."""
+    return {
+        "calls": {name: _call(name) for name in FORBIDDEN if name not in _ENDS_THE_TRIAL},
+        "new namespace": _new_namespace(),
+        "fork": _outcome(_fork),
+        "program": _outcome(lambda: _run("/bin/true")),
+        "write and execute": _outcome(lambda: mmap.mmap(-1, 4096, prot=7).close()),
+        "execute later": _outcome(_execute_later),
+        "families": [name for name in FAMILIES if _outcome(partial(_make_and_close, name)) == "done"],
+        "bind": _outcome(lambda: _socket("AF_INET").bind(("127.0.0.1", 0))),
+        "connect": [_outcome(partial(_connect, port)) for port in wanted["ports"]],
+        "read": {path: _outcome(Path(path).read_bytes) for path in wanted["reads"]},
+        "write": {path: _outcome(partial(Path(path).write_text, "x")) for path in wanted["writes"]},
+        "signal": _outcome(lambda: os.kill(wanted["pid"], signal.SIGUSR1)),
+        "filtered": "Seccomp:\t2" in Path("/proc/self/status").read_text(),
+    }
+
+
+def _outcome(attempt: Callable[[], Any]) -> str:
+    try:
+        attempt()
+    except OSError as error:
+        return errno.errorcode.get(error.errno or 0, str(error))
+    return "done"
+
+
+def _socket(family: str) -> socket.socket:
+    return socket.socket(getattr(socket, family), _KINDS.get(family, socket.SOCK_STREAM))
+
+
+def _make_and_close(family: str) -> None:
+    _socket(family).close()
+
+
+def _connect(port: int) -> None:
+    with _socket("AF_INET") as sock:
+        sock.connect(("127.0.0.1", port))
+
+
+def _call(name: str) -> str:
+    """A call of the kernel without arguments; one that this machine does not have is not tried."""
+    number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(name.encode())
+    if number < 0:
+        return "not there"
+    libc = ctypes.CDLL(None, use_errno=True)
+    first = (
+        _PTRACE_ATTACH if name == "ptrace" else 0
+    )  # 0 is PTRACE_TRACEME: the trial would stop at its next signal
+    result = libc.syscall(ctypes.c_long(number), ctypes.c_long(first), *(ctypes.c_long(0) for _ in range(5)))
+    return "done" if result >= 0 else errno.errorcode[ctypes.get_errno()]
+
+
+def _new_namespace() -> str:
+    """By `clone`, as unshare is among the calls: with a namespace of users everything else would be open."""
+    number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
+    libc = ctypes.CDLL(None, use_errno=True)
+    arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)
+    result = libc.syscall(ctypes.c_long(number), *(ctypes.c_long(one) for one in arguments))
+    if result == 0:
+        os._exit(0)
+    if result < 0:
+        return errno.errorcode[ctypes.get_errno()]
+    os.waitpid(result, 0)
+    return "done"
+
+
+def _fork() -> None:
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+
+
+def _run(program: str) -> None:
+    os.waitpid(os.posix_spawn(program, [program], {}), 0)
+
+
+def _execute_later() -> None:
+    """What compiled code needs: memory that is written first, and executable then."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.mmap.restype = ctypes.c_void_p
+    private_anonymous = 0x22
+    at = libc.mmap(None, ctypes.c_size_t(4096), 3, private_anonymous, -1, 0)
+    if libc.mprotect(ctypes.c_void_p(at), ctypes.c_size_t(4096), 5) != 0:
+        raise OSError(ctypes.get_errno(), "mprotect")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(tried(json.loads(Path("trial").read_text()))) + "\n")

@@ -1,0 +1,159 @@
+"""`[Limits]` of a policy with real nodes: floods, throttles, and a change while they run."""
+
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.network.lab import Lab
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.processes import Host, Process
+from tests.support.requirements import need_root, needs
+from tests.support.syslog import eventually
+
+CLIENTS: list[Client] = ["rospy", "roscpp"]
+MONITOR = "counter() { int heard; event said() /watched std_msgs/String '{}' { heard++; } }"
+LIMITED = (
+    OPEN_POLICY
+    + """[Limits]
+/watched = publisher 5 Hz
+/flood = publisher 5 Hz
+/camera = subscriber 10.77.0.20 5 Hz, subscriber 10.77.0.10 20 Hz
+/map = publisher 1 Hz
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def lab() -> Iterator[Lab]:
+    """Hosts in namespaces."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with Lab("rosrv-limits") as lab:
+        yield lab
+
+
+@pytest.fixture(scope="module")
+def appliance(lab: Lab) -> Iterator[Appliance]:
+    """An appliance with limits, and a monitor on /watched."""
+    with tempfile.TemporaryDirectory(prefix="rosrv-limits-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "counter.rv").write_text(MONITOR)
+        middle = lab.host("master", "10.77.0.2/24")
+        options = ("--monitors", str(folder), "--api", "off")
+        with Appliance(middle, policy=LIMITED, options=options) as appliance:
+            yield appliance
+
+
+@pytest.fixture(scope="module")
+def hosts(lab: Lab) -> tuple[Host, Host]:
+    """The robot's machine, and the operator's."""
+    return lab.host("robot", "10.77.0.10/24"), lab.host("ocu", "10.77.0.20/24")
+
+
+@pytest.fixture
+def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Iterator[RosSession]:
+    """The robot's nodes."""
+    with RosSession(appliance.master_uri, tmp_path, hosts[0]) as session:
+        yield session
+
+
+def seconds_for(listener: Process, count: int) -> float:
+    """How long so many more messages take."""
+    there = len(listener.seen(event="received"))
+    began = time.monotonic()
+    listener.wait_for_count(there + count, event="received")
+    return time.monotonic() - began
+
+
+def numbers(listener: Process) -> list[int]:
+    """The numbers of the messages that came."""
+    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
+
+
+def without_gap(heard: list[int]) -> bool:
+    """Whether nothing is missing, and the order is kept."""
+    return heard == list(range(heard[0], heard[0] + len(heard)))
+
+
+def judged(appliance: Appliance) -> int:
+    """How many messages the monitor has judged."""
+    [row] = [one for one in appliance.rosrv("monitor", "list").stdout.splitlines() if "counter" in one]
+    return int(row.split()[3])
+
+
+@pytest.mark.parametrize("topic", ["/flood", "/watched"])
+@pytest.mark.parametrize("client", CLIENTS)
+def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
+    appliance: Appliance, ros: RosSession, client: Client, topic: str
+) -> None:
+    """A hundred in a second become five, with or without a monitor, with a record; the other topic has all of its."""
+    before = judged(appliance)
+    listener, other = ros.listener(client, topic), ros.listener(client, "/quiet")
+    ros.talker(client, "/quiet", "--rate", "50")
+    name = f"flooder_{topic[1:]}_{client}"
+    talker = ros.talker(client, topic, "--rate", "100", name=name)
+    listener.wait_for_count(4, event="received")
+    assert seconds_for(listener, 15) > (15 - 4) / 5
+    heard = numbers(listener)
+    assert heard == sorted(heard)
+    talker.wait_for_count(2 * len(heard), event="sent")
+    assert heard[-1] > len(heard)
+    assert without_gap(numbers(other))
+    [first, *_] = reversed(appliance.audit("--event", "rate limited", caller_id=f"/{name}"))
+    assert (first["host"], first["resource"], first["rule"]["key"]) == ("10.77.0.10", topic, topic)
+    assert first["detail"]["part"] == "publisher"
+    if topic == "/watched":
+        # The relay reports its counters once in a second.
+        eventually(lambda: judged(appliance) - before >= len(heard))
+        assert judged(appliance) - before < talker.seen(event="sent")[-1]["number"]
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
+    appliance: Appliance, hosts: tuple[Host, Host], ros: RosSession, client: Client
+) -> None:
+    """The tablet gets five in a second, the robot twenty; without the limit the same connection gets all."""
+    tablet, robot = ros.on(hosts[1]).listener(client, "/camera"), ros.listener(client, "/camera")
+    ros.talker(client, "/camera", "--rate", "100", name=f"camera_{client}")
+    for listener, rate in ((tablet, 5), (robot, 20)):
+        listener.wait_for_count(rate, event="received")
+        assert seconds_for(listener, 2 * rate) > (2 * rate - rate / 2 - 1) / rate
+    appliance.reload(OPEN_POLICY)
+    try:
+        mark = len(numbers(tablet))
+        tablet.wait_for_count(mark + 200, event="received")
+        assert without_gap(numbers(tablet)[-100:])
+        appliance.reload(LIMITED)
+        mark = len(numbers(tablet))
+        tablet.wait_for_count(mark + 5, event="received")
+        assert seconds_for(tablet, 10) > (10 - 3) / 5
+    finally:
+        appliance.reload(LIMITED)
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_a_latched_message_beyond_the_limit_comes_a_little_later(ros: RosSession, client: Client) -> None:
+    """The last of a quick few is what everybody has in the end, those that come later included."""
+    listener = ros.listener(client, "/map", name=f"reader_{client}")
+    ros.start(
+        [
+            "/usr/bin/python3",
+            "-c",
+            "import rospy; from std_msgs.msg import String; rospy.init_node('mapper', anonymous=True);"
+            "p = rospy.Publisher('/map', String, latch=True, queue_size=10)\n"
+            "while not p.get_num_connections(): rospy.sleep(0.01)\n"
+            "for n in range(1, 6): p.publish(f'map {n}')\n"
+            "rospy.spin()",
+        ],
+        label="mapper",
+    )
+    listener.wait_for(event="received", data="map 5")
+    heard = numbers(listener)
+    assert (heard[0], heard[-1], heard == sorted(set(heard)), len(heard) < 5) == (1, 5, True, True)
+    late = ros.listener(client, "/map", name=f"late_{client}")
+    assert late.wait_for(event="received")["data"] == "map 5"

@@ -1,0 +1,254 @@
+"""A robot at work while two hundred addresses try to use up what there is.
+
+with Siege(lab, home, "relay: {connections: 3000}\\n") as siege:
+    siege.crowd.hold(siege.crowd.guests, 11311, each=500)
+    siege.works()
+
+The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. A crowd on one machine has a hundred
+addresses of guests, who may do anything below `/guest`, and a hundred of strangers, whom no rule names.
+"""
+
+import contextlib
+import resource
+import select
+import socket
+import time
+import xmlrpc.client
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network.lab import Host, Lab
+from appliance.ros.xmlrpc import FaultReceived, parse_response
+from tests.support.appliance import ROSRV, Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT, Process, ThisMachine
+
+POLICY = """\
+[Groups]
+team = 10.77.0.10 10.77.0.20
+guests = 10.77.1.0/24
+[Nodes]
+default = team
+/guest/** = team guests
+[Publishers]
+default = team
+/guest/** = team guests
+[Subscribers]
+default = team
+/guest/** = team guests
+/chatter = team guests
+[Services]
+default = team
+/guest/** = team guests
+[Clients]
+default = team
+/guest/** = team guests
+[Parameters]
+read default = team guests
+write default = team
+write /guest/** = team guests
+[Commands]
+default = team guests
+"""
+APPLIANCE = "10.77.0.2"
+_BURST = 256  # connections that are under way at once
+
+
+class Crowd:
+    """Many addresses on one machine, and the connections that they hold."""
+
+    def __init__(self, lab: Lab) -> None:
+        self.guests = [f"10.77.1.{number}" for number in range(1, 101)]
+        self.strangers = [f"10.77.2.{number}" for number in range(1, 101)]
+        everybody = [f"{address}/16" for address in (*self.guests, *self.strangers)]
+        self.host: Host = lab.host("crowd", *everybody)
+        self.held: list[socket.socket] = []
+
+    def hold(
+        self,
+        addresses: Sequence[str],
+        port: int,
+        *,
+        each: int,
+        data: bytes = b"",
+    ) -> int:
+        """Connect so many times from each address, send this, and stay; how many connections there are."""
+        before = len(self.held)
+        self.host.run(lambda: self._connect([one for _ in range(each) for one in addresses], port, data))
+        return len(self.held) - before
+
+    def _connect(self, addresses: list[str], port: int, data: bytes) -> None:
+        for start in range(0, len(addresses), _BURST):
+            coming = []
+            for address in addresses[start : start + _BURST]:
+                sock = socket.socket()
+                sock.setblocking(False)
+                # The kernel looks for a free port when it knows the other end, so that each address has them all.
+                sock.setsockopt(socket.IPPROTO_IP, 24, 1)  # IP_BIND_ADDRESS_NO_PORT
+                sock.bind((address, 0))
+                sock.connect_ex((APPLIANCE, port))
+                coming.append(sock)
+            waiting = set(coming)
+            deadline = time.monotonic() + 1
+            while waiting and time.monotonic() < deadline:
+                poll = select.poll()
+                by_number = {sock.fileno(): sock for sock in waiting}
+                for number in by_number:
+                    poll.register(number, select.POLLOUT)
+                for number, _events in poll.poll(100):
+                    sock = by_number[number]
+                    waiting.discard(sock)
+                    with contextlib.suppress(OSError):
+                        sock.send(data)
+            for sock in waiting:
+                sock.close()
+            self.held += [sock for sock in coming if sock not in waiting]
+
+    def subscribe(self, address: str, caller_id: str, publisher: str, topic: str) -> int:
+        """Ask for a topic as a node does: there is a grant then for the port of the relay that is returned."""
+        face = self.call(address, "lookupNode", caller_id, publisher)
+        assert face[0] == 1, face
+        port = int(face[2].rstrip("/").rpartition(":")[2])
+        answer = self.call(address, "requestTopic", caller_id, topic, [["TCPROS"]], port=port)
+        assert answer[0] == 1, answer
+        return int(answer[2][2])
+
+    def leave(self) -> None:
+        """Close every connection."""
+        for sock in self.held:
+            sock.close()
+        self.held.clear()
+
+    def call(self, address: str, method: str, *parameters: Any, port: int = 11311) -> Any:
+        """One call of the Master API (or of a node's face) from this address: the answer, or the fault."""
+        answer = self.ask(address, method, *parameters, port=port)
+        try:
+            return parse_response(answer.partition(b"\r\n\r\n")[2])
+        except FaultReceived as fault:
+            return fault
+
+    def ask(self, address: str, method: str, *parameters: Any, port: int = 11311) -> bytes:
+        """The same call: what comes back."""
+        body = xmlrpc.client.dumps(parameters, method).encode()
+        data = b"POST / HTTP/1.1\r\nConnection: close\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
+
+        def exchange() -> bytes:
+            with socket.create_connection((APPLIANCE, port), LIMIT, source_address=(address, 0)) as sock:
+                sock.sendall(data)
+                received = bytearray()
+                while piece := sock.recv(1 << 20):
+                    received += piece
+                return bytes(received)
+
+        return self.host.run(exchange)
+
+
+class Siege:
+    """The appliance, the robot at work, and the crowd; a context manager."""
+
+    def __init__(self, lab: Lab, home: Path, configuration: str) -> None:
+        self.middle = lab.host("appliance", f"{APPLIANCE}/16")
+        self.robot = lab.host("robot", "10.77.0.10/16")
+        self.ocu = lab.host("ocu", "10.77.0.20/16")
+        self.crowd = Crowd(lab)
+        self.home = home
+        self.appliance = Appliance(
+            self.middle, policy=POLICY, options=("--config", str(home / "appliance.yaml")), relays=2
+        )
+        (home / "appliance.yaml").write_text(configuration)
+        self._closing = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+            stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+            stack.enter_context(self.appliance)
+            stack.callback(self.crowd.leave)
+            command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
+            self.trail = stack.enter_context(
+                Process(ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail")
+            )
+            self.ros = stack.enter_context(RosSession(self.appliance.master_uri, self.home, self.robot))
+            self.talker = self.ros.talker("rospy", "/chatter", "--rate", "50", name="voice")
+            self.listener = self.ros.on(self.ocu).listener("roscpp", "/chatter", name="ear")
+            self.server = self.ros.service_server("roscpp", "/negate", name="negator")
+            self.client = self.ros.on(self.ocu).service_client("rospy", "/negate", name="asker")
+            self.listener.wait_for(event="received")
+            self._closing = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._closing.close()
+
+    def calls(self, count: int = 50) -> float:
+        """The slowest of so many calls of the robot, a connection each; every one is answered."""
+
+        def each() -> float:
+            begun = time.monotonic()
+            server: Any = xmlrpc.client.ServerProxy(self.appliance.master_uri)
+            with server:
+                assert server.getParam("/looker", "/rosdistro")[0] == 1
+            return time.monotonic() - begun
+
+        return self.robot.run(lambda: max(each() for _ in range(count)))
+
+    def call(self, method: str, *parameters: Any) -> Any:
+        """One call of the robot."""
+
+        def make() -> Any:
+            with xmlrpc.client.ServerProxy(self.appliance.master_uri) as server:
+                return server.__getattr__(method)(*parameters)
+
+        return self.robot.run(make)
+
+    def parameters(self, large: str) -> None:
+        """The robot loads its parameters as at a start: small and large ones, and some once more."""
+        for number in range(50):
+            assert self.call("setParam", "/starter", f"/robot/gains/{number}", number)[0] == 1
+        for value in (large, large, {"description": large}):
+            assert self.call("setParam", "/starter", "/robot/model", value)[0] == 1
+        assert self.call("getParam", "/starter", "/robot/model")[2] == {"description": large}
+        assert self.call("deleteParam", "/starter", "/robot")[0] == 1
+
+    def works(self, *, slowest: float, messages: int = 25) -> None:
+        """No message is lost, service calls and calls of the Master API are answered in time, a node can start."""
+        heard = len(self.listener.seen(event="received"))
+        took = self.calls()
+        assert took < slowest, f"a call of the robot took {took:.2f} s"
+        answered = len(self.client.seen(event="answered"))
+        for _ in range(5):
+            self.client.send("true")
+        self.client.wait_for_count(answered + 5, event="answered")
+        assert not self.client.seen(event="failed")
+        late = self.ros.on(self.ocu).listener("rospy", "/chatter")
+        late.wait_for(event="received")
+        late.stop()
+        self.unharmed(heard, messages)
+
+    def unharmed(self, before: int, messages: int) -> None:
+        """What the listener heard from its message `before` on is without a gap, and so many more come."""
+        count = max(before, len(self.listener.seen(event="received"))) + messages
+        heard = self.listener.wait_for_count(count, event="received")[before:]
+        numbers = [int(event["data"].rsplit(" ", 1)[1]) for event in heard]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (
+            "messages are missing or doubled"
+        )
+
+    def memory(self, role: str) -> int:
+        """The resident bytes of a process."""
+        pid = self.appliance.pids(role)[0]
+        status = Path(f"/proc/{pid}/status").read_text()
+        return int(status.partition("VmRSS:")[2].split()[0]) << 10
+
+    def reload(self) -> None:
+        """The policy is read again, in the middle of it all."""
+        self.appliance.rosrv("policy", "reload")
+
+    def throughout(self, attack: Callable[[], None], *, slowest: float) -> None:
+        """While this goes on, and after it, the robot works, also over a reload."""
+        attack()
+        self.works(slowest=slowest)
+        self.reload()
+        self.works(slowest=slowest)

@@ -1,0 +1,139 @@
+"""First packets under somebody else's address, thousands a second: who is named goes on as if there were none."""
+
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.network.firewall.firewall import BackendChoice, Firewall
+from appliance.network.firewall.rules import FirewallSettings, PortRange
+from appliance.network.lab import Host, Lab
+from tests.support.forged_syns import flood_command
+from tests.support.requirements import need_program, need_root
+from tests.support.translators import load
+from tests.system.network.test_protect import close
+
+BACKENDS: tuple[BackendChoice, ...] = ("nft", "iptables")
+PER_SECOND, SECONDS = 3000, 3.0
+_SILENT = """table inet own {
+    chain input {
+        type filter hook input priority 0; policy accept;
+        tcp flags & (syn | ack) == (syn | ack) ct state != established drop
+    }
+}
+"""
+MASTER, NODE, REST = 11311, 20000, 8443
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """A lab of these tests."""
+    need_root()
+    need_program("nft", "nftables")
+    need_program("iptables-legacy", "iptables")
+    with Lab("rosrv-flood") as one:
+        yield one
+
+
+@pytest.fixture
+def protected(lab: Lab) -> Host:
+    """Where the flood goes to."""
+    return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
+
+
+@pytest.fixture
+def robot(lab: Lab) -> Host:
+    """The host that is named, and has calls to make."""
+    return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
+
+
+@pytest.fixture
+def attacker(lab: Lab) -> Host:
+    """The host that writes the robot's address."""
+    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
+
+
+def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.socket) -> list[float]:
+    """Seconds that each call of the robot took while the flood went on; a call that is not answered raises."""
+    address, pause = server.getsockname()[:2], threading.Event()
+    took = []
+    while flood.poll() is None:
+        begun = time.monotonic()
+        with robot.entered(), socket.create_connection(address, timeout=10) as client:
+            client.sendall(b"?")
+            with accepted(server, client.getsockname()[1]) as peer:
+                assert peer.recv(1) == b"?"
+                peer.sendall(b"!")
+            assert client.recv(1) == b"!"
+        took.append(time.monotonic() - begun)
+        pause.wait(0.003)  # a robot's pace: some hundred calls a second, which is below the limit of a host
+    return took
+
+
+def accepted(server: socket.socket, port: int) -> socket.socket:
+    """The connection from this port; a SYN cookie that comes twice makes a second one, which is let go."""
+    for _ in range(100):
+        peer, (_, seen, *_) = server.accept()
+        if seen == port:
+            peer.settimeout(10)
+            return peer
+        peer.close()
+    raise AssertionError("a hundred connections came from elsewhere")
+
+
+def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...], backlog: int) -> None:
+    """Flood each port under the robot's address, on both families; the robot's calls are answered at once.
+
+    A forged packet that is half-open in the kernel's memory with the very port that the robot then chooses costs
+    that call a second: a hundredth of the calls may meet one.
+    """
+    for target, named in ((protected.address, robot.address), (protected.address6, robot.address6)):
+        for port in ports:
+            family = socket.AF_INET6 if ":" in target else socket.AF_INET
+            command = flood_command(named, target, port, per_second=PER_SECOND, seconds=SECONDS)
+            with protected.entered():
+                server = socket.create_server((target, port), family=family, backlog=backlog)
+            with server, attacker.popen(command, stdout=subprocess.PIPE, text=True) as flood:
+                server.settimeout(10)
+                took = sorted(calls_during(flood, robot, server))
+                sent = int(flood.communicate(timeout=30)[0])
+            assert sent > PER_SECOND * SECONDS / 2, "there was no flood"
+            assert len(took) > 100
+            assert took[int(len(took) * 0.99) - 1] < 0.5, f"{target} port {port}: {took[-20:]}"
+
+
+@pytest.fixture(params=[False, True], ids=["resets", "silent"])
+def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
+    """Whether the robot's own firewall drops the answers to what it has not asked for: they stay half-open then."""
+    if request.param:
+        load(robot.namespace, "nft", _SILENT)
+    return bool(request.param)
+
+
+@pytest.mark.usefixtures("silent")
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_named_host_is_served(
+    protected: Host, robot: Host, attacker: Host, backend: BackendChoice
+) -> None:
+    """RVMaster's port, a node's or relay's, and REST's: 3,000 forged first packets a second count for nobody."""
+    Firewall(protected.namespace, backend).install(
+        FirewallSettings(
+            control_uid=61011,
+            rosmaster_uid=61012,
+            master_port=MASTER,
+            node_ports=PortRange(NODE, NODE + 9),
+            api_port=REST,
+            api_networks=("10.77.0.0/24", "fd77::/64"),
+        )
+    )
+    unharmed(robot, attacker, protected, (MASTER, NODE, REST), backlog=128)
+
+
+@pytest.mark.usefixtures("silent")
+def test_the_appliance_reaches_protected_ports(protected: Host, robot: Host, attacker: Host) -> None:
+    """The same on a machine of nodes under `rosrv protect`, with the few places that rospy asks the kernel for."""
+    close(protected, robot)
+    unharmed(robot, attacker, protected, (40007,), backlog=5)

@@ -1,0 +1,74 @@
+"""Tests of `appliance.api.streams`."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from starlette.responses import Response
+
+from appliance.api.access import Bearer, Role
+from appliance.api.problems import ProblemError
+from appliance.api.streams import Held, Streams
+from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
+
+
+def bearer(name: str, role: Role = Role.VIEWER) -> Bearer:
+    """The holder of a token."""
+    return Bearer(name, name, role, 1e12, "shown")
+
+
+def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Callable[[], None]]:
+    """As many places as this one gets; how each is given back."""
+    places: list[Callable[[], None]] = []
+    try:
+        while len(places) < most:
+            places.append(streams.take(who, peer, "clients follow"))
+    except ProblemError as problem:
+        assert (problem.status, problem.headers["Retry-After"]) == (503, "10")
+    return places
+
+
+def test_two_hundred_viewers_leave_places_to_operators() -> None:
+    """From two hundred machines with a token each: together they get what is not kept, and an operator follows."""
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
+    viewers = sum(len(taken(streams, bearer(f"v{one}"), f"10.0.{one}.1")) for one in range(200))
+    assert viewers == 12
+    assert len(taken(streams, bearer("op", Role.OPERATOR), "10.1.0.1")) == 4
+
+
+def test_one_token_and_one_machine_have_a_share() -> None:
+    """Six for a token from however many machines, eight for a machine with however many tokens."""
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
+    assert len(taken(streams, bearer("a"), "10.0.0.1", 3) + taken(streams, bearer("a"), "10.0.0.2")) == 6
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
+    assert len(taken(streams, bearer("a"), "10.0.0.1") + taken(streams, bearer("b"), "10.0.0.1")) == 8
+
+
+@pytest.mark.parametrize(("whole", "first"), [(1, 1), (2, 1), (64, 24)])
+def test_a_share_is_as_large_in_proportion(whole: int, first: int) -> None:
+    """However many streams are configured, a token gets its part and an operator one where there are two."""
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, whole)
+    assert len(taken(streams, bearer("a"), "10.0.0.1")) == first
+    assert bool(taken(streams, bearer("op", Role.ADMIN), "10.0.0.2", 1)) is (whole > 1)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_place_is_given_back_however_the_response_ends(*, fails: bool) -> None:
+    """Sent to its end or broken off: whoever followed may follow again, and nothing is remembered of the token."""
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 1)
+
+    async def send(_message: Any) -> None:
+        if fails:
+            raise ConnectionResetError
+
+    async def receive() -> Any:
+        return {"type": "http.disconnect"}
+
+    for _ in range(3):
+        held = Held(Response("x"), streams.take(bearer("a"), "10.0.0.1", "clients follow"))
+        try:
+            asyncio.run(held({"type": "http"}, receive, send))
+        except ConnectionResetError:
+            assert fails
+    assert not streams._roles

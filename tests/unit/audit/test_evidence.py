@@ -1,0 +1,194 @@
+"""An export proves itself on another machine with the public key alone, whatever filter it was made with."""
+
+import json
+import lzma
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.evidence import evidence, evidence_line
+from appliance.audit.exported import ExportUnreadableError, ExportVerification, verify_export
+from appliance.audit.findings import Kind
+from appliance.audit.log import AuditLog
+from appliance.audit.output import as_json
+from appliance.audit.query import Filter
+from appliance.audit.retention import Retention
+from appliance.audit.search import export
+from appliance.audit.signatures import read_public_key
+from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog, Notary
+from tests.unit.audit.test_retention import await_removal, make_old
+
+STRANGE: dict[str, Any] = {
+    "text": 'é"\\\n\x1b',
+    "number": 0.1,
+    "large": 1e300,
+    "deep": {"b": [1, None], "a": True},
+}
+OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
+
+
+@pytest.fixture
+def log(make_log: MakeLog, path: Path) -> Path:
+    """A log of two hundred records and some, sealed every fifty, with a denial among every ten."""
+    log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
+    for number in range(200):
+        verdict = "deny" if number % 10 == 3 else "allow"
+        log.record(decision(log, number, decision=verdict, resource=f"/r{number}", detail=STRANGE))
+        if number % 25 == 24:
+            assert settle(log) is None
+    log.close()
+    return path
+
+
+@pytest.fixture
+def public(key: Ed25519PrivateKey) -> bytes:
+    """The key that the reviewer has."""
+    return key.public_key().public_bytes_raw()
+
+
+def exported(log: Path, wanted: Filter, page: int = 1000) -> list[dict[str, Any]]:
+    """The lines of an export."""
+    return [json.loads(evidence_line(*one)) for one in evidence(log, wanted, page)]
+
+
+def checked(lines: list[dict[str, Any]], place: Path, key: bytes) -> ExportVerification:
+    """What a reviewer finds in a file with these lines."""
+    place.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return verify_export(place, key)
+
+
+@pytest.mark.parametrize("wanted", [Filter(), Filter(decision=("deny",)), Filter(resource="/r77")])
+@pytest.mark.parametrize("page", [1000, 7])
+def test_it_verifies_elsewhere(log: Path, public: bytes, tmp_path: Path, wanted: Filter, page: int) -> None:
+    """With and without a filter each record leads to a signed checkpoint, in pages of any size."""
+    lines = exported(log, wanted, page)
+    result = checked(lines, tmp_path / "x.ndjson", public)
+    assert result.ok, result.findings
+    assert result.records == len(lines) == sum(1 for _ in export(log, wanted))
+    assert result.proven + result.unsealed == result.records
+    assert result.proven > 0.8 * result.records
+    assert len(result.logs) == 1
+
+
+def test_a_line_is_the_record_as_everywhere_and_its_place(log: Path) -> None:
+    """Who reads records out of an export reads what a search gives, with one field more."""
+    for (entry, _chain), line in zip(evidence(log, Filter()), exported(log, Filter()), strict=True):
+        chain = line.pop("chain")
+        assert line == json.loads(as_json(entry))
+        assert set(chain) >= {"previous", "hash", "then"}
+
+
+def _change(lines: list[dict[str, Any]]) -> None:
+    lines[3]["decision"] = "allow"
+
+
+def _rename(lines: list[dict[str, Any]]) -> None:
+    lines[3]["detail"]["text"] = "other"
+
+
+def _drop(lines: list[dict[str, Any]]) -> None:
+    del lines[2]
+
+
+def _swap(lines: list[dict[str, Any]]) -> None:
+    lines[1], lines[2] = lines[2], lines[1]
+
+
+def _double(lines: list[dict[str, Any]]) -> None:
+    lines.insert(2, lines[1])
+
+
+def _renumber(lines: list[dict[str, Any]]) -> None:
+    lines[4]["sequence"] += 1
+
+
+def _shorten(lines: list[dict[str, Any]]) -> None:
+    next(line for line in lines if len(line["chain"]["then"]) > 1)["chain"]["then"].pop()
+
+
+def _reseal(lines: list[dict[str, Any]]) -> None:
+    line = next(line for line in lines if line["chain"].get("checkpoint"))
+    line["chain"]["checkpoint"]["sequence"] -= 1
+
+
+def _sign_otherwise(lines: list[dict[str, Any]]) -> None:
+    for line in lines:
+        if line["chain"].get("checkpoint"):
+            line["chain"]["checkpoint"]["signature"] = "no signature"
+
+
+@pytest.mark.parametrize(
+    "tamper", [_change, _rename, _drop, _swap, _double, _renumber, _shorten, _reseal, _sign_otherwise]
+)
+def test_whatever_was_tampered_with_is_found(
+    log: Path, public: bytes, tmp_path: Path, tamper: Callable[[list[dict[str, Any]]], None]
+) -> None:
+    """A changed, dropped, swapped, doubled or renumbered record, a shorter chain, another seal: each is found."""
+    lines = exported(log, Filter(decision=("deny",)))
+    tamper(lines)
+    assert not checked(lines, tmp_path / "x.ndjson", public).ok
+
+
+def test_a_record_made_anew_leads_to_no_checkpoint(log: Path, public: bytes, tmp_path: Path) -> None:
+    """A forger who makes hashes anew as well, and the whole export with them, has no signature."""
+    forged_log = AuditLog(tmp_path / "forged.db", checkpoint_every=5)
+    for number in range(20):
+        forged_log.record(decision(forged_log, number))
+    settle(forged_log)
+    forged_log.close()
+    result = checked(exported(tmp_path / "forged.db", Filter()), tmp_path / "x.ndjson", public)
+    assert (result.proven, {one.kind for one in result.findings}) == (0, {Kind.PROVES_NOTHING})
+    other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
+    genuine = checked(exported(log, Filter()), tmp_path / "y.ndjson", other)
+    assert Kind.SIGNATURE_WRONG in {one.kind for one in genuine.findings}
+    assert genuine.proven == 0
+
+
+@pytest.mark.parametrize("text", ["", "{}\n", "no json\n", '{"chain": {}}\n', "[]\n"])
+def test_what_is_no_export(tmp_path: Path, public: bytes, text: str) -> None:
+    """What has no records with their places is no export, and never right."""
+    file = tmp_path / "x.ndjson"
+    file.write_text(text)
+    if text:
+        with pytest.raises(ExportUnreadableError, match=r"x\.ndjson:1"):
+            verify_export(file, public)
+    else:
+        assert not verify_export(file, public).ok
+    with pytest.raises(ExportUnreadableError, match="No such file"):
+        verify_export(tmp_path / "missing", public)
+
+
+def test_after_retention(
+    make_log: MakeLog, path: Path, public: bytes, notary: Notary, tmp_path: Path
+) -> None:
+    """What is left after retention proves itself as well, from its first record on."""
+    make_old(make_log, notary)
+    log = make_log(checkpoint_every=100, retention=Retention(days=1))
+    log.record(decision(log))
+    await_removal(path, 1900)
+    for number in range(200):
+        log.record(decision(log, number))
+    settle(log)
+    deadline = time.monotonic() + 30
+    while not (result := checked(exported(path, Filter()), tmp_path / "x.ndjson", public)).proven:
+        assert time.monotonic() < deadline
+        log.record(decision(log))
+        settle(log)
+    log.close()
+    assert result.ok, result.findings
+
+
+def test_a_log_of_version_0_1_0(path: Path, tmp_path: Path) -> None:
+    """Its whole export proves itself; with a filter it is said that it cannot."""
+    path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
+    old_key = read_public_key(OLD_LOG.with_name("log-0.1.0.pub"))
+    whole = checked(exported(path, Filter()), tmp_path / "x.ndjson", old_key)
+    assert whole.ok, whole.findings
+    assert whole.proven > 0
+    part = checked(exported(path, Filter(resource="/cmd_3")), tmp_path / "y.ndjson", old_key)
+    assert {one.kind for one in part.findings} == {Kind.PROVES_NOTHING}

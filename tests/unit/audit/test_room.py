@@ -1,0 +1,68 @@
+"""Tests of room on the log's disk: what is told before it is full, and that all goes on by itself."""
+
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.budget import Budget
+from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.search import search
+from appliance.shares.pool import Standing
+from tests.support.audit import decision, settle
+from tests.support.requirements import need_root
+
+_LIMIT_SECONDS = 30
+_RESERVE = 4 << 20
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 8 MiB."""
+    need_root()
+    place = tmp_path / "disk"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "rosrv-audit-test", place], check=True)
+    yield place
+    subprocess.run(["umount", "--lazy", place], check=True)
+
+
+def await_degraded(log: AuditLog, *, degraded: bool) -> None:
+    """Wait until the log says that room is scarce, or does not any more."""
+    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
+    while (log.degraded is not None) is not degraded:
+        assert time.monotonic() < end, log.degraded
+        tick.wait(0.05)
+
+
+def test_a_disk_that_fills_is_told_before_it_is_full(disk: Path) -> None:
+    """Below the reserve an alarm says so and who owes much waits, nobody else; with room again all is as before."""
+    budget = Budget(lambda _host: Standing.REGISTERED)
+    log = AuditLog(disk / "audit.db", budget=budget, reserve=_RESERVE)
+    log.record(decision(log))
+    assert settle(log) is None
+    assert log.degraded is None
+    filler = disk / "filler"
+    filler.write_bytes(b"x" * (5 << 20))
+    await_degraded(log, degraded=True)
+    assert "reserve" in (log.degraded or "")
+    assert log.failed is None
+    for number in range(2000):
+        log.record(
+            decision(log, host="10.0.0.66", detail={"call": "setParam", "key": f"/{number}" + "k" * 400})
+        )
+    assert budget.pause("10.0.0.66") > 0
+    assert budget.pause("10.0.0.1") == 0
+    assert settle(log) is None
+    filler.unlink()
+    await_degraded(log, degraded=False)
+    assert budget.pause("10.0.0.66") == 0
+    assert log.close() is None
+    found = search(disk / "audit.db", Filter(event="disk *")).entries[::-1]
+    assert [(one.record.event, one.record.severity.value) for one in found] == [
+        ("disk nearly full", "alarm"), ("disk has room", "notice"),
+    ]  # fmt: skip

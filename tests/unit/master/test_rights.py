@@ -1,0 +1,227 @@
+"""Everybody who says whether a call is allowed says the same: the gate, and whoever explains, tests, learns or revokes.
+
+The rules are made so that a host stands inside or outside each of them; what each call needs is written here once more,
+by hand, section by section, as docs/policy.md says it.
+"""
+
+import ipaddress
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.master.arguments import CALLER_API, KEY, SERVICE_API, ApiUri, Parameter
+from appliance.master.call import Call, Caller, Identity
+from appliance.master.calls import MASTER_CALLS
+from appliance.master.gate import Contest, Gate, HostLimits
+from appliance.master.http import Peer
+from appliance.master.node_calls import NODE_CALLS
+from appliance.master.registry import Incarnation, Kind, Registry, new_key
+from appliance.policy import Policy, compile_policy, diff, explain, run_cases
+from appliance.policy.learn import Observation, learn
+from appliance.policy.model import Category, Decision, Request
+from appliance.policy.rights import needs_node
+from appliance.ros.parameter_tree import Tree
+from appliance.ros.uris import parse_node_uri
+from appliance.ros.xmlrpc import Value
+from tests.support.control_parts import ControlParts, Nothing
+
+HOST = ipaddress.ip_address("10.0.0.5")
+NAME, THING, KEY_GIVEN = "/me", "/thing", "/arm/speed"
+URI = "http://10.0.0.5:4000/"
+ROWS = [*MASTER_CALLS.values(), *NODE_CALLS.values()]
+SECTIONS = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "read", "write", "Commands")
+# What a call needs besides [Commands] under its own name, which all others need.
+NEEDS = {
+    "registerPublisher": ("Publishers", "Nodes"),
+    "unregisterPublisher": ("Publishers", "Nodes"),
+    "registerSubscriber": ("Subscribers", "Nodes"),
+    "unregisterSubscriber": ("Subscribers", "Nodes"),
+    "requestTopic": ("Subscribers", "Nodes"),
+    "registerService": ("Services", "Nodes"),
+    "unregisterService": ("Services", "Nodes"),
+    "lookupService": ("Clients", "Commands"),
+    "getParam": ("Commands", "read"),
+    "hasParam": ("Commands", "read"),
+    "setParam": ("Commands", "write"),
+    "deleteParam": ("Commands", "write"),
+    "subscribeParam": ("Commands", "read", "Nodes"),
+    "unsubscribeParam": ("Commands", "read", "Nodes"),
+}
+EXTENSIONS = {"Services", "Clients", "read", "write"}  # free when the policy does not have them
+GRANTS = {
+    Kind.PUBLICATION: "registerPublisher",
+    Kind.SUBSCRIPTION: "registerSubscriber",
+    Kind.SERVICE: "registerService",
+    Kind.PARAMETER: "subscribeParam",
+}
+GIVES_UP = {
+    "unregisterPublisher": Kind.PUBLICATION,
+    "unregisterSubscriber": Kind.SUBSCRIPTION,
+    "unregisterService": Kind.SERVICE,
+    "unsubscribeParam": Kind.PARAMETER,
+}
+VERBS = {
+    Category.PUBLISH: "publish",
+    Category.SUBSCRIBE: "subscribe",
+    Category.OFFER: "offer",
+    Category.CALL: "call",
+    Category.COMMAND: "command",
+    Category.READ: "read",
+    Category.WRITE: "write",
+}
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The loop that control runs on."""
+    return "asyncio"
+
+
+def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> str:
+    """A policy that grants this host what is needed in these sections; `missing` ones are not there at all."""
+    lines: dict[str, list[str]] = {}
+    for section in SECTIONS:
+        verb = f"{section} " if section in {"read", "write"} else ""
+        title = "Parameters" if verb else section
+        if section in missing or (verb and {"read", "write"} & missing):
+            continue
+        keys = ["default", f"{verb}default"][bool(verb) : bool(verb) + 1]
+        if keyed and not verb and section != "Commands":
+            keys.append(NAME if section == "Nodes" else THING)
+        if section == "Commands":
+            keys += ["getRVState", "shutdownMaster"]
+        who = "10.0.0.5 10.0.0.9" if section in granted else "10.0.0.9"
+        lines.setdefault(title, []).extend(f"{key} = {who}" for key in keys)
+    return "".join(f"[{title}]\n" + "\n".join(rules) + "\n" for title, rules in lines.items())
+
+
+def argument_of(parameter: Parameter) -> Any:
+    """A canonical value for a parameter of a call."""
+    if parameter in {CALLER_API, SERVICE_API}:
+        return ApiUri(URI, parse_node_uri(URI))
+    return KEY_GIVEN if parameter is KEY else THING
+
+
+def gate_says(policy: Policy, call: Call, tree: Tree) -> Decision:
+    """What RVMaster answers to the call."""
+    gate = Gate(lambda: policy, Registry(Nothing()), HostLimits())
+    name = "" if call.identity is Identity.NOBODY else NAME
+    arguments = tuple(argument_of(one) for one in call.parameters)
+    decision = gate.decide(Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0), call, arguments, tree)
+    assert not isinstance(decision, Contest)
+    return decision
+
+
+def needed(call: Call, missing: frozenset[str]) -> list[str]:
+    """The sections that must grant it, by the table above."""
+    free = EXTENSIONS & (missing | ({"read", "write"} if {"read", "write"} & missing else set()))
+    return [section for section in NEEDS.get(call.name, ("Commands",)) if section not in free]
+
+
+def deeds(call: Call) -> list[Request]:
+    """What a person would ask about the call: the deed, and the parameter that it is about."""
+    found = [
+        Request(
+            HOST, NAME, call.category, THING if call.category is not Category.COMMAND else call.policy_name
+        )
+    ]
+    if call.touches is not None:
+        found.append(Request(HOST, NAME, call.touches, KEY_GIVEN))
+    return found
+
+
+def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
+    """Whether a case that expects this answer passes."""
+    word = "allow" if allowed else "deny"
+    deed = f"{VERBS[request.category]} {request.resource}"
+    text = f"cases:\n- host: {HOST}\n  node: {NAME}\n  {word}: ['{deed}']\n"
+    return all(one.passed for one in run_cases(policy, text, "cases"))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.frozensets(st.sampled_from(SECTIONS)),
+    st.frozensets(st.sampled_from(SECTIONS), max_size=2),
+    st.booleans(),
+)
+def test_all_answer_alike(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> None:
+    """Every row of every table of calls, whatever sections grant it or are missing: one answer, and the right one."""
+    policy = compile_policy(text_of(granted, missing, keyed), file="policy")
+    nobody = compile_policy("[Nodes]\n", file="nobody")
+    for call in ROWS:
+        verdict = gate_says(policy, call, {}).allowed
+        assert verdict == all(one in granted - missing for one in needed(call, missing)), call.name
+        explained = {request: explain(policy, request).allowed for request in deeds(call)}
+        assert verdict == all(explained.values()), call.name
+        for request, allowed in explained.items():
+            assert case_passes(policy, request, allowed), request
+            assert not case_passes(policy, request, not allowed), request
+            differs = diff(policy, nobody, [request])
+            assert bool(differs) == (allowed != explain(nobody, request).allowed), request
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("kind", list(Kind))
+async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> None:
+    """A reload takes back what the gate would not grant any more, and nothing else: registrations and grants."""
+    world = ControlParts()
+    call = MASTER_CALLS[GRANTS[kind]]
+    resource = KEY_GIVEN if kind is Kind.PARAMETER else THING
+    node = Incarnation(new_key(), NAME, HOST, parse_node_uri(URI), URI, "10.0.0.1", 1, 2)
+    for number in range(1 << len(SECTIONS)):
+        granted = frozenset(section for bit, section in enumerate(SECTIONS) if number >> bit & 1)
+        world.current = compile_policy(text_of(granted, frozenset(), keyed=False), file="policy")
+        verdict = gate_says(world.current, call, {}).allowed
+        assert world.revocation.may_have(node, kind, resource) == verdict
+        for live, name in (("topic", "requestTopic"), ("service", "lookupService")):
+            given_by = MASTER_CALLS.get(name) or NODE_CALLS[name]
+            may = world.gate.may_have(name, HOST, NAME, THING, {}).allowed
+            assert may == gate_says(world.current, given_by, {}).allowed, live
+
+
+@pytest.mark.parametrize("call", ROWS, ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
+)
+def test_what_was_learned_from_a_call_lets_it_pass(call: Call, tree: dict[str, Value]) -> None:
+    """A policy that was learned from the records of a call grants the whole call, and it alone needs no more."""
+    key = KEY_GIVEN if call.touches is not None else ""
+    learned = learn([Observation(deeds(call)[0], call.name, key)])
+    assert not learned.left_out
+    policy = compile_policy(learned.text, file="learned")
+    assert gate_says(policy, call, tree).allowed
+    other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.category, deeds(call)[0].resource)
+    assert not explain(policy, other).allowed
+
+
+def test_a_call_that_makes_a_node_binds_its_name() -> None:
+    """What the policy asks [Nodes] about is what the gate binds to a host as a node's name."""
+    for call in ROWS:
+        assert needs_node(deeds(call)[0]) == (call.identity is Identity.NODE), call.name
+
+
+def test_what_a_call_registers_another_gives_up() -> None:
+    """Each kind of thing has one call that registers it and one that gives it up; both are about a resource."""
+    assert {call.registers: call.name for call in ROWS if call.registers is not None} == GRANTS
+    assert {call.name: call.gives_up for call in ROWS if call.gives_up is not None} == GIVES_UP
+    assert all(call.resource is not None for call in ROWS if call.registers or call.gives_up)
+
+
+def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:
+    """Who may call a service and not make the call that finds it is denied, by the gate and in every explanation."""
+    policy = compile_policy(
+        "[Groups]\nocu = 10.0.0.5\nrobot1 = 10.0.0.9\n[Nodes]\ndefault = ocu\n[Clients]\ndefault = ocu\n"
+        "[Commands]\ndefault = robot1\n",
+        file="policy",
+    )
+    request = Request(HOST, "", Category.CALL, "/negate")
+    assert not gate_says(policy, MASTER_CALLS["lookupService"], {}).allowed
+    found = explain(policy, request)
+    assert found.decision.allowed
+    assert not found.allowed
+    assert found.command is not None
+    assert "lookupService" in found.command.decision.reason
+    assert case_passes(policy, request, allowed=False)
+    assert not case_passes(policy, request, allowed=True)

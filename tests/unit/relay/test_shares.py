@@ -1,0 +1,199 @@
+"""What guests do with the relay's memory stops nobody else, and nothing stays stopped."""
+
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from appliance.channel.messages import (
+    ConnectionClosed,
+    GrantInstalled,
+    LatchRefused,
+    NodePlaced,
+    NodeWithdrawn,
+    PublicationPlaced,
+    UpstreamFound,
+    UpstreamLost,
+    UpstreamWanted,
+)
+from appliance.relay.limits import MIB
+from appliance.ros.tcpros import encode_frame, encode_header
+from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
+
+SMALL_RELAY = replace(
+    LIMITS,
+    memory_bytes=64 * MIB,
+    header_memory_bytes=MIB,
+    message_bytes=16 * MIB,
+    queue_bytes=16 * MIB,
+    stall_seconds=0.4,
+    connections=2000,
+    connections_per_host=1000,
+    header_seconds=60.0,
+    connect_seconds=30.0,
+)
+IMAGE = encode_frame(bytes(2 * MIB))
+LATCHED = HEADER | {"latching": "1"}
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    """A relay of 64 MiB, 16 of them for latched messages; `/talker` and `/listener` are the robot's."""
+    world = World(SMALL_RELAY)
+    yield world
+    world.close()
+
+
+def publish(world: World, number: int, host: str, header: dict[str, str] = HEADER) -> tuple[Peer, Peer]:
+    """A node on a host of its own publishes /chatter, and a subscriber hears it; publisher and subscriber."""
+    key, listening = f"guest{number}", world.listen()
+    world.state(NodePlaced(key, f"/guest{number}", host), listening)
+    world.state(PublicationPlaced(key, "/chatter", "*"))
+    world.state(GrantInstalled(key, "/chatter", LOOPBACK, "/listener"))
+    subscriber = Peer(socket.create_connection(listening.getsockname()))
+    world.open.append(subscriber.sock)
+    subscriber.send(encode_header(ASK))
+    world.hears(UpstreamWanted, key=key)
+    world.state(UpstreamFound(key, "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
+    publisher = world.accept(world.publisher)
+    world.gets_header(publisher)
+    publisher.send(encode_header(header))
+    world.gets_header(subscriber)
+    return publisher, subscriber
+
+
+def carries_images(world: World, publisher: Peer, subscriber: Peer) -> None:
+    """The robot's images go through, ten of them."""
+    for _ in range(10):
+        world.push(publisher, IMAGE)
+        world.gets(subscriber, IMAGE)
+
+
+def test_latched_messages_of_a_guest_stop_nobody_else(world: World) -> None:
+    """Its share is refused with a report; images and the robot's own latch go on; what is gone makes room."""
+    robot = world.subscribed()
+    message = encode_frame(bytes(MIB))
+    refused = 0
+    for number in range(30):
+        publisher, subscriber = publish(world, number, "10.9.9.9", LATCHED)
+        world.push(publisher, message)
+        world.gets(subscriber, message)
+        carries_images(world, *robot) if not number % 10 else None
+        refused += any(isinstance(one, LatchRefused) and one.key == f"guest{number}" for one in world.told)
+    assert world.engine._memory.latched.of("10.9.9.9").used < 9 * MIB
+    assert world.hears(LatchRefused, key="guest29").size == len(message)
+    assert refused > 20
+    own, subscriber = publish(world, 100, LOOPBACK, LATCHED)
+    world.push(own, message)
+    world.gets(subscriber, message)
+    assert world.engine._memory.latched.of(LOOPBACK).used == len(message)
+    for number in range(29):
+        world.state(NodeWithdrawn(f"guest{number}"))
+    assert world.engine._memory.latched.of("10.9.9.9").used == 0
+    carries_images(world, *robot)
+
+
+def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: World) -> None:
+    """Each takes what it can get, the first of them by halves; the next host's latch is kept all the same."""
+    for number in range(200):
+        size = 6 * MIB if number < 6 else 60_000
+        message = encode_frame(bytes(size))
+        publisher, subscriber = publish(world, number, f"10.9.0.{number}", LATCHED)
+        world.push(publisher, message)
+        world.gets(subscriber, message)
+    robot, subscriber = publish(world, 200, LOOPBACK, LATCHED)
+    message = encode_frame(bytes(2 * MIB))
+    world.push(robot, message)
+    world.gets(subscriber, message)
+    assert world.engine._memory.latched.of(LOOPBACK).used == len(message)
+
+
+def test_unfinished_messages_of_a_guest_stop_nobody_else(world: World) -> None:
+    """Forty publishers of one host begin messages and never end them: it is cut, images go through at all times."""
+    robot = world.subscribed()
+    begun = encode_frame(bytes(8 * MIB))[: 2 * MIB]
+    for number in range(40):
+        publisher, _subscriber = publish(world, number, "10.9.9.9")
+        world.push(publisher, begun)
+        if not number % 10:
+            carries_images(world, *robot)
+    assert world.engine._memory.frames.of("10.9.9.9").used < 18 * MIB
+    world.hears(UpstreamLost, violation="limit exceeded")
+    carries_images(world, *robot)
+    world.until(lambda: world.engine._memory.frames.of("10.9.9.9").used == 0)
+
+
+def test_subscribers_of_a_guest_that_never_read_stop_nobody_else(world: World) -> None:
+    """They lose messages, and those in the middle of a message are cut; the quick one of another host gets all."""
+    publisher, quick = world.subscribed()
+    world.state(GrantInstalled("k", "/chatter", "127.0.0.2", "/stuck"))
+    stuck = []
+    for _ in range(40):
+        sock = socket.create_connection(world.port.getsockname(), source_address=("127.0.0.2", 0))
+        peer = Peer(sock)
+        world.open.append(sock)
+        peer.send(encode_header(ASK | {"callerid": "/stuck"}))
+        world.gets_header(peer)
+        stuck.append(peer)
+    large = encode_frame(bytes(5 * MIB))
+    for _ in range(20):
+        world.push(publisher, large)
+        world.gets(quick, large)
+    assert world.engine._memory.queues.of(LOOPBACK).used == 0
+    share = world.engine._memory.queues.of("127.0.0.2")
+    assert 0 < share.used < 16 * MIB
+    share.add(8 * MIB)
+    assert "no memory left" in world.hears(ConnectionClosed).reason
+    share.add(-8 * MIB)
+    world.until(lambda: not share.exhausted)
+    for peer in stuck:
+        peer.reset()
+    world.until(lambda: share.used == 0)
+    carries_images(world, publisher, quick)
+
+
+def test_headers_of_strangers_leave_room_for_the_robots(world: World) -> None:
+    """A hundred addresses that nobody knows begin headers: together they have a quarter."""
+    unfinished = encode_header({"callerid": "/" + "x" * 30_000})[:-1]
+    for number in range(100):
+        source = (f"127.0.1.{number + 1}", 0)
+        sock = socket.create_connection(world.port.getsockname(), source_address=source)
+        world.open.append(sock)
+        sock.send(unfinished)
+        world.loop.turn(0.01)
+    ours = world.connect(encode_header(ASK | {"filler": "x" * 30_000}))
+    world.upstream()
+    assert world.gets_header(ours)["callerid"] == "/talker"
+    pool = world.engine._memory.headers.pool
+    assert 0 < pool.total <= MIB // 4 + len(unfinished)
+
+
+def test_headers_of_publishers_and_servers_count_while_they_are_connected(world: World) -> None:
+    """They choose how long theirs are, and the relay remembers them: nothing of a host is there for nothing."""
+    share = world.engine._memory.frames.of("10.9.9.9")
+    publisher, _subscriber = publish(world, 1, "10.9.9.9", HEADER | {"message_definition": "x" * 60_000})
+    assert 60_000 < share.used < 61_000
+    publisher.reset()
+    world.until(lambda: share.used == 0)
+    own = world.engine._memory.frames.of(LOOPBACK)
+    client = world.connect(encode_header(CALL) + encode_frame(bytes(50_000)))
+    service = world.accept(world.service)
+    world.until(lambda: own.used > 50_000)
+    world.gets_header(service)
+    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "m", "more": "x" * 40_000}))
+    world.gets_header(client)
+    world.until(lambda: 40_000 < own.used < 41_000)
+    client.reset()
+    world.until(lambda: own.used == 0)
+
+
+@pytest.mark.parametrize("asked", [ASK, CALL])
+def test_of_a_peers_header_little_is_remembered(world: World, asked: dict[str, str]) -> None:
+    """Fields that ROS has, none longer than a name: eight thousand connections of a host take little memory."""
+    long = world.connect(encode_header(asked | {"type": "x" * 2000}))
+    assert world.gets_header(long)["error"] == "its header has a type of 2000 characters"
+    world.connect(encode_header(asked | {"message_definition": "x" * 30_000, "own": "x" * 30_000}))
+    members = lambda: [*world.engine._clients, *world.engine._topics["k", "/chatter"][0].members]  # noqa: E731 - said once
+    [member] = world.until(members)
+    assert set(member._fields) == set(asked)

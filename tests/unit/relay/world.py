@@ -1,0 +1,250 @@
+"""An engine that plays with peers on loopback: control's messages, peers' bytes, and what comes back.
+
+The engine runs in the test's own thread; every step lets the loop turn until what is awaited has happened.
+"""
+
+import contextlib
+import socket
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import (
+    ClientGranted,
+    GrantInstalled,
+    Message,
+    NodePlaced,
+    PublicationPlaced,
+    RelayLink,
+    ServicePlaced,
+    UpstreamFound,
+    UpstreamWanted,
+)
+from appliance.relay.engine import Engine
+from appliance.relay.limits import MIB, Limits
+from appliance.relay.links import Link
+from appliance.relay.loop import Loop
+from appliance.ros.tcpros import HeaderParser, encode_header
+
+LOOPBACK = "127.0.0.1"
+LIMITS = replace(
+    Limits(),
+    message_bytes=4 * MIB,
+    queue_messages=50,
+    queue_bytes=8 * MIB,
+    header_seconds=0.3,
+    grant_seconds=0.1,
+    connect_seconds=0.3,
+    service_seconds=0.6,
+    linger=0.2,
+    farewell=0.2,
+    retry_first=0.02,
+    report_every=0.1,
+    connections=20,
+    connections_per_host=15,
+)
+HEADER = {
+    "callerid": "/talker",
+    "type": "std_msgs/String",
+    "md5sum": "m",
+    "latching": "0",
+    "topic": "/chatter",
+}
+ASK = {"callerid": "/listener", "topic": "/chatter", "type": "std_msgs/String", "md5sum": "m"}
+CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
+
+
+class Peer:
+    """A socket of a test that never blocks; collects what it is sent."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        self.sock = sock
+        self.data = bytearray()
+        self.ended = False
+
+    def send(self, data: bytes) -> None:
+        """Write without waiting for all of it."""
+        self.sock.send(data)
+
+    def read(self) -> None:
+        """Take what is there."""
+        while not self.ended:
+            try:
+                data = self.sock.recv(1 << 20)
+            except BlockingIOError:
+                return
+            except ConnectionResetError:
+                data = b""
+            self.data += data
+            self.ended = not data
+
+    def header(self) -> dict[str, str] | None:
+        """The header in what has come, taken off when it is whole."""
+        parser = HeaderParser()
+        fields = parser.feed(bytes(self.data))
+        if fields is not None:
+            self.data = bytearray(parser.rest)
+        return fields
+
+    def reset(self) -> None:
+        """Close with a reset, as a crashed machine's kernel does."""
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.sock.close()
+
+
+class World:
+    """An engine with a control, one node `/talker` (key `k`) that publishes /chatter and offers /mode."""
+
+    def __init__(self, limits: Limits = LIMITS) -> None:
+        self.loop = Loop()
+        self.engine = Engine(self.loop, limits)
+        self.told: list[Any] = []
+        self.open: list[socket.socket] = []
+        self.publisher = self.listen()
+        self.service = self.listen()
+        self.port = self.listen()
+        self.connect_control()
+        self.state(NodePlaced("k", "/talker", LOOPBACK), self.port)
+        self.state(PublicationPlaced("k", "/chatter", "*"))
+        self.state(GrantInstalled("k", "/chatter", LOOPBACK, "/listener"))
+        self.state(ServicePlaced("k", "/mode", LOOPBACK, self.service.getsockname()[1]))
+        self.state(ClientGranted("k", "/mode", LOOPBACK, "/client"))
+
+    def connect_control(self) -> None:
+        """A (new) control."""
+        ours, theirs = socket.socketpair()
+        self.control = Channel(ours, RelayLink)
+        self.link = Link(self.loop, Channel(theirs, RelayLink), self.engine.take, lambda _reason: None)
+        self.engine.attach(self.link)
+
+    def listen(self) -> socket.socket:
+        """A listening socket of the test."""
+        sock = socket.create_server((LOOPBACK, 0))
+        sock.setblocking(False)
+        self.open.append(sock)
+        return sock
+
+    @property
+    def held(self) -> int:
+        """The bytes of messages that the relay holds for all hosts."""
+        return sum(size for what, size in self.engine._memory.held().items() if what != "headers")
+
+    def state(self, message: Message, *sockets: socket.socket) -> None:
+        """Control says something, and it is carried out."""
+        self.control.send(message, tuple(sock.fileno() for sock in sockets))
+        self.link.catch_up()
+
+    def until(self, condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+        """Let the loop turn until the condition gives something; fails loudly."""
+        deadline = time.monotonic() + seconds
+        while True:
+            self.loop.turn(0.01)
+            self.told += [message for message, _fds in self.control.receive()]
+            found = condition()
+            if found:
+                return found
+            assert time.monotonic() < deadline, f"not within {seconds} s; control was told {self.told[-10:]}"
+
+    def hears(self, kind: type[Message], **fields: Any) -> Any:
+        """Control is told something of this kind; it is taken out of what was told."""
+
+        def find() -> Any:
+            for message in self.told:
+                if isinstance(message, kind) and all(getattr(message, k) == v for k, v in fields.items()):
+                    return message
+            return None
+
+        found = self.until(find)
+        self.told.remove(found)
+        return found
+
+    def connect(self, *parts: bytes, host: str = LOOPBACK) -> Peer:
+        """A peer at the relay's port, from this address."""
+        where = (LOOPBACK, self.port.getsockname()[1])
+        peer = Peer(socket.create_connection(where, source_address=(host, 0)))
+        self.open.append(peer.sock)
+        for part in parts:
+            peer.send(part)
+        return peer
+
+    def push(self, peer: Peer, data: bytes) -> None:
+        """The peer sends all of this, as fast as the relay takes it."""
+        rest = memoryview(data)
+        while rest:
+            with contextlib.suppress(BlockingIOError):
+                rest = rest[peer.sock.send(rest[:MIB]) :]
+            self.loop.turn(0)
+
+    def accept(self, listening: socket.socket) -> Peer:
+        """The relay's connection to the publisher or the service."""
+
+        def take() -> Peer | None:
+            try:
+                return Peer(listening.accept()[0])
+            except BlockingIOError:
+                return None
+
+        peer: Peer = self.until(take)
+        self.open.append(peer.sock)
+        return peer
+
+    def gets_header(self, peer: Peer) -> dict[str, str]:
+        """The peer has been sent a header."""
+
+        def find() -> dict[str, str] | None:
+            peer.read()
+            return peer.header()
+
+        fields: dict[str, str] = self.until(find)
+        return fields
+
+    def gets(self, peer: Peer, data: bytes) -> None:
+        """The peer has been sent exactly this."""
+
+        def whole() -> bool:
+            peer.read()
+            return len(peer.data) >= len(data)
+
+        self.until(whole)
+        assert peer.data == data
+        peer.data.clear()
+
+    def ends(self, peer: Peer) -> bytes:
+        """The peer's connection is closed by the relay; what came before."""
+
+        def ended() -> bool:
+            peer.read()
+            return peer.ended
+
+        self.until(ended)
+        return bytes(peer.data)
+
+    def upstream(self, header: dict[str, str] = HEADER) -> Peer:
+        """Answer the relay's question for the publisher, and its header."""
+        self.hears(UpstreamWanted, key="k", topic="/chatter")
+        self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
+        peer = self.accept(self.publisher)
+        asked = self.gets_header(peer)
+        assert (asked["topic"], asked["md5sum"], asked["callerid"]) == ("/chatter", "*", "/rosrv")
+        peer.send(encode_header(header))
+        return peer
+
+    def subscribed(self) -> tuple[Peer, Peer]:
+        """A publisher and a subscriber that is served."""
+        subscriber = self.connect(encode_header(ASK))
+        publisher = self.upstream()
+        assert self.gets_header(subscriber) == HEADER
+        return publisher, subscriber
+
+    def close(self) -> None:
+        """End everything."""
+        self.engine.close()
+        self.link.close()
+        self.loop.close()
+        self.control.close()
+        for sock in self.open:
+            sock.close()

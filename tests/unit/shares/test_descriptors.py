@@ -1,0 +1,63 @@
+"""No process runs out of descriptors before a share is spent."""
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.config import Limits, Settings
+from appliance.master.gate import HostLimits
+from appliance.relay.process import descriptors_for
+from appliance.shares.descriptors import connections_within
+from appliance.shares.table import (
+    DESCRIPTORS,
+    NODE_PORTS,
+    RELAY_CONNECTIONS,
+    REST_CONNECTIONS,
+    RVMASTER_CONNECTIONS,
+    RVMASTER_FAREWELLS,
+)
+from appliance.supervisor.roles import roles_of
+
+BESIDE = 1024  # databases, links, listeners, calls to ROSMaster, threads
+TRUE = Path("/bin/true")
+
+
+def test_all_shares_together_fit_the_descriptors() -> None:
+    """Every connection, every node's ports and a call to every node at once: each process may open as much."""
+    files = {role.name: role.files for role in roles_of(rosmaster=TRUE, rosout=TRUE)}
+    ports = NODE_PORTS.bounds.whole
+    nodes = ports // 2  # with one relay, which is where there are most
+    connections = RVMASTER_CONNECTIONS.bounds.whole + RVMASTER_FAREWELLS.bounds.whole
+    assert connections + ports + 2 * nodes + BESIDE <= files["control"]  # a face listens on a duplicate
+    assert connections <= files["control"] // 2
+    assert descriptors_for(RELAY_CONNECTIONS.bounds.whole) + nodes <= files["relay"]
+    assert 2 * REST_CONNECTIONS.bounds.whole + BESIDE <= files["api"]
+    assert files["control"] == files["relay"] == DESCRIPTORS.bounds.whole == 16 * files["api"]
+
+
+def test_the_configuration_has_the_tables_bounds() -> None:
+    """What an operator finds as default is what the page says."""
+    settings = Settings()
+    for given, row in (
+        (settings.limits, RVMASTER_CONNECTIONS),
+        (settings.relay, RELAY_CONNECTIONS),
+        (settings.api_limits, REST_CONNECTIONS),
+    ):
+        assert (given.connections, given.connections_per_host) == (row.bounds.whole, row.bounds.host)
+    assert Limits().topics_per_host == HostLimits().registrations
+
+
+@pytest.fixture
+def few_descriptors() -> Iterator[None]:
+    """A process that may open a thousand."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (1000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_where_the_system_allows_fewer_connections_have_half(few_descriptors: None) -> None:
+    """Above it one is told so, instead of a process that can open nothing any more."""
+    assert [connections_within(wanted) for wanted in (100, 4096)] == [100, 500]

@@ -1,0 +1,63 @@
+"""What systemd hears of the appliance."""
+
+import asyncio
+import os
+import socket
+from pathlib import Path
+
+from appliance.supervisor.service_manager import ServiceManager
+
+
+def listening(path: Path) -> socket.socket:
+    """A socket as systemd gives to a service."""
+    heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    heard.bind(str(path))
+    heard.settimeout(10)
+    return heard
+
+
+def test_it_hears_of_ready_and_of_the_end(tmp_path: Path) -> None:
+    """`READY=1` with a status when nodes may connect, `STOPPING=1` when the appliance ends in order."""
+    with listening(tmp_path / "notify") as heard:
+        manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        manager.ready("nodes may connect")
+        manager.stopping()
+        assert heard.recv(4096) == b"READY=1\nSTATUS=nodes may connect"
+        assert heard.recv(4096).startswith(b"STOPPING=1\n")
+
+
+def test_the_watchdog_hears_twice_in_its_time(tmp_path: Path) -> None:
+    """While the loop runs the watchdog is told so, each half of the time that it grants; a start gets more time."""
+    environment = {
+        "NOTIFY_SOCKET": str(tmp_path / "notify"),
+        "WATCHDOG_USEC": "20000",
+        "WATCHDOG_PID": str(os.getpid()),
+    }
+
+    async def live(manager: ServiceManager, heard: socket.socket) -> tuple[bytes, bytes]:
+        async with manager.watched():
+            first = await asyncio.to_thread(heard.recv, 4096)
+            manager.ready("nodes may connect")
+            while not (await asyncio.to_thread(heard.recv, 4096)).startswith(b"READY=1"):
+                pass
+            return first, await asyncio.to_thread(heard.recv, 4096)
+
+    with listening(tmp_path / "notify") as heard:
+        manager = ServiceManager.of(environment)
+        assert manager.watchdog_seconds == 0.02
+        starting, running = asyncio.run(live(manager, heard))
+    assert starting == b"EXTEND_TIMEOUT_USEC=120000000\nWATCHDOG=1"
+    assert running == b"WATCHDOG=1"
+    assert environment == {}, "a child must not speak in its place"
+
+
+def test_without_a_service_manager_nothing_is_said() -> None:
+    """Started by hand, or with a watchdog that is meant for another process, there is nobody to tell."""
+    manager = ServiceManager.of({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"})
+    manager.ready("nobody hears it")
+    assert manager.watchdog_seconds is None
+
+
+def test_a_service_manager_that_has_gone_stops_nothing(tmp_path: Path) -> None:
+    """A socket that is not there any more is no reason to end."""
+    ServiceManager(str(tmp_path / "gone"), None).ready("nobody hears it")
