@@ -1,0 +1,165 @@
+"""`make package`: dist/rosrv_VERSION_ARCH.deb for Debian 12 and Ubuntu 24.04.
+
+    python -m distribution.deb amd64 arm64
+
+The tree of the package is put together under build/package/ARCH, then debhelper makes the package of it. Every time in
+it is that of the newest commit, so two builds of one commit are the same, byte by byte.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from email.utils import formatdate
+from pathlib import Path
+
+from appliance import __version__
+from appliance.supervisor.users import NUMERIC_IDS
+from distribution.environment import ARCHITECTURES, INTERPRETERS, ROOT, Architecture, make_environment
+from distribution.man import write_pages
+
+HERE = ROOT / "distribution"
+LIBRARY = "usr/lib/rosrv"
+_TOOLS = {"dh_installsystemd": "debhelper", "dpkg-buildpackage": "dpkg-dev", "lintian": "lintian"}
+# Of packages.txt: what runs on the robot's machine.
+RUNS = (
+    "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",
+    "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
+)  # fmt: skip
+_LAUNCHER = """\
+#!/usr/lib/rosrv/bin/python -P
+from appliance.cli.main import main
+
+main()
+"""
+
+
+def build(architecture: Architecture, *, moment: int) -> Path:
+    """Build the package of this architecture; `moment` (seconds since the epoch) is every time in it. Its path."""
+    work = ROOT / "build/package" / architecture.debian
+    shutil.rmtree(work, ignore_errors=True)
+    source = work / "source"
+    source.mkdir(parents=True)
+    _gather(source, architecture, work, moment)
+    _debian_folder(source / "debian", moment)
+    environment = {"SOURCE_DATE_EPOCH": str(moment), "DEB_BUILD_OPTIONS": "nocheck", "LC_ALL": "C.UTF-8"}
+    subprocess.run(
+        # Nothing is compiled, so nothing of the other architecture is needed (-d).
+        ["dpkg-buildpackage", "--build=binary", "-us", "-uc", "-d", f"--host-arch={architecture.debian}"],
+        cwd=source,
+        env=os.environ | environment,
+        stdin=subprocess.DEVNULL,
+        stdout=(work / "build.log").open("wb"),
+        stderr=subprocess.STDOUT,
+        check=True,
+    )
+    made = work / f"rosrv_{__version__}_{architecture.debian}.deb"
+    dist = ROOT / "dist" / made.name
+    dist.parent.mkdir(exist_ok=True)
+    shutil.move(made, dist)
+    return dist
+
+
+def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -> None:
+    """Everything that the package installs, under `source/root`."""
+    root = source / "root"
+    library = root / LIBRARY
+    make_environment(library, architecture, work)
+    _make_virtual(library)
+    _copy(ROOT / "appliance", library / "common/appliance")
+    _copy(ROOT / "examples", root / "usr/share/rosrv/examples")
+    (root / "usr/bin").mkdir(parents=True)
+    launcher = root / "usr/bin/rosrv"
+    launcher.write_text(_LAUNCHER)
+    launcher.chmod(0o755)
+    settings = root / "etc/rosrv"
+    settings.mkdir(parents=True)
+    shutil.copyfile(HERE / "appliance.yaml", settings / "appliance.yaml")
+    for folder in ("policies", "monitors", "ipsec"):
+        _copy(ROOT / folder, settings / folder)
+    date = formatdate(moment)
+    write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
+    _documentation(root / "usr/share/doc/rosrv")
+    completion = root / "usr/share/bash-completion/completions"
+    completion.mkdir(parents=True)
+    shown = subprocess.run(
+        [ROOT / ".venv/bin/rosrv"],
+        env=os.environ | {"_ROSRV_COMPLETE": "source_bash"},
+        capture_output=True,
+        check=True,
+    )
+    (completion / "rosrv").write_bytes(shown.stdout)
+
+
+def _make_virtual(library: Path) -> None:
+    """A virtual environment of Debian's interpreter, whichever of `INTERPRETERS` that is."""
+    (library / "bin").mkdir()
+    (library / "bin/python").symlink_to("/usr/bin/python3")
+    (library / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n")
+
+
+def _documentation(target: Path) -> None:
+    target.mkdir(parents=True)
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        shutil.copyfile(page, target / page.name)
+    _copy(ROOT / "docs/pictures", target / "pictures")
+    for name in ("README.md", "SECURITY.md"):
+        shutil.copyfile(ROOT / name, target / name)
+
+
+def _copy(folder: Path, target: Path) -> None:
+    shutil.copytree(folder, target, ignore=shutil.ignore_patterns("__pycache__", "*.pyc"))
+
+
+def _debian_folder(target: Path, moment: int) -> None:
+    shutil.copytree(HERE / "debian", target)
+    control = (target / "control").read_text()
+    (target / "control").write_text(control.replace("@RUNS@", ", ".join(RUNS)))
+    (target / "changelog").write_text(
+        f"rosrv ({__version__}) stable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
+        f" -- The ROSRV maintainers <maintainers@localhost>  {formatdate(moment)}\n"
+    )
+    lines = [f'u {name} - "ROSRV appliance" - -' for name in NUMERIC_IDS]
+    # root reads the audit log as a member of its group, where it has no CAP_DAC_OVERRIDE.
+    (target / "rosrv.sysusers").write_text("\n".join([*lines, "m root rosrv-api"]) + "\n")
+    (target / "rosrv.install").write_text("root/* /\n")
+    for name in ("postinst", "prerm"):
+        text = (target / f"rosrv.{name}").read_text()
+        (target / f"rosrv.{name}").write_text(text.replace("@VERSIONS@", " ".join(INTERPRETERS)))
+
+
+def _missing_packages() -> list[str]:
+    packages = [package for tool, package in _TOOLS.items() if shutil.which(tool) is None]
+    foreign = ARCHITECTURES["arm64"].triplet
+    if shutil.which(f"{foreign}-gcc") is None:
+        packages += [f"gcc-{foreign.replace('_', '-')}", "libc6-dev-arm64-cross"]
+    return packages
+
+
+def main(arguments: list[str]) -> int:
+    """Build for the architectures that are named; exit status 1 with words when that is not possible."""
+    unknown = [name for name in arguments if name not in ARCHITECTURES]
+    if unknown or not arguments:
+        sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")
+        return 2
+    if missing := _missing_packages():
+        sys.stderr.write(f"package: tools are missing: sudo apt-get install {' '.join(missing)}\n")
+        return 1
+    if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
+        sys.stderr.write(f"package: version {__version__} is none of a package\n")
+        return 1
+    said = subprocess.run(
+        ["git", "-c", f"safe.directory={ROOT}", "log", "-1", "--format=%ct"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    for name in arguments:
+        made = build(ARCHITECTURES[name], moment=int(said.stdout))
+        sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,96 @@
+"""Man pages of `rosrv`, made of its own help: rosrv(1), and a page for each verb.
+
+python -m distribution.man DIRECTORY DATE     (DATE as 2026-11-01: two builds write the same)
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from appliance import __version__ as VERSION  # noqa: N812  a constant
+from appliance.cli.main import app
+
+_FILES = """\
+.SH FILES
+.TP
+.I /etc/rosrv/appliance.yaml
+The configuration; \\fBrosrv config show\\fR prints every setting.
+.TP
+.I /etc/rosrv/policies, /etc/rosrv/monitors, /etc/rosrv/ipsec/hosts.yaml
+What an operator edits.
+.TP
+.I /var/lib/rosrv
+The state: registrations, audit log, keys.
+.SH SEE ALSO
+The pages in \\fI/usr/share/doc/rosrv\\fR.
+"""
+
+
+def write_pages(directory: Path, date: str) -> None:
+    """Write `rosrv.1` and `rosrv-VERB.1` for each verb that is shown."""
+    root = typer.main.get_command(app)
+    context = root.make_context("rosrv", [], resilient_parsing=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / "rosrv.1").write_text("".join(_page("rosrv", root, context, date)) + _FILES)
+    for words, command, inner in _verbs(("rosrv",), root, context):
+        name = "-".join(words)
+        (directory / f"{name}.1").write_text("".join(_page(" ".join(words), command, inner, date)))
+
+
+def _verbs(words: tuple[str, ...], group: Any, context: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if command.hidden:
+            continue
+        inner = command.make_context(name, [], parent=context, resilient_parsing=True)
+        real = inner.command
+        yield (*words, name), real, inner
+        if hasattr(real, "list_commands"):
+            yield from _verbs((*words, name), real, inner)
+
+
+def _page(title: str, command: Any, context: Any, date: str) -> Iterator[str]:
+    name = title.replace(" ", "-")
+    summary, _, rest = (command.help or "").strip().partition("\n\n")
+    yield f'.TH "{name.upper()}" 1 "{date}" "rosrv {VERSION}" "ROSRV appliance"\n'
+    yield f".SH NAME\n{_text(name)} \\- {_text(_one_line(summary).rstrip('.'))}\n"
+    pieces = " ".join(_text(piece) for piece in command.collect_usage_pieces(context))
+    yield f".SH SYNOPSIS\n.B {_text(title)}\n{pieces}\n"
+    if rest:
+        yield ".SH DESCRIPTION\n"
+        for paragraph in rest.split("\n\n"):
+            yield f".PP\n{_text(_one_line(paragraph))}\n"
+    if hasattr(command, "list_commands"):
+        yield ".SH COMMANDS\n"
+        for verb in command.list_commands(context):
+            inner = command.get_command(context, verb)
+            if not inner.hidden:
+                yield f".TP\n.B {_text(verb)}\n{_text(inner.get_short_help_str(300))}\n"
+    options = [record for record in _records(command, context) if record]
+    if options:
+        yield ".SH OPTIONS\n"
+        for flags, help_text in options:
+            yield f".TP\n.B {_text(flags)}\n{_text(_one_line(help_text)) or '.br'}\n"
+
+
+def _records(command: Any, context: Any) -> Iterator[tuple[str, str] | None]:
+    for parameter in command.get_params(context):
+        yield parameter.get_help_record(context)
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"\s+", " ", text).strip()
+
+
+def _text(text: str) -> str:
+    """Text that roff takes as it stands."""
+    escaped = text.replace("\\", "\\e").replace("-", "\\-").replace("'", "\\(aq")
+    return re.sub(r"^\.", r"\\&.", escaped, flags=re.MULTILINE)
+
+
+if __name__ == "__main__":
+    write_pages(Path(sys.argv[1]), sys.argv[2])

@@ -1,0 +1,180 @@
+"""The Debian package on a clean Debian with systemd, in a virtual machine: install, serve, reboot, upgrade, remove.
+
+The machine has the packages that ours depends on (it has no network to fetch them) and nothing else of the project.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.machine import Done, Machine
+from tests.support.machine_disk import ROOT, clean_disk, newest_kernel
+from tests.support.requirements import need_program
+
+pytestmark = pytest.mark.timeout(
+    1800
+)  # packages are built, and a machine boots twice, each instruction computed
+NODE_PACKAGES = (
+    "python3-rospy",
+    "python3-rostopic",
+    "python3-rosnode",
+    "python3-std-msgs",
+    "systemd-resolved",
+)
+SERVE_SECONDS = 600.0
+EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
+
+
+@pytest.fixture(scope="module")
+def package() -> Path:
+    """dist/rosrv_VERSION_amd64.deb, built now by the one command."""
+    for program, debian in (("dh", "debhelper"), ("dpkg-buildpackage", "dpkg-dev"), ("lintian", "lintian")):
+        need_program(program, debian)
+    done = subprocess.run(
+        [sys.executable, "-m", "distribution.deb", "amd64"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return ROOT / done.stdout.split()[0]
+
+
+@pytest.fixture
+def newer(package: Path, tmp_path: Path) -> Path:
+    """The same package as 0.1.1."""
+    tree = tmp_path / "newer"
+    subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(tree)], check=True)
+    control = tree / "DEBIAN/control"
+    control.write_text(control.read_text().replace("Version: 0.1.0", "Version: 0.1.1"))
+    made = tmp_path / "rosrv_0.1.1_amd64.deb"
+    subprocess.run(
+        ["dpkg-deb", "--root-owner-group", "--build", str(tree), str(made)], check=True, capture_output=True
+    )
+    return made
+
+
+@pytest.fixture
+def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
+    """A clean machine with both packages in its folder, not started."""
+    depends = subprocess.run(
+        ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True
+    ).stdout
+    named = {entry.split("|")[0].split("(")[0].strip() for entry in depends.split(",")}
+
+    def freight(path: Path) -> None:
+        with tarfile.open(path, "w") as archive:
+            archive.add(package, "old.deb")
+            archive.add(newer, "new.deb")
+
+    disk = tmp_path / "disk.ext4"
+    image = clean_disk(newest_kernel(), (*sorted(named - {"systemd"}), *NODE_PACKAGES))
+    subprocess.run(["cp", "--sparse=always", str(image), str(disk)], check=True)
+    machine = Machine(tmp_path, disk=disk, freight=freight)
+    try:
+        yield machine
+    finally:
+        machine.stop()
+
+
+def state_of(machine: Machine) -> dict[str, str]:
+    """What the appliance changes on a machine while it runs."""
+    looks = {
+        "rules": ("nft", "list", "ruleset"),
+        "legacy rules": ("iptables-legacy-save",),
+        "namespaces": ("ip", "netns", "list"),
+        "interfaces": ("ip", "-brief", "link"),
+        "forwarding": ("cat", "/proc/sys/net/ipv4/ip_forward"),
+        "units": ("systemctl", "list-unit-files", "--no-legend", "rosrv*"),
+    }
+    return {name: machine.run(*command, check=False).output for name, command in looks.items()}
+
+
+def ros(machine: Machine, *command: str) -> Done:
+    """A stock tool on the robot's machine; nothing is set but ROS_MASTER_URI."""
+    return machine.run("env", *(f"{key}={value}" for key, value in EVERYWHERE.items()), *command, seconds=120)
+
+
+def serves(machine: Machine) -> dict[str, object]:
+    """The status of the appliance, once systemd says that it is ready."""
+    machine.run("systemctl", "start", "rosrv", seconds=SERVE_SECONDS)  # waits for a start that is under way
+    status: dict[str, object] = json.loads(machine.run("rosrv", "status", "--json", check=False).output)
+    return status
+
+
+def test_the_life_of_the_package(machine: Machine) -> None:
+    """One command protects the robot; reboot, kill and upgrade keep it so, and removal leaves the machine as it was."""
+    machine.start()
+    before = state_of(machine)
+    machine.run("dpkg", "--install", "old.deb", seconds=900)
+    assert serves(machine)["version"] == "0.1.0"
+    assert machine.run("rosrv", "policy", "check", "/etc/rosrv/policies/default.ini").status == 0
+    processes = machine.run("ps", "-eo", "user:20,args").output
+    for user in ("rosrv-relay", "rosrv-api", "rosrv-signer", "rosmaster"):
+        assert f"{user} " in processes, processes
+
+    machine.run("systemd-run", "--unit=talker", "--setenv=ROS_MASTER_URI=http://localhost:11311",
+                "rostopic", "pub", "--rate=5", "/chatter", "std_msgs/String", "data: hello")  # fmt: skip
+    assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output
+
+    machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
+    serves(machine)
+    assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
+        "the talker was not restarted"
+    )
+
+    machine.run("sh", "-c", "echo '# a line of mine' >> /etc/rosrv/policies/default.ini")
+    machine.run("systemctl", "reload", "rosrv")
+    machine.run("dpkg", "--install", "new.deb", seconds=900)
+    serves(machine)
+    assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "0.1.1"
+    assert "a line of mine" in machine.run("tail", "-1", "/etc/rosrv/policies/default.ini").output
+    assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
+        "the upgrade took the talker along"
+    )
+    assert machine.run("rosrv", "audit", "verify").status == 0
+
+    assert machine.stop(), machine.story()
+    machine.start()
+    serves(machine)
+    machine.run("rosrv", "audit", "verify")
+
+    machine.run("dpkg", "--remove", "rosrv", seconds=300)
+    after = state_of(machine)
+    assert {name: text for name, text in after.items() if text != before[name]} == {}
+    machine.run("dpkg", "--purge", "rosrv", seconds=300)
+    looked = ("/etc", "/var", "/usr", "/lib", "/run", "-xdev", "-name", "*rosrv*")
+    others = ("/var/lib/dpkg/*", "/var/log/*", "*rosrv-agent*", "*rosrv.agent*")
+    left = machine.run("find", *looked, *(word for path in others for word in ("-not", "-path", path))).output
+    assert left == "", left
+
+
+def test_what_lintian_says_of_it(package: Path) -> None:
+    """Debian's checker finds no error but what a package that brings its own Python packages cannot avoid."""
+    done = subprocess.run(
+        ["lintian", "--fail-on", "none", str(package)], capture_output=True, text=True, check=False
+    )
+    brought = ("embedded-library", "library-not-linked-against-libc", "bogus-mail-host")
+    errors = [
+        line
+        for line in done.stdout.splitlines()
+        if line.startswith("E:") and not any(tag in line for tag in brought)
+    ]
+    assert errors == []
+
+
+def test_two_builds_are_the_same(package: Path, tmp_path: Path) -> None:
+    """Who builds the same commit gets the same package, byte by byte."""
+    kept = tmp_path / package.name
+    shutil.copyfile(package, kept)
+    subprocess.run(
+        [sys.executable, "-m", "distribution.deb", "amd64"], cwd=ROOT, capture_output=True, check=True
+    )
+    assert package.read_bytes() == kept.read_bytes()

@@ -1,0 +1,52 @@
+"""Tests that the Debian package keeps step with the program, the container image and the list of packages."""
+
+import re
+from pathlib import Path
+
+from appliance.config_sources import resolve
+from appliance.supervisor.privileges import SUPERVISORS
+from distribution.deb import RUNS
+from distribution.environment import INTERPRETERS
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_it_depends_on_what_the_image_has() -> None:
+    """What runs in the container is what the package asks for; only the container needs an init of its own."""
+    stage = (ROOT / "Dockerfile").read_text().partition("FROM ${BASE} AS appliance")[2]
+    installed = re.search(r"--no-install-recommends \\\n((?: +\S+ \\\n)+)", stage)
+    assert installed is not None
+    assert set(installed[1].split()) - {"\\", "tini"} == set(RUNS)
+
+
+def test_each_dependency_has_its_reason() -> None:
+    """Every package that it asks for stands in packages.txt, where the reasons are."""
+    listed = {line.partition("#")[0].strip() for line in (ROOT / "packages.txt").read_text().splitlines()}
+    assert set(RUNS) <= listed
+
+
+def test_the_service_has_the_rights_of_the_supervisor() -> None:
+    """systemd leaves the service exactly the capabilities that the supervisor keeps."""
+    unit = (ROOT / "distribution/debian/rosrv.service").read_text()
+    given = {
+        name.removeprefix("CAP_")
+        for line in re.findall(r"^CapabilityBoundingSet=(.*)$", unit, re.MULTILINE)
+        for name in line.split()
+    }
+    assert given == set(SUPERVISORS)
+
+
+def test_the_installed_configuration_is_right() -> None:
+    """What the package puts to /etc/rosrv is read without a mistake, and every commented key is one."""
+    file = ROOT / "distribution/appliance.yaml"
+    settings = resolve(file, {}, {})
+    assert settings.enable == "none"
+    keys = re.findall(r"^(?:# )?([a-z_]+):", file.read_text(), re.MULTILINE)
+    assert set(keys) <= set(type(settings).model_fields)
+
+
+def test_it_serves_the_interpreters_that_it_says() -> None:
+    """The dependency on python3 and the environments that are built are of the same versions."""
+    control = (ROOT / "distribution/debian/control").read_text()
+    bounds = re.findall(r"python3 \((>=|<<) 3\.(\d+)\)", control)
+    assert [f"3.{minor}" for minor in range(int(bounds[0][1]), int(bounds[1][1]))] == list(INTERPRETERS)
