@@ -1,5 +1,9 @@
 """The tables of control's state file."""
 
+import os
+import signal
+import traceback
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +30,19 @@ def incarnation(key: str) -> IncarnationRow:
 def reopened(directory: Path) -> StateStore:
     """The store as the next control finds it."""
     return StateStore(directory, failed=pytest.fail)
+
+
+def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
+    """A process opens the store, works, and is killed: its writer writes nothing after that."""
+    child = os.fork()
+    if not child:
+        try:
+            work(reopened(directory))
+            os.kill(os.getpid(), signal.SIGKILL)
+        finally:  # only when something failed there
+            traceback.print_exc()
+            os._exit(1)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
 
 
 def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -124,33 +141,42 @@ def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
 
 def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> None:
     """Changes are there for the next control, in order, though the tree was not kept since and nothing was closed."""
-    killed = reopened(tmp_path)
-    killed.save_parameters({"a": 1})
-    killed.note_parameter("/b", [1.5, {"c": b"x"}])
-    killed.note_parameter("/a", None)
-    again = reopened(tmp_path)
-    assert again.parameter_changes() == [("/b", [1.5, {"c": b"x"}]), ("/a", None)]
-    again.note_parameter("/d", 3)
-    assert reopened(tmp_path).parameter_changes()[-1] == ("/d", 3)
-    for one in (killed, again):
-        one.close()
+
+    def first(store: StateStore) -> None:
+        store.save_parameters({"a": 1})
+        store.note_parameter("/b", [1.5, {"c": b"x"}])
+        store.note_parameter("/a", None)
+
+    def second(store: StateStore) -> None:
+        assert store.parameter_changes() == [("/b", [1.5, {"c": b"x"}]), ("/a", None)]
+        store.note_parameter("/d", 3)
+
+    killed_after(first, tmp_path)
+    killed_after(second, tmp_path)
+    last = reopened(tmp_path)
+    assert last.parameter_changes() == [("/b", [1.5, {"c": b"x"}]), ("/a", None), ("/d", 3)]
+    last.close()
 
 
 def test_who_set_parameters_outlasts_the_process(tmp_path: Path) -> None:
     """Owners of keys are there for the next control; with a key go those below it, and no other that looks like it."""
-    killed = reopened(tmp_path)
-    for key in ("/", "/a", "/a/b", "/a/b/c", "/a/bc", "/ab", "/a-", "/b"):
-        killed.parameter_owned(key, "10.0.0.9")
-    killed.parameters_disowned("/a/b")
-    killed.parameter_owned("/b", "10.0.0.8")
-    again = reopened(tmp_path)
-    kept = dict.fromkeys(("/", "/a", "/a/bc", "/ab", "/a-"), "10.0.0.9") | {"/b": "10.0.0.8"}
-    assert dict(again.parameter_owners()) == kept
-    again.parameters_disowned("/")
+
+    def first(store: StateStore) -> None:
+        for key in ("/", "/a", "/a/b", "/a/b/c", "/a/bc", "/ab", "/a-", "/b"):
+            store.parameter_owned(key, "10.0.0.9")
+        store.parameters_disowned("/a/b")
+        store.parameter_owned("/b", "10.0.0.8")
+
+    def second(store: StateStore) -> None:
+        kept = dict.fromkeys(("/", "/a", "/a/bc", "/ab", "/a-"), "10.0.0.9") | {"/b": "10.0.0.8"}
+        assert dict(store.parameter_owners()) == kept
+        store.parameters_disowned("/")
+
+    killed_after(first, tmp_path)
+    killed_after(second, tmp_path)
     last = reopened(tmp_path)
     assert last.parameter_owners() == []
-    for one in (killed, again, last):
-        one.close()
+    last.close()
 
 
 def test_the_whole_tree_takes_the_place_of_its_changes(tmp_path: Path) -> None:
