@@ -39,7 +39,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from appliance.network import links
+from appliance.network import conntrack, links
 from appliance.network.endings import end_processes
 from appliance.network.endpoint import Endpoint, outward_address
 from appliance.network.firewall import iptables
@@ -147,6 +147,8 @@ class Isolation:
             return
         try:
             self._clear_leftovers()
+            if self._rules:
+                self._forget_tunnels()
         finally:
             self.ends.clear()
             self._rules = ()
@@ -193,17 +195,25 @@ class Isolation:
                 f"the host has a program of its own on UDP {', '.join(map(str, sorted(used)))}, where the appliance's"
                 " tunnels arrive: stop it (a strongSwan of the host?), or run the appliance in a container"
             )
-        self._backend.install(rules)
-        self._rules = rules
+        self._install(rules)
 
     def put_rules_back(self) -> None:
         """Install the rules on the host again, when somebody took them away."""
         if self._rules:
-            self._backend.install(self._rules)
+            self._install(self._rules)
 
     def rules(self) -> tuple[RuleStatus, ...]:
         """Return the rules on the host with their counters."""
         return statuses(self._rules, self._backend.counters())
+
+    def _install(self, rules: tuple[Rule, ...]) -> None:
+        self._backend.install(rules)
+        self._rules = rules
+        self._forget_tunnels()
+
+    def _forget_tunnels(self) -> None:
+        """Let the next packet of each tunnel go where the rules say now."""
+        conntrack.forget(self._host, [port.first for port in _TUNNELS])
 
     def _build(self) -> None:
         settings, inside = self.settings, self.namespace
@@ -219,8 +229,7 @@ class Isolation:
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
         self._routers = routers
-        self._rules = isolation_rules(settings, self.ends, routers)
-        self._backend.install(self._rules)  # before forwarding is turned on
+        self._install(isolation_rules(settings, self.ends, routers))  # before forwarding is turned on
         self._forwarding.enable(tuple(self.ends))
 
     def _choose_subnets(self) -> None:

@@ -122,6 +122,47 @@ def test_hosts_reach_the_appliance_with_their_own_address(bare: Host, node: Host
         assert source_seen(server, node, bare.address, MASTER) == node.address
 
 
+@pytest.mark.parametrize("wildcard", ["0.0.0.0", "::"])
+def test_a_tunnel_that_never_pauses_follows_the_rules(
+    bare: Host, node: Host, tmp_path: Path, wildcard: str
+) -> None:
+    """The connection tracker remembers where a host's UDP packets went; it forgets when the appliance comes or goes."""
+    family = socket.AF_INET6 if ":" in wildcard else socket.AF_INET
+    target = (bare.address6 if ":" in wildcard else bare.address, 4500)
+    # As of a container engine: with a rule that translates, every conversation is remembered.
+    rules = (
+        "add table inet other; add chain inet other in { type nat hook prerouting priority -90; };"
+        " add rule inet other in udp dport 9 redirect to :10"
+    )
+    assert bare.popen(["nft", rules]).wait(timeout=20) == 0
+    with bare.entered():
+        own = socket.socket(family, socket.SOCK_DGRAM)
+        own.bind((wildcard, 4500))
+    with node.entered():
+        tunnel = socket.socket(family, socket.SOCK_DGRAM)
+    with own, tunnel:
+        own.settimeout(10)
+        tunnel.sendto(b"before", target)
+        assert own.recv(9) == b"before"
+        own.close()  # as the strongSwan of the host is stopped
+        with isolated(bare, tmp_path) as isolation:
+            isolation.forward_tunnels()
+            with isolation.namespace.entered():
+                charon = socket.socket(family, socket.SOCK_DGRAM)
+            with charon:
+                charon.bind((wildcard, 4500))
+                charon.settimeout(10)
+                tunnel.sendto(b"during", target)
+                assert charon.recv(9) == b"during"
+        with bare.entered():
+            again = socket.socket(family, socket.SOCK_DGRAM)
+        with again:
+            again.bind((wildcard, 4500))
+            again.settimeout(10)
+            tunnel.sendto(b"after", target)
+            assert again.recv(9) == b"after"
+
+
 def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> None:
     """Nodes on the host and on the network are reached; the network sees the host's address."""
     with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567) as local:

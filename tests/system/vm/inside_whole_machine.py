@@ -67,9 +67,6 @@ def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, ba
         before = state_of_the_machine()
         with Appliance(machine, policy=POLICY, isolation=isolation, options=options) as one:
             one.rosrv("host", "add", "ocu-1", "--appliance", MIDDLE, "--out", str(kit))
-            # What the connection tracker remembers of this host is gone before the next test (docs/limits.md).
-            for name in ("udp_timeout", "udp_timeout_stream"):
-                Path(f"/proc/sys/net/netfilter/nf_conntrack_{name}").write_text("5\n")
             with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
                 joined.wait_until_up()
                 with (

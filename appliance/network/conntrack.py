@@ -1,0 +1,52 @@
+"""What the connection tracker of a machine remembers, and how it forgets.
+
+A rule that translates addresses is asked for the first packet of a conversation only. A host that sends UDP on and on
+(IKE, ESP in UDP) keeps its old entry alive, and its packets go where they went before the rules were there, or to an
+appliance that is gone. So entries of forwarded ports are deleted whenever the rules change.
+"""
+
+import errno
+import socket
+from collections.abc import Iterable
+
+from pyroute2 import NFCTSocket
+from pyroute2.netlink.exceptions import NetlinkError
+from pyroute2.netlink.nfnetlink.nfctsocket import NFCTAttrTuple
+
+from appliance.network import links
+from appliance.network.namespaces import Namespace, NetworkError
+
+_FAMILIES = (socket.AF_INET, socket.AF_INET6)
+
+
+def forget(namespace: Namespace, ports: Iterable[int]) -> int:
+    """Delete the entries of UDP packets to these ports of the namespace's own addresses, and count them.
+
+    Entries of what the machine forwards for others stay. Raises: NetworkError when the kernel refuses.
+    """
+    own = {address.partition("/")[0] for address in links.addresses(namespace)}
+    try:
+        return namespace.run(
+            lambda: sum(_forget(family, port, own) for family in _FAMILIES for port in ports)
+        )
+    except (NetlinkError, OSError) as error:
+        raise NetworkError(f"deleting entries of the connection tracker: {error}") from error
+
+
+def _forget(family: int, port: int, own: set[str]) -> int:
+    wanted = NFCTAttrTuple(family=family, proto=socket.IPPROTO_UDP, dport=port)
+    deleted = 0
+    with NFCTSocket(nfgen_family=family) as tracker:
+        for message in list(tracker.dump(tuple_orig=wanted)):
+            entry = NFCTAttrTuple.from_netlink(family, message.get_attr("CTA_TUPLE_ORIG"))
+            # Kernels before 5.8 do not filter.
+            if (entry.proto, entry.dport) != (wanted.proto, port) or entry.daddr not in own:
+                continue
+            try:
+                tracker.entry("del", tuple_orig=entry)
+            except NetlinkError as error:
+                if error.code != errno.ENOENT:  # it ended by itself meanwhile
+                    raise
+            else:
+                deleted += 1
+    return deleted
