@@ -3,7 +3,7 @@
 `METRICS` is the one list that `/metrics` is made from and docs/metrics.md is generated from
 (`python -m appliance.metrics`). Counting is a few additions on the way of a request; nothing is formatted there.
 Labels have few values: names of calls, categories and roles are ours; topics and services are those that are carried,
-and only so many of them by name (`appliance.master.measures`).
+and only so many of them by name (`appliance.control.measures`).
 """
 
 import bisect

@@ -36,7 +36,7 @@ def judge(
     before: Mapping[str, dict[str, str]], files: dict[str, str], definitions: dict[str, str], revision: int
 ) -> Draft:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
-    from appliance.master.specifications import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  as said above
+    from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  as said above
 
     present = Sources(before["files"], before["definitions"])
     following = present.with_files(files, definitions)

@@ -3,7 +3,7 @@
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
 passes on `RestRequest`, which cannot make tokens. Of these, control makes a `RestChange` only with the proof that the
-holder of a token asked for just that (`appliance/master/rest_proof.py`).
+holder of a token asked for just that (`appliance/control/rest_proof.py`).
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """

@@ -9,7 +9,7 @@ import msgspec
 from appliance.channel.admin import AdminAnswer, AdminRequest
 
 if TYPE_CHECKING:
-    from appliance.cli.audit_source import AuditSource
+    from appliance.cli.audit.source import AuditSource
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
@@ -28,7 +28,7 @@ class AdminSocket:
 
     def audit(self) -> "AuditSource":
         """The audit log's file, which can be read without a running appliance."""
-        from appliance.cli.audit_source import FileLog  # noqa: PLC0415  only for the verbs that read it
+        from appliance.cli.audit.source import FileLog  # noqa: PLC0415  only for the verbs that read it
 
         return FileLog(self.state)
 

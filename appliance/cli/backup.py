@@ -8,10 +8,10 @@ from typing import Annotated, NoReturn
 import typer
 
 from appliance.audit.output import printable
+from appliance.backup.contents import BackupError
+from appliance.backup.restoring import restore as put_back
+from appliance.backup.taking import back_up
 from appliance.cli.running import DEFAULT_STATE, State
-from appliance.supervisor.backup import back_up
-from appliance.supervisor.backup_contents import BackupError
-from appliance.supervisor.backup_restore import restore as put_back
 
 _NewState = Annotated[
     Path,

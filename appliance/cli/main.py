@@ -16,64 +16,64 @@ VERBS: dict[str, Verb | Group] = {
         "Show the running appliance: processes, isolation, policy, graph, audit log.",
     ),
     "selftest": Verb(
-        "appliance.cli.selftest:selftest",
+        "appliance.cli.selftest.verb:selftest",
         "Try whether this machine can run the appliance, and whether the running one does what it must.",
     ),
     "demo": Verb(
-        "appliance.cli.demo:demo",
+        "appliance.cli.demo.verb:demo",
         "Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.",
     ),
     "protect": Verb(
         "appliance.cli.protect:protect", "Close the ROS ports of this machine to all but the appliance."
     ),
-    "audit": Verb("appliance.cli.audit:app", "Review the audit log and prove that it is complete."),
+    "audit": Verb("appliance.cli.audit.verbs:app", "Review the audit log and prove that it is complete."),
     "policy": Verb(
-        "appliance.cli.policy:app", "Check, explain, test, compare, learn and change access policies."
+        "appliance.cli.policy.verbs:app", "Check, explain, test, compare, learn and change access policies."
     ),
     "monitor": Group(
         "Monitors: check specifications, try them on a recording, run them on the robot.",
         {
             "check": Verb(
-                "appliance.cli.monitor:check",
+                "appliance.cli.monitor.verbs:check",
                 "Report every error and warning with its place; exit status 1 if there is an error.",
             ),
             "run": Verb(
-                "appliance.cli.monitor:run",
+                "appliance.cli.monitor.verbs:run",
                 "Give a recording to the monitors and report what came of every message, by the recording's clock.",
             ),
             "list": Verb(
-                "appliance.cli.monitor_running:list_monitors",
+                "appliance.cli.monitor.running:list_monitors",
                 "Show every monitor: enabled or not, what it listens to, what it did.",
             ),
             "enable": Verb(
-                "appliance.cli.monitor_running:enable", "Let the events of these monitors happen again."
+                "appliance.cli.monitor.running:enable", "Let the events of these monitors happen again."
             ),
             "disable": Verb(
-                "appliance.cli.monitor_running:disable",
+                "appliance.cli.monitor.running:disable",
                 "Let messages pass these monitors untouched; their variables stay.",
             ),
             "load": Verb(
-                "appliance.cli.monitor_running:load",
+                "appliance.cli.monitor.running:load",
                 "Load specifications while the robot runs; a file of the same name is replaced.",
             ),
             "remove": Verb(
-                "appliance.cli.monitor_running:remove",
+                "appliance.cli.monitor.running:remove",
                 "Remove specifications, by the names of their monitors or files.",
             ),
             "reload": Verb(
-                "appliance.cli.monitor_running:reload",
+                "appliance.cli.monitor.running:reload",
                 "Take what the folder of specifications has now; what was loaded from elsewhere stays in force.",
             ),
             "resume": Verb(
-                "appliance.cli.monitor_running:resume",
+                "appliance.cli.monitor.running:resume",
                 "Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).",
             ),
             "reset": Verb(
-                "appliance.cli.monitor_offline:reset",
+                "appliance.cli.monitor.offline:reset",
                 "Give up the specifications that were loaded by command: the next start takes those of the folder.",
             ),
             "rvstate": Verb(
-                "appliance.cli.monitor_running:rv_state",
+                "appliance.cli.monitor.running:rv_state",
                 "ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried.",
                 hidden=True,
             ),
@@ -81,7 +81,9 @@ VERBS: dict[str, Verb | Group] = {
     ),
     "version": Verb("appliance.cli.version:version", "Show which version this is, and what it stands on."),
     "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
-    "host": Verb("appliance.cli.host:app", "Enrol, list and revoke hosts that come through IPsec tunnels."),
+    "host": Verb(
+        "appliance.cli.host.verbs:app", "Enrol, list and revoke hosts that come through IPsec tunnels."
+    ),
     "backup": Verb(
         "appliance.cli.backup:backup",
         "Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.",

@@ -20,7 +20,7 @@ from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
 if TYPE_CHECKING:
-    from appliance.cli.audit_source import AuditSource
+    from appliance.cli.audit.source import AuditSource
 
 DEFAULT_STATE = Path("/var/lib/rosrv")  # as appliance.config has it, which is not imported for every verb
 TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
@@ -136,7 +136,7 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
         if "api_ca" in typed:
             raise usage_error("--api-ca is for --api URL, which is not given")
         return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
-    from appliance.cli.rest_way import RestWay  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
         return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True, place=api)

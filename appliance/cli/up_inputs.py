@@ -9,9 +9,9 @@ import sqlite3
 from pathlib import Path
 
 from appliance.config import Settings
-from appliance.master.specifications import SpecificationsRefusedError, check, read_folder
 from appliance.policy import PolicyError, compile_policy
 from appliance.policy.policy import DEFAULT_PORTS
+from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.errors import StartError
 
 _DISK = "disk"

@@ -11,9 +11,9 @@ calls, whose order counts, travels together by `in_order`.
 import asyncio
 from collections.abc import Sequence
 
-from appliance.master.client import CallFailedError, XmlRpcClient
 from appliance.ros.errors import EncodingError
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.client import CallFailedError, XmlRpcClient
 
 _LARGEST = 64  # parts of one multicall: what one slow part can hold up
 _TOGETHER = frozenset({

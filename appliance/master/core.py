@@ -3,20 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.master.addresses import Addresses
-from appliance.master.faces import Faces
-from appliance.master.gate import Gate
-from appliance.master.graph import Graph
-from appliance.master.liveness import Liveness
-from appliance.master.mediation import Mediation
-from appliance.master.monitors import Monitors
-from appliance.master.parameters import ParameterMirror
-from appliance.master.recorder import Recorder
-from appliance.master.registry import Registry
-from appliance.master.relays import RelayControl
+from appliance.master.calls.gate import Gate
+from appliance.master.calls.parameters import ParameterMirror
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.liveness import Liveness
+from appliance.master.graph.registry import Registry
+from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.faces import Faces
+from appliance.master.reach.mediation import Mediation
+from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import Policy
 from appliance.policy.model import Address
+from appliance.recorder import Recorder
+from appliance.specifications.monitors import Monitors
 
 
 @dataclass(slots=True)

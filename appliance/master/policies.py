@@ -13,11 +13,11 @@ from pathlib import Path
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.master.recorder import Recorder
 from appliance.policy import Policy, PolicyError, compile_policy
 from appliance.policy.cases import run_cases
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
+from appliance.recorder import Recorder
 from appliance.store.state import RevisionRow, StateStore
 
 _log = structlog.get_logger()

@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import TypeVar
 
 from appliance.master.batch import BatchingClient, Wanted
-from appliance.master.call import Answer
-from appliance.master.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
+from appliance.master.calls.call import Answer
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import Limits, Value
+from appliance.rpc.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
 
 _T = TypeVar("_T")
 

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
+from appliance.relay.connections.memory import Memory
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.memory import Memory
-from appliance.relay.middle import Middle
+from appliance.relay.monitors.middle import Middle
 from appliance.relay.report import Reporter
 
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from appliance.relay.places import Place
+from appliance.relay.monitors.places import Place
 from appliance.rosmop.batch import Walked, Walker
 
 

@@ -37,28 +37,28 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamRefused,
 )
-from appliance.relay.admission import NOTHING, asked_for, bound_name, flaw, missing
-from appliance.relay.anteroom import Anteroom
-from appliance.relay.client import ServiceClient, ServiceTraffic
+from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
+from appliance.relay.connections.anteroom import Anteroom
+from appliance.relay.connections.client import ServiceClient, ServiceTraffic
+from appliance.relay.connections.flow import Flows
+from appliance.relay.connections.frames import SCRATCH
+from appliance.relay.connections.headers import kept
+from appliance.relay.connections.links import Link
+from appliance.relay.connections.memory import Memory
+from appliance.relay.connections.ports import Ports
+from appliance.relay.connections.sockets import tune
+from appliance.relay.connections.subscriber import Subscriber
+from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.connections.upstream import Publisher
+from appliance.relay.connections.visitor import Farewell, Visitor
 from appliance.relay.context import RelayContext
-from appliance.relay.flow import Flows
-from appliance.relay.frames import SCRATCH
 from appliance.relay.grants import StatedTable, Statement
-from appliance.relay.headers import kept
 from appliance.relay.limits import Limits
-from appliance.relay.links import Link
 from appliance.relay.loop import Loop
-from appliance.relay.memory import Memory
-from appliance.relay.middle import Middle
-from appliance.relay.own import OwnPublisher
-from appliance.relay.places import Place
-from appliance.relay.ports import Ports
+from appliance.relay.monitors.middle import Middle
+from appliance.relay.monitors.own import OwnPublisher
+from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
-from appliance.relay.sockets import tune
-from appliance.relay.subscriber import Subscriber
-from appliance.relay.topic import RelayedTopic
-from appliance.relay.upstream import Publisher
-from appliance.relay.visitor import Farewell, Visitor
 from appliance.shares.pool import Standing
 
 

@@ -13,11 +13,11 @@ from typing import Any
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Lifeline, LinkOpened, Ping, Pong, Ready, RelayLink, Stop
+from appliance.relay.connections.links import Link
+from appliance.relay.connections.sockets import congestion_control
 from appliance.relay.engine import Engine
 from appliance.relay.limits import Limits
-from appliance.relay.links import Link
 from appliance.relay.loop import Loop
-from appliance.relay.sockets import congestion_control
 
 _DESCRIPTORS_BESIDE = 1024
 

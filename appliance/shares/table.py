@@ -50,7 +50,7 @@ RVMASTER_BYTES = Share(
     alarm="`limit exceeded`",
     shown_by=(
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
-        "unit/master/test_visitors.py::test_bytes_are_freed_by_the_host_that_holds_most",
+        "unit/rpc/test_visitors.py::test_bytes_are_freed_by_the_host_that_holds_most",
     ),
 )
 RVMASTER_FAREWELLS = Share(
@@ -59,7 +59,7 @@ RVMASTER_FAREWELLS = Share(
     setting="",
     at_limit="closed without a word",
     alarm="`limit exceeded`",
-    shown_by=("unit/master/test_visitors.py::test_connections_turned_away_in_all",),
+    shown_by=("unit/rpc/test_visitors.py::test_connections_turned_away_in_all",),
 )
 RVMASTER_REQUESTS = Share(
     thing="requests that RVMaster and faces serve at once",
@@ -70,7 +70,7 @@ RVMASTER_REQUESTS = Share(
     alarm="none: nothing is refused",
     shown_by=(
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
-        "unit/master/test_turns.py::test_requests_of_many_guests_leave_slots_for_the_robot",
+        "unit/rpc/test_turns.py::test_requests_of_many_guests_leave_slots_for_the_robot",
     ),
 )
 LARGE_WRITES = Share(
@@ -79,7 +79,7 @@ LARGE_WRITES = Share(
     setting="",
     at_limit="the value waits for its host's turn; small calls go between",
     alarm="none: nothing is refused",
-    shown_by=("unit/master/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
+    shown_by=("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
 )
 PROBES = Share(
     thing="nodes that are asked at once whether they are there",
@@ -87,7 +87,7 @@ PROBES = Share(
     setting="",
     at_limit="the node is asked when it is its host's turn",
     alarm="none: nothing is refused",
-    shown_by=("unit/master/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
+    shown_by=("unit/master/graph/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
 )
 NODE_CALLS_UNDER_WAY = Share(
     thing="calls that are being made to nodes for ROSMaster",
@@ -95,7 +95,7 @@ NODE_CALLS_UNDER_WAY = Share(
     setting="",
     at_limit="the node is told when it is its host's turn",
     alarm="none: nothing is refused",
-    shown_by=("unit/master/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
+    shown_by=("unit/master/graph/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
 )
 QUEUED_NODE_CALLS = Share(
     thing="bytes of calls that wait for nodes",
@@ -104,7 +104,7 @@ QUEUED_NODE_CALLS = Share(
     at_limit="the host that has most loses the oldest call to the node that has most of it; the node is told how things"
     " are once it answers",
     alarm="the process log; the node is looked at",
-    shown_by=("unit/master/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
+    shown_by=("unit/master/graph/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
 )
 RELAY_CONNECTIONS = Share(
     thing="connections to one relay",
@@ -124,7 +124,7 @@ PARAMETER_BYTES = Share(
     alarm="`limit exceeded`",
     shown_by=(
         "integration/master/test_shares.py::test_parameters_of_two_hundred_addresses",
-        "unit/master/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
+        "unit/master/calls/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
     ),
 )
 
@@ -170,7 +170,7 @@ RELAY_HEADERS = Share(
     "`connection refused`; `rosrv_relay_memory_bytes`",
     (
         f"{_RELAY}test_headers_of_strangers_leave_room_for_the_robots",
-        "unit/relay/test_anteroom.py::test_long_headers_make_room_for_short_ones",
+        "unit/relay/connections/test_anteroom.py::test_long_headers_make_room_for_short_ones",
     ),
 )
 REST_CONNECTIONS = Share(
@@ -268,7 +268,7 @@ NODE_PORTS = Share(
     "the refused call's record",
     (
         "integration/master/test_shares.py::test_ports_and_names",
-        "unit/master/test_places.py::test_no_host_takes_all_ports",
+        "unit/master/reach/test_places.py::test_no_host_takes_all_ports",
     ),
 )
 NAMES = Share(
@@ -280,7 +280,7 @@ NAMES = Share(
     "`decision`: the refused call's record",
     (
         "integration/master/test_floods.py::test_registrations_of_one_node",
-        "unit/master/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",
+        "unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",
     ),
 )
 GRANTS = Share(
@@ -289,7 +289,7 @@ GRANTS = Share(
     "",
     "the host, or of all hosts that with most, loses its oldest grants that nobody is connected by",
     "none: a node that asks again gets it again",
-    ("unit/master/test_relays.py::test_grants_of_all_hosts_are_bounded",),
+    ("unit/master/reach/test_relays.py::test_grants_of_all_hosts_are_bounded",),
 )
 IKE_HANDSHAKES = Share(
     "IKE handshakes under way (a host is an address; nobody is known before his handshake)",

@@ -147,7 +147,7 @@ def roles_of(
             name="control",
             user="rosrv",
             part="control",
-            entry="appliance.master.process:main",
+            entry="appliance.control.process:main",
             ended_early=100,
             path=lambda facts: facts.config,
             links=("relay", "signer", "api", "charon", "syslog"),

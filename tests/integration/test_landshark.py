@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.cli.landshark import MASTER_URI, Actor, Stage
+from appliance.cli.demo.landshark import MASTER_URI, Actor, Stage
 from appliance.network.lab import Lab
 from tests.support.nodes import ROOT, has_ros
 from tests.support.requirements import need_root, needs

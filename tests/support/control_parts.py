@@ -8,29 +8,29 @@ import asyncio
 import ipaddress
 from typing import Any, Self, cast
 
-from appliance.master.allocation import SERVICE
-from appliance.master.arguments import ApiUri
-from appliance.master.call import Answer, Caller
-from appliance.master.calls import MASTER_CALLS
-from appliance.master.client import CallFailedError, RefusedError
+from appliance.master.calls.arguments import ApiUri
+from appliance.master.calls.call import Answer, Caller
+from appliance.master.calls.gate import Gate, HostLimits
+from appliance.master.calls.parameters import may_be_told
+from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.registration import withdraw_lost
+from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.core import Master
-from appliance.master.delivery import NodeCall
-from appliance.master.gate import Gate, HostLimits
-from appliance.master.graph import Graph
-from appliance.master.http import HttpRequest, Peer
-from appliance.master.liveness import Liveness, LivenessSettings
-from appliance.master.parameters import may_be_told
-from appliance.master.pipeline import Pipeline
-from appliance.master.reconcile import Reconciler
-from appliance.master.registration import withdraw_lost
-from appliance.master.registry import Incarnation, Kind, Life, Registration, Registry, new_key
-from appliance.master.revocation import Revocation
+from appliance.master.graph.delivery import NodeCall
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.liveness import Liveness, LivenessSettings
+from appliance.master.graph.reconcile import Reconciler
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
+from appliance.master.graph.revocation import Revocation
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import compile_policy
 from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri
 from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
+from appliance.rpc.client import CallFailedError, RefusedError
+from appliance.rpc.server import HttpRequest, Peer
 from appliance.shares.pool import Standing
+from appliance.specifications.allocation import SERVICE
 from appliance.store.state import PermissionRow
 from tests.support.parameters import mirror
 

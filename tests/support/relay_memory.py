@@ -1,6 +1,6 @@
 """The memory of a relay for tests of its parts."""
 
-from appliance.relay.memory import HostShare, HostShares
+from appliance.relay.connections.memory import HostShare, HostShares
 from appliance.shares.pool import Bounds, Pool, Standing
 
 

@@ -1,4 +1,4 @@
-"""`appliance.cli.doorway`: a loopback port of this machine that comes out on a host of a lab."""
+"""`appliance.cli.demo.doorway`: a loopback port of this machine that comes out on a host of a lab."""
 
 import socket
 import threading
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.cli.doorway import CONNECTIONS, Doorway
+from appliance.cli.demo.doorway import CONNECTIONS, Doorway
 from appliance.network.lab import Host, Lab
 from tests.support.requirements import need_root
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from appliance.config_sources import resolve
-from appliance.master.rest_place import rest_place
+from appliance.hosts.rest_place import rest_place
 from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import NUMERIC_IDS

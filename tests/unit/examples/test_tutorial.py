@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from appliance.cli.monitor import app
+from appliance.cli.monitor.verbs import app
 from examples.landshark.drive import TRIGGERED, Simulation, record
 from examples.landshark.messages import MONITORS
 

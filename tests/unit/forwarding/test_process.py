@@ -10,10 +10,10 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
+from appliance.control.forwarded import Forwarded
 from appliance.forwarding.forwarder import Progress
 from appliance.forwarding.process import Reports
-from appliance.master.forwarded import Forwarded
-from appliance.master.recorder import Recorder
+from appliance.recorder import Recorder
 
 
 class Control:

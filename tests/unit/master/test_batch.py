@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from appliance.master.batch import BatchingClient
-from appliance.master.client import BrokenOffError, CallFailedError
 from appliance.ros.errors import EncodingError
+from appliance.rpc.client import BrokenOffError, CallFailedError
 
 
 class Server:

@@ -17,8 +17,8 @@ from appliance.channel import admin, messages
 from appliance.channel.admin import AdminAnswer, AdminRequest, AnyRequest
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Asked
-from appliance.master.rest import RestLink
-from appliance.master.tokens import Tokens
+from appliance.control.rest import RestLink
+from appliance.control.tokens import Tokens
 from appliance.store.order_proof import proof_of, reading_key, statement
 from appliance.store.state import StateStore
 from tests.support.heard import Heard

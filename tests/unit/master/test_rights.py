@@ -11,13 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.arguments import CALLER_API, KEY, SERVICE_API, ApiUri, Parameter
-from appliance.master.call import Call, Caller, Identity
-from appliance.master.calls import MASTER_CALLS
-from appliance.master.gate import Contest, Gate, HostLimits
-from appliance.master.http import Peer
-from appliance.master.node_calls import NODE_CALLS
-from appliance.master.registry import Incarnation, Kind, Registry, new_key
+from appliance.master.calls.arguments import CALLER_API, KEY, SERVICE_API, ApiUri, Parameter
+from appliance.master.calls.call import Call, Caller, Identity
+from appliance.master.calls.gate import Contest, Gate, HostLimits
+from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
+from appliance.master.reach.node_calls import NODE_CALLS
 from appliance.policy import Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.learn import Observation, learn
 from appliance.policy.model import Category, Decision, Request
@@ -25,6 +24,7 @@ from appliance.policy.rights import needs_node
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.server import Peer
 from tests.support.control_parts import ControlParts, Nothing
 
 HOST = ipaddress.ip_address("10.0.0.5")

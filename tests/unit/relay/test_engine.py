@@ -38,8 +38,8 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from appliance.relay.connections.upstream import Publisher
 from appliance.relay.limits import MIB
-from appliance.relay.upstream import Publisher
 from appliance.ros.tcpros import (
     encode_frame,
     encode_header,

@@ -23,9 +23,9 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
+from appliance.relay.connections.links import Link
 from appliance.relay.engine import Engine
 from appliance.relay.limits import MIB, Limits
-from appliance.relay.links import Link
 from appliance.relay.loop import Loop
 from appliance.ros.tcpros import HeaderParser, encode_header
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from appliance.config import Limits, Settings
-from appliance.master.gate import HostLimits
+from appliance.master.calls.gate import HostLimits
 from appliance.relay.process import descriptors_for
 from appliance.shares.descriptors import connections_within
 from appliance.shares.table import (

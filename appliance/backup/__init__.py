@@ -1,0 +1,1 @@
+"""The state directory in one file, and back."""

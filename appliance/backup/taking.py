@@ -1,0 +1,193 @@
+"""The state directory in one file, taken while the appliance runs or not (put back: `backup_restore`).
+
+Invariants:
+
+1. A database is copied by SQLite itself, as of one moment; nothing of a running appliance is waited for or stopped.
+2. What the signer remembers is taken back to the checkpoints that the copy of the log has, so that a restored log can
+   be signed on. (It is taken after the log, so it has all of them.)
+3. The file has keys in it: only its owner may read it. Nothing is written over, and nothing unfinished is left.
+4. Root reads in folders of users whose processes may have fallen to a stranger: with root's rights a link is never
+   followed, and a file that is not the user's own is an error.
+"""
+
+import errno
+import os
+import sqlite3
+import stat
+import tarfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import BinaryIO
+
+from appliance.backup.contents import (
+    AUDIT_LOG,
+    LARGEST,
+    MOST_FILES,
+    BackupError,
+    is_database,
+    is_passing,
+    kept_parts,
+    trouble_with,
+)
+from appliance.backup.database import copy_database
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import refuse_half_restored
+
+_PIECE = 1 << 20
+_HEADER, _HASH = 8, 32  # bytes, of the signer's memory
+_FORMAT = tarfile.GNU_FORMAT  # a large database has its size in the one header
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe is not waited for
+_ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/upgrade-and-backup.md)"
+
+
+def back_up(state: Path, file: Path) -> list[str]:
+    """Write the state directory to `file` (a tar archive, mode 0600); the names of what is in it.
+
+    Raises `BackupError`.
+    """
+    try:
+        refuse_half_restored(state)
+    except StartError as error:
+        raise BackupError(str(error)) from None
+    if not (state / AUDIT_LOG).exists():
+        raise BackupError(f"{state} has no audit log: it is no state directory of an appliance (--state)")
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        raise BackupError(f"{file} is there already: choose another name") from None
+    except OSError as error:
+        raise BackupError(f"{file}: {error.strerror}") from error
+    try:
+        with (
+            os.fdopen(descriptor, "wb") as raw,
+            tarfile.open(fileobj=raw, mode="w:gz", format=_FORMAT) as archive,
+        ):
+            names = _write(state, archive, file.absolute().parent)
+            archive.close()
+            raw.flush()
+            os.fsync(raw.fileno())
+    except BaseException as error:  # Ctrl-C, too
+        file.unlink()
+        if isinstance(error, (OSError, sqlite3.Error)):
+            raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
+        raise
+    return names
+
+
+def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
+    names = []
+    with TemporaryDirectory(prefix=".rosrv-backup-", dir=beside) as folder:
+        copy = Path(folder) / "copy.db"
+        last: dict[str, int] = {}
+        for name, descriptor in _files(state):
+            with os.fdopen(descriptor, "rb") as file:
+                mode = os.fstat(descriptor).st_mode & 0o777
+                if trouble := trouble_with(name, os.fstat(descriptor).st_size):
+                    raise BackupError(f"{name} {trouble}: see who put it there, and take it away")
+                if is_database(name):
+                    copy_database(state / name, os.fstat(descriptor), copy)
+                else:
+                    _copy_file(name, file, copy, last)
+            if name == AUDIT_LOG:
+                last = _last_checkpoint(copy)
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(time.time()), mode
+            with copy.open("rb") as content:
+                archive.addfile(entry, content)
+            copy.unlink()
+            names.append(name)
+    return names
+
+
+def _files(state: Path) -> Iterator[tuple[str, int]]:
+    """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it."""
+    names = [
+        name
+        for part in sorted(kept_parts())
+        if (state / part).exists()  # else a role that never ran here
+        for name in _names(state, part)
+    ]
+    if len(names) > MOST_FILES:
+        parts = Counter(name.partition("/")[0] for name in names)
+        raise BackupError(
+            f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: see who put them"
+            " there, and take them away"
+        )
+    for name in sorted(names, key=lambda one: one != AUDIT_LOG):
+        descriptor = _opened(state, name)
+        if descriptor is not None:
+            yield name, descriptor
+
+
+def _names(state: Path, part: str) -> Iterator[str]:
+    # A folder that cannot be looked into is an error: a backup without the keys would be none.
+    for folder, folders, names in os.walk(state / part, onerror=_raise):
+        folders.sort()
+        for name in sorted(names):
+            if not is_passing(name):
+                yield (Path(folder) / name).relative_to(state).as_posix()
+
+
+def _opened(state: Path, name: str) -> int | None:
+    """A file of a part, None for what is no regular file; no link is followed on the way."""
+    part, *folders, last = PurePosixPath(name).parts
+    here = os.open(state / part, _FOLDER)
+    owner = os.fstat(here).st_uid
+    try:
+        for folder in folders:
+            outer, here = here, os.open(folder, _FOLDER, dir_fd=here)
+            os.close(outer)
+        descriptor = os.open(last, _FILE, dir_fd=here)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+            return None
+        raise
+    finally:
+        os.close(here)
+    found = os.fstat(descriptor)
+    if stat.S_ISREG(found.st_mode) and found.st_uid == owner:
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISREG(found.st_mode):
+        raise BackupError(
+            f"{state / name} belongs to user id {found.st_uid}, and its part to {owner}: see who put it there, and take"
+            " it away"
+        )
+    return None
+
+
+def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> None:
+    if name.endswith(".signed"):
+        copy.write_bytes(_as_far_as(file.read(LARGEST), last.get(PurePosixPath(name).stem)))
+        return
+    with copy.open("wb") as written:
+        while piece := file.read(_PIECE):
+            written.write(piece)
+            if written.tell() > LARGEST:  # it grows while it is read
+                raise BackupError(
+                    f"{name} has more than {LARGEST} bytes: see who put it there, and take it away"
+                )
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def _last_checkpoint(log: Path) -> dict[str, int]:
+    with closing(sqlite3.connect(log)) as connection:
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
+        (number,) = connection.execute("SELECT coalesce(max(number), 0) FROM checkpoint").fetchone()
+    return {str(log_id): int(number)}
+
+
+def _as_far_as(memory: bytes, number: int | None) -> bytes:
+    """The signer's memory of a log without what it signed since; all of it for a log that is not the copied one."""
+    if number is None or len(memory) < _HEADER:
+        return memory
+    first = int.from_bytes(memory[:_HEADER], "big")
+    return memory[: _HEADER + max(0, number - first + 1) * _HASH]

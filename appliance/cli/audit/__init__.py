@@ -1,0 +1,1 @@
+"""`rosrv audit`: the review of the audit log."""

@@ -1,0 +1,85 @@
+"""What the audit verbs look for: one set of options for `search`, `tail` and `export`."""
+
+import functools
+import inspect
+import time
+from collections.abc import Callable
+from typing import Annotated, Concatenate, ParamSpec
+
+import typer
+
+from appliance.audit.moment import parse_moment
+from appliance.audit.query import Filter
+from appliance.audit.record import Severity
+from appliance.cli.audit.errors import Errors
+from appliance.cli.running import Appliance
+
+_P = ParamSpec("_P")
+
+
+def _filter(
+    *,
+    deny: Annotated[
+        bool, typer.Option("--deny", help="Only what was denied (and summaries of denials)")
+    ] = False,
+    allow: Annotated[bool, typer.Option("--allow", help="Only what was allowed")] = False,
+    would_deny: Annotated[
+        bool, typer.Option("--would-deny", help="Only what a trial policy would have denied")
+    ] = False,
+    since: Annotated[
+        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--until", help="Before this moment")] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option("--topic", "--resource", help="Topic, service, parameter, call; a glob: '/cmd_*'"),
+    ] = None,
+    host: Annotated[str | None, typer.Option("--host", help="Address of the peer; a glob")] = None,
+    caller: Annotated[str | None, typer.Option("--caller", help="Name the node gave; a glob")] = None,
+    event: Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")] = None,
+    category: Annotated[
+        str | None, typer.Option("--category", help="Category of the request; a glob")
+    ] = None,
+    severity: Annotated[
+        Severity | None, typer.Option("--severity", help="This severity or a graver one")
+    ] = None,
+    rule: Annotated[
+        str | None, typer.Option("--rule", help="Section or key of the policy rule; a glob")
+    ] = None,
+    text: Annotated[
+        str | None, typer.Option("--text", help="Found anywhere in names, reason and details")
+    ] = None,
+) -> Filter:
+    now = time.time_ns()
+    wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
+    return Filter(
+        decision=tuple(name for name, asked in wanted.items() if asked),
+        since=None if since is None else parse_moment(since, now),
+        until=None if until is None else parse_moment(until, now),
+        host=host,
+        caller_id=caller,
+        resource=topic,
+        category=category,
+        event=event,
+        severity=severity,
+        rule=rule,
+        text=text,
+    )
+
+
+def filtered(
+    verb: Callable[Concatenate[Appliance, Filter, _P], None],
+) -> Callable[Concatenate[Appliance, _P], None]:
+    """Give a verb whose second parameter is a `Filter` the options that say what is looked for."""
+    options = inspect.signature(_filter).parameters
+
+    @functools.wraps(verb)
+    def asked(appliance: Appliance, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        with Errors():
+            given = {name: kwargs.pop(name) for name in options}
+            verb(appliance, _filter(**given), *args, **kwargs)  # type: ignore[arg-type]  # as the options say
+
+    own = inspect.signature(verb, eval_str=True)
+    first, _wanted, *rest = own.parameters.values()
+    asked.__signature__ = own.replace(parameters=[first, *options.values(), *rest])  # type: ignore[attr-defined]  # what `speaks` reads
+    return asked  # type: ignore[return-value]  # mypy gives the appliance a name that it is not called by

@@ -1,0 +1,308 @@
+"""The cast of the demonstration: a simulated LandShark, its operator, an attacker; each on a host of a lab.
+
+    with Lab("rosrv-demo") as lab, Stage(lab, examples) as stage:
+        stage.start_appliance()
+        stage.start_robot()
+
+Each program is an `Actor`: a process on its host that prints one JSON object per line. Of the appliance
+the nodes know ROS_MASTER_URI, nothing else.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from appliance.cli.demo.doorway import Doorway
+from appliance.network.lab import Host, Lab
+
+NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
+APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"
+MASTER_URI = f"http://{APPLIANCE}:11311"
+CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
+START_SECONDS = 60.0  # an appliance or a node that is not there by then is not coming
+ATTACK_SECONDS = 60.0
+COMMAND_SECONDS = 120.0  # a drive through the yard and what starts before it
+
+Event = dict[str, Any]
+
+
+class DemoError(RuntimeError):
+    """The demonstration cannot go on: what is missing, or what did not happen, and where to look."""
+
+
+@dataclass(frozen=True)
+class Attack:
+    """What the attacker tried, what was answered, and whether it worked."""
+
+    name: str
+    tried: str
+    answer: str
+    succeeded: bool
+
+
+class Actor:
+    """A process on a host; its events in order, its other output in a file."""
+
+    def __init__(
+        self, host: Host, name: str, command: list[str], environment: dict[str, str], log: Path
+    ) -> None:
+        self.host, self.name, self.log = host, name, log
+        self.events: queue.Queue[Event | None] = queue.Queue()
+        self._log = log.open("a")
+        self.process = host.popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+            errors="backslashreplace",
+            start_new_session=True,  # Ctrl-C is for the demonstration, which ends its actors itself
+        )
+        self._reader = threading.Thread(target=self._read, name=f"{name} output", daemon=True)
+        self._reader.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether the process has not ended."""
+        return self.process.poll() is None
+
+    def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
+        """The next event of this name; what else is said before it is passed over."""
+        deadline = time.monotonic() + seconds
+        while True:
+            try:
+                said = self.events.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise self._failure(f"did not say {event!r} within {seconds:.0f} s") from None
+            if said is None:
+                raise self._failure(f"ended with status {self.process.wait()} before it said {event!r}")
+            if said.get("event") == event:
+                return said
+
+    def newest(self, event: str, seconds: float = START_SECONDS) -> Event:
+        """The next event of this name that is said from now on."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                if self.events.get_nowait() is None:
+                    self.events.put(None)
+                    break
+        return self.expect(event, seconds)
+
+    def interrupt(self) -> None:
+        """Ask the process to end."""
+        if self.running:
+            self.process.send_signal(signal.SIGTERM)
+
+    def stop(self, seconds: float = 6.0) -> None:
+        """End the process: SIGTERM, then SIGKILL."""
+        if self.running:
+            self.interrupt()
+            try:
+                self.process.wait(seconds)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._reader.join(seconds)
+        self._log.close()
+
+    def _read(self) -> None:
+        output = self.process.stdout
+        assert output is not None  # noqa: S101  popen was told to make it
+        for line in output:
+            with contextlib.suppress(ValueError):
+                said = json.loads(line)
+                if isinstance(said, dict):
+                    self.events.put(said)
+                    continue
+            self._log.write(line)
+        output.close()
+        self.events.put(None)
+
+    def _failure(self, what: str) -> DemoError:
+        self._log.flush()
+        words = self.log.read_text(errors="backslashreplace").strip().splitlines()[-8:]
+        return DemoError("\n  ".join([f"{self.name} on {self.host.name} {what}", *words]))
+
+
+class Stage:
+    """The hosts, and everybody on them; a context manager that ends all of it."""
+
+    def __init__(self, lab: Lab, examples: Path) -> None:
+        self.nodes = examples / "landshark" / "nodes"
+        self.monitors = examples.parent / "monitors"
+        self.policy = examples / "landshark" / "landshark-demo.ini"
+        self.directory = Path(tempfile.mkdtemp(prefix="rosrv-demo-"))
+        self.directory.chmod(0o755)  # the appliance's processes run as other users
+        self.state = self.directory / "state"
+        self.appliance_host = lab.host("appliance", f"{APPLIANCE}/24")
+        self.robot_host = lab.host("robot", f"{ROBOT}/24")
+        self.operator_host = lab.host("ocu", f"{OPERATOR}/24")
+        self.attacker_host = lab.host("attacker", f"{ATTACKER}/24")
+        self.actors: list[Actor] = []
+
+    def start_appliance(self) -> Event:
+        """`rosrv up` in its own namespace; the ready line, once nodes may connect."""
+        command = [sys.executable, "-m", "appliance.cli.main", "up", "--json", "--isolation", "container"]
+        command += [
+            "--listen",
+            f"{APPLIANCE}:11311",
+            "--policy",
+            str(self.policy),
+            "--monitors",
+            str(self.monitors),
+            "--enable",
+            "none",
+            "--state",
+            str(self.state),
+            "--api",
+            f"{CONSOLE[0]}:{CONSOLE[1]}",
+        ]
+        return self._start(self.appliance_host, "rosrv up", command).expect("ready")
+
+    def start_robot(self) -> list[Actor]:
+        """The LandShark's drivers and sensors, five rospy nodes and one roscpp node."""
+        python = {
+            "base": ["base.py"],
+            "turret": ["turret.py"],
+            "gps": ["sensors.py", "gps"],
+            "laser": ["sensors.py", "laser"],
+            "battery": ["sensors.py", "battery"],
+        }
+        commands = {
+            name: [NODE_PYTHON, str(self.nodes / file), *arguments]
+            for name, (file, *arguments) in python.items()
+        }
+        commands["radar"] = [str(self._radar())]
+        return [
+            self._start(self.robot_host, f"landshark_{name}", command) for name, command in commands.items()
+        ]
+
+    def protect_robot(self) -> None:
+        """`rosrv protect` on the robot's machine: its nodes' own ports answer the appliance only."""
+        command = [sys.executable, "-m", "appliance.cli.main", "protect", "--appliance", APPLIANCE, "--apply"]
+        protect = self.robot_host.popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        said, _ = protect.communicate(timeout=START_SECONDS)
+        if protect.returncode:
+            raise DemoError(f"rosrv protect on the robot failed: {said.strip()}")
+
+    def start_operator(self) -> Actor:
+        """The operator control unit."""
+        return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
+
+    def command(self, what: str, *values: str) -> Event:
+        """One command of the operator, once his unit has ended: what `command.py` says of it."""
+        program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
+        actor = self._start(self.operator_host, "ocu command", program)
+        said = actor.expect(
+            {"drive": "drove", "reach": "reached", "aim": "aimed", "fire": "fired"}[what], COMMAND_SECONDS
+        )
+        actor.stop()
+        self.actors.remove(actor)
+        return said
+
+    def draw(self, ways: dict[str, Sequence[Sequence[float]]], picture: Path) -> None:
+        """The ways of the robot (metres), without and with monitors, from above as an SVG."""
+        file = self.directory / "ways.json"
+        file.write_text(json.dumps(ways))
+        command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
+        done = subprocess.run(
+            command,
+            cwd=self.nodes.parents[2],
+            capture_output=True,
+            text=True,
+            timeout=START_SECONDS,
+            check=False,
+        )
+        if done.returncode:
+            raise DemoError(f"the picture {picture} cannot be drawn: {done.stderr.strip()}")
+
+    def console(self) -> Doorway:
+        """A door from this machine to the console, which listens on loopback of the appliance's host."""
+        return Doorway(self.appliance_host, CONSOLE)
+
+    def enable_monitor(self, name: str) -> None:
+        """`rosrv monitor enable NAME`, while the robot runs."""
+        command = [sys.executable, "-m", "appliance.cli.main", "monitor", "enable", name]
+        command += ["--state", str(self.state)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
+        if done.returncode:
+            raise DemoError(f"the monitor {name} cannot be enabled: {done.stderr.strip()}")
+
+    def attack(self, name: str) -> Attack:
+        """Have the attacker try one thing."""
+        attacker = self._start(
+            self.attacker_host, "attacker", [NODE_PYTHON, str(self.nodes / "attacker.py"), name]
+        )
+        said = attacker.expect("attacked", ATTACK_SECONDS)
+        attacker.stop()
+        self.actors.remove(attacker)
+        answer = said["answer"]
+        text = str(answer[1]) if len(answer) > 1 and isinstance(answer[0], int) else json.dumps(answer)
+        return Attack(name, said["tried"], text, said["succeeded"])
+
+    def audit(self, *flags: str) -> list[dict[str, Any]]:
+        """`rosrv audit search` with these flags: the records."""
+        command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", *flags, "--json"]
+        command += ["--state", str(self.state)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
+        if done.returncode:
+            raise DemoError(f"the audit log cannot be read: {done.stderr.strip()}")
+        return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
+
+    def close(self) -> None:
+        """End everybody, the appliance last, and remove what they left."""
+        for actor in self.actors[1:]:
+            actor.interrupt()  # all at once: each takes its second
+        for actor in reversed(self.actors):
+            actor.stop()
+        self.actors.clear()
+        shutil.rmtree(self.directory, ignore_errors=True)
+
+    def _start(self, host: Host, name: str, command: list[str]) -> Actor:
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "ROSRV_"))}
+        environment = kept | {
+            "ROS_MASTER_URI": MASTER_URI,
+            "ROS_IP": host.address,
+            "ROS_HOME": str(self.directory / host.name),
+            "PYTHONUNBUFFERED": "1",
+        }
+        actor = Actor(host, name, command, environment, self.directory / f"{name.replace(' ', '-')}.log")
+        self.actors.append(actor)
+        return actor
+
+    def _radar(self) -> Path:
+        root = self.nodes.parents[2]
+        program = root / "build" / "landshark_radar"
+        built = subprocess.run(
+            [str(root / "scripts" / "build-roscpp"), str(self.nodes / "radar.cpp"), str(program)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if built.returncode:
+            raise DemoError(f"the radar node could not be compiled:\n{built.stderr.strip()}")
+        return program
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,1 @@
+"""`rosrv host`: who may come through a tunnel."""

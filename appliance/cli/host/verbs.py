@@ -1,0 +1,222 @@
+"""`rosrv host add|list|kit|reload|revoke`: who may come through a tunnel."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
+from appliance.cli.host.kit import KitWriter, place, wishes_of, write_script
+from appliance.cli.host.output import new_output, usage_error
+from appliance.cli.output import Json, moment, say, say_json
+from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import seconds_of
+
+app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
+
+_Name = Annotated[str, typer.Argument(help="The host's name: `host:NAME` in the policy", show_default=False)]
+_Endpoint = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Address or name at which the host reaches the appliance (UDP 500 and 4500; default: `ipsec.endpoint` of"
+        " the configuration, else the machine's address towards its default route)",
+    ),
+]
+_Csr = Annotated[
+    Path | None,
+    typer.Option(help="Signing request (PEM) of a key that the host made: the kit has no private key then"),
+]
+_Days = Annotated[float, typer.Option(help="Days until the certificate ends")]
+_Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
+        " standard output"
+    ),
+]
+_Open = Annotated[
+    list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
+]
+_Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
+
+
+@app.command()
+@speaks
+def add(  # noqa: PLR0917  typer gives every flag by its name
+    running: Appliance,
+    name: _Name,
+    appliance: _Endpoint = None,
+    address: Annotated[
+        str | None, typer.Option(help="Its virtual address (default: the next free one)")
+    ] = None,
+    token: Annotated[
+        bool,
+        typer.Option("--token", help="Print a one-time token and write a script; the host makes its own key"),
+    ] = False,
+    within: Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")] = "1h",
+    csr: _Csr = None,
+    days: _Days = 90,
+    out: _Out = None,
+    opened: _Open = None,
+    ports: _Ports = "32768-60999",
+    as_json: Json = False,
+) -> None:
+    """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
+
+    Example: rosrv host add ocu-1 --token
+    """
+    wishes = wishes_of(appliance, ports, opened)
+    if token:
+        if csr is not None:
+            raise usage_error(
+                "--csr and --token are two ways: with a token the host brings its request itself"
+            )
+        seconds = _seconds(within)
+        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
+            placed = place(running, wishes, as_json=as_json)
+            order = HostToken(name, placed.wishes.kept(), seconds, days, address, new=True)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+        return
+    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        placed = place(running, wishes, as_json=as_json)
+        order_kit = HostAdd(name, writer.request, days, address)
+        writer.write(running.ask_or_exit(order_kit, as_json=as_json), placed, as_json=as_json)
+
+
+@app.command()
+@speaks
+def kit(  # noqa: PLR0917  as above
+    running: Appliance,
+    name: _Name,
+    appliance: _Endpoint = None,
+    token: Annotated[
+        bool, typer.Option("--token", help="A one-time token instead: the host comes with another key")
+    ] = False,
+    within: Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")] = "1h",
+    csr: _Csr = None,
+    days: _Days = 90,
+    out: _Out = None,
+    opened: _Open = None,
+    ports: _Ports = "32768-60999",
+    as_json: Json = False,
+) -> None:
+    """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
+
+    Example: rosrv host kit ocu-1
+    """
+    wishes = wishes_of(appliance, ports, opened)
+    if token:
+        seconds = _seconds(within)
+        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
+            placed = place(running, wishes, as_json=as_json)
+            order = HostToken(name, placed.wishes.kept(), seconds, days)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+        return
+    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        placed = place(running, wishes, as_json=as_json)
+        body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
+        writer.write(body, placed, as_json=as_json)
+
+
+@app.command("list")
+@speaks
+def list_hosts(
+    running: Appliance,
+    group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the hosts that are enrolled, awaited or declared, with their tunnels; and machines in clear text.
+
+    Example: rosrv host list
+    """
+    body = running.ask_or_exit(HostList(), as_json=as_json)
+    for row in body["hosts"]:
+        if group is not None and group not in row["groups"]:
+            continue
+        if as_json:
+            say_json(row)
+        else:
+            say("  ".join(_words(row)))
+    if as_json or group is not None:
+        return
+    for one in body["machines"]:
+        nodes = f"{one['nodes']} nodes in clear text"
+        say("  ".join([f"{one['address']:<37} {nodes:<13}", _ports_words(one["ports"])]))
+    for trouble in body["troubles"]:
+        say(f"! {trouble}")
+
+
+@app.command()
+@speaks
+def reload(running: Appliance, as_json: Json = False) -> None:
+    """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
+
+    Example: rosrv host reload
+    """
+    body = running.ask_or_exit(HostsReload(), as_json=as_json)
+    if as_json:
+        say_json(body)
+        return
+    say(f"{len(body['declared'])} hosts are declared")
+    for word, names in (("may come again", body["opened"]), ("tunnel closed", body["closed"])):
+        if names:
+            say(f"{word}: {', '.join(names)}")
+    for one in body["divergence"]:
+        say(f"! {one}")
+
+
+@app.command()
+@speaks
+def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
+    """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.
+
+    Example: rosrv host revoke ocu-1
+    """
+    body = running.ask_or_exit(HostRevoke(name), as_json=as_json)
+    if as_json:
+        say_json(body)
+    elif not body["serial"]:
+        say(f"{body['name']} is awaited no longer: its one-time token opens nothing")
+    else:
+        say(
+            f"{body['name']} ({body['address']}) is revoked; {body['taken_back']} registrations and grants taken back"
+        )
+
+
+def _words(row: dict[str, Any]) -> list[str]:
+    parts = [f"{row['name']:<20} {row['address'] or '-':<16} {row['state']:<13}"]
+    if row["state"] == "up":
+        parts.append(
+            f"from {row['remote']} for {row['seconds']} s, {row['bytes_in']} B in, {row['bytes_out']} B out"
+        )
+    if row["last_seen"] is not None:
+        parts.append(f"last seen {moment(row['last_seen'])}")
+    if row["expires"] is not None and row["state"] != "revoked":
+        parts.append(
+            f"certificate until {moment(row['expires'])}" + (" (soon!)" if row["expires_soon"] else "")
+        )
+    if row["token_expires"] is not None:
+        parts.append(f"token until {moment(row['token_expires'])}")
+    if row["state"] not in ("not enrolled", "revoked", "awaited"):
+        parts.append(_ports_words(row["ports"]))
+    if row["groups"]:
+        parts.append(f"in {', '.join(row['groups'])}")
+    if row["divergence"]:
+        parts.append(f"({row['divergence']})")
+    return parts
+
+
+def _ports_words(ports: dict[str, Any]) -> str:
+    if ports["checked"] is None:
+        return "ports never checked"
+    return f"ports {ports['state']} ({moment(ports['checked'])})"
+
+
+def _seconds(text: str) -> float:
+    seconds = seconds_of(text, "mhd")
+    if seconds is None:
+        raise usage_error(f"--within {text!r} is no time such as 30m, 1h or 7d")
+    return seconds

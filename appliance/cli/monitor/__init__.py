@@ -1,0 +1,1 @@
+"""`rosrv monitor`: specifications judged, tried and switched."""

@@ -1,0 +1,193 @@
+"""Recordings: a bag goes through the monitors, and what subscribers would have received into another bag.
+
+A topic whose messages have another definition than the specifications mean is refused: its messages are dropped.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader, ReaderError, Writer
+from rosbags.rosbag1.writer import WriterError
+
+from appliance.cli.monitor.input import usage_error
+from appliance.ros.definitions import Definitions
+from appliance.ros.errors import DefinitionError
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.outcomes import Outcome
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What came of one message (or, without a topic, of a tick or deadline)."""
+
+    outcome: Outcome
+    index: int | None = None
+    topic: str | None = None
+
+
+def ros_type(name: str) -> str:
+    """`package/Type` of the name that the bag reader gives a type, `package/msg/Type`."""
+    package, _, kind = name.partition("/")
+    return f"{package}/{kind.rpartition('/')[2]}"
+
+
+def open_bag(path: Path) -> Reader:
+    """An open recording, or an end with the reason."""
+    try:
+        reader = Reader(path)
+        reader.open()
+    except (ReaderError, OSError) as error:
+        raise usage_error(f"cannot read the bag {path}: {error}") from error
+    _order_by_place(reader)
+    return reader
+
+
+def _order_by_place(reader: Reader) -> None:
+    """Have messages with equal times come in the order in which they stand in the file.
+
+    The reader merges an index for each connection, by time only; so it is given one index with everything, as if of the
+    first connection. Whose a message is stands in its own record.
+    """
+    everything = [entry for entries in reader.indexes.values() for entry in entries]
+    everything.sort(key=lambda entry: (entry.time, entry.chunk_pos, entry.offset))
+    for number, connection in enumerate(reader.connections):
+        reader.indexes[connection.id] = everything if number == 0 else []
+
+
+def definitions_of(reader: Reader) -> Definitions:
+    """The definitions that the recorded publishers sent; those that cannot be read are left out."""
+    found = Definitions({})
+    for connection in reader.connections:
+        try:
+            name = ros_type(connection.msgtype)
+            found = found.extended(Definitions.from_full_text(name, connection.msgdef.data))
+        except DefinitionError:
+            continue
+    return found
+
+
+_Header = tuple[
+    str, str, str, str, str | None, int | None
+]  # topic, type, definition, md5sum, caller, latching
+
+
+class Recording:
+    """The bag that is written: what subscribers would have received."""
+
+    def __init__(self, path: Path, definitions: Definitions) -> None:
+        self._path = path
+        self._definitions = definitions
+        self._connections: dict[_Header, Connection] = {}
+        try:
+            self._writer = Writer(path)
+            self._writer.open()
+        except (WriterError, OSError) as error:
+            raise usage_error(f"cannot write the bag {path}: {error}") from error
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()
+
+    def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
+        """Write a message of a recorded publisher."""
+        caller, latching = (
+            getattr(connection.ext, "callerid", None),
+            getattr(connection.ext, "latching", None),
+        )
+        header = (
+            connection.topic,
+            connection.msgtype,
+            connection.msgdef.data,
+            connection.digest,
+            caller,
+            latching,
+        )
+        self._write(header, time_ns, data)
+
+    def publish(self, outcome: Outcome) -> None:
+        """Write what monitors published."""
+        for message in outcome.published:
+            package, _, kind = message.type.partition("/")
+            text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
+            header = (message.topic, f"{package}/msg/{kind}", text, digest, "/rosrv", None)
+            self._write(header, outcome.time, message.data)
+
+    def _write(self, header: _Header, time_ns: int, data: bytes) -> None:
+        if header not in self._connections:
+            topic, kind, text, digest, caller, latching = header
+            self._connections[header] = self._writer.add_connection(
+                topic, kind, msgdef=text, md5sum=digest, callerid=caller, latching=latching
+            )
+        self._writer.write(self._connections[header], time_ns, data)
+
+
+def replay(monitors: MonitorSet, reader: Reader, output: Recording | None) -> Iterator[Replayed]:
+    """Give every message of a bag to the monitors, in the order of the bag, with its clock."""
+    started: Outcome | None = None
+    refusals = {connection.id: _refusal(monitors, connection) for connection in reader.connections}
+    expected = frozenset(
+        connection.topic for connection in reader.connections if refusals[connection.id] is None
+    )
+    try:
+        for index, (connection, time_ns, data) in enumerate(reader.messages()):
+            if not index:
+                started = monitors.start(time_ns, expected)
+            outcome = _outcome(monitors, connection, time_ns, data, refusals[connection.id])
+            if started is not None:
+                outcome = _after(started, outcome)
+                started = None
+            for earlier in outcome.before:
+                if output is not None:
+                    output.publish(earlier)
+                yield Replayed(earlier)
+            if output is not None:
+                if outcome.result != "dropped":
+                    output.relay(connection, time_ns, bytes(outcome.buffer))
+                output.publish(outcome)
+            yield Replayed(outcome, index, connection.topic)
+    except ReaderError as error:
+        raise usage_error(f"the bag is damaged: {error}") from error
+
+
+def _outcome(
+    monitors: MonitorSet, connection: Connection, time_ns: int, data: bytes, refusal: str | None
+) -> Outcome:
+    if refusal is None:
+        return monitors.process(connection.topic, data, time_ns)
+    outcome = Outcome(data, time_ns)
+    outcome.result, outcome.reason, outcome.before = "dropped", refusal, monitors.advance(time_ns)
+    return outcome
+
+
+def _after(started: Outcome, outcome: Outcome) -> Outcome:
+    """The outcome of the first message, with what `init` put out in front."""
+    outcome.log = [*started.log, *outcome.log]
+    outcome.published = [*started.published, *outcome.published]
+    outcome.faults = [*started.faults, *outcome.faults]
+    return outcome
+
+
+def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
+    """Why the messages of a recorded publisher are refused, None if they are not."""
+    wanted = monitors.topics.get(connection.topic)
+    if wanted is None:
+        return None
+    kind = ros_type(connection.msgtype)
+    if kind != wanted:
+        return f"{connection.topic} carries {kind}, but the specifications mean {wanted}"
+    if connection.digest not in ("*", monitors.md5sum(wanted)):
+        return f"the publisher of {connection.topic} has another definition of {kind} than the specifications"
+    return None
+
+
+def refusals(monitors: MonitorSet, reader: Reader) -> list[str]:
+    """What to tell about topics that are refused."""
+    found = [_refusal(monitors, connection) for connection in reader.connections]
+    return sorted({text for text in found if text is not None})

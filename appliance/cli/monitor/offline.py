@@ -1,0 +1,73 @@
+"""`rosrv monitor reset`: the way back to the folder's specifications when the appliance does not start with its own."""
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.cli.output import say, say_json
+from appliance.specifications.monitors import forget_revision
+from appliance.store.database import StoreError
+from appliance.store.state import StateStore
+from appliance.supervisor.state import StateDirectory
+
+_STATE = "state.db"
+
+
+def reset(
+    state: Annotated[
+        Path, typer.Option(envvar="ROSRV_STATE", help="State directory of the appliance, which must not run")
+    ] = Path("/var/lib/rosrv"),
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output")] = False,
+) -> None:
+    """Give up the specifications that were loaded by command: the next start takes those of the folder.
+
+    For an appliance that does not start with them (while it runs, `rosrv monitor reload` does the same). Which monitors
+    are switched off stays as it is. The revision that is given up stays in the state directory.
+
+    Example: rosrv monitor reset --state /var/lib/rosrv
+    """
+    home = state / "control"
+    if not (home / _STATE).exists():
+        typer.echo(
+            f"rosrv monitor: there is no state of an appliance in {state} (name it with --state DIR)",
+            err=True,
+        )
+        raise typer.Exit(2)
+    directory = StateDirectory(state)
+    try:
+        revision = _forget(home)
+    finally:
+        directory.close()
+    if as_json:
+        say_json({"given_up": revision})
+    elif revision is None:
+        say("nothing to give up: the last specifications in force were the folder's")
+    else:
+        say(
+            f"revision {revision} is given up: the next start takes the specifications of the folder (--monitors)"
+        )
+
+
+def _forget(home: Path) -> int | None:
+    owner = home.stat()
+
+    troubles: list[str] = []
+    try:
+        store = StateStore(home, failed=troubles.append)
+        try:
+            revision = forget_revision(store, time.time())
+        finally:
+            store.close()
+        if troubles:
+            raise StoreError(troubles[-1])
+        return revision
+    except StoreError as error:
+        typer.echo(f"rosrv monitor: the state cannot be changed: {error}", err=True)
+        raise typer.Exit(1) from error
+    finally:
+        if os.geteuid() == 0:
+            for path in home.glob("state.*"):
+                os.chown(path, owner.st_uid, owner.st_gid)

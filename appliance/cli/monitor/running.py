@@ -1,0 +1,209 @@
+"""`rosrv monitor list|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
+
+import sys
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from appliance.channel.admin import (
+    AdminAnswer,
+    MonitorLoad,
+    MonitorReload,
+    MonitorRemove,
+    MonitorResume,
+    MonitorsWanted,
+    MonitorSwitch,
+)
+from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.running import Appliance, body_or_exit, speaks
+
+_WIDE = 200  # columns where nobody looks at them through a window
+
+_Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
+
+
+@speaks
+def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
+    """Show every monitor: enabled or not, what it listens to, what it did.
+
+    Example: rosrv monitor list --json
+    """
+    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
+    if as_json:
+        for row in body["monitors"]:
+            say_json(row)
+        return
+    if body["refused"]:
+        say(f"the relay does not take them: {body['refused'][0]}", "red")
+    table = Table(
+        "monitor", "state", Column("listens to", overflow="fold"), "events", "verdicts", "drops", "changes", "faults",
+        box=None, padding=(0, 2, 0, 0), header_style="dim",
+    )  # fmt: skip
+    for row in body["monitors"]:
+        counts = [str(row[name]) for name in ("events", "verdicts", "drops", "changes", "faults")]
+        table.add_row(row["name"], _state(row), "\n".join(row["topics"] + row["services"]), *counts)
+    Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
+    source = f" ({body['folder']})" if body["folder"] else ""
+    differs = (
+        "; not what the folder has (rosrv monitor reload takes that, and removes nothing that was loaded here)"
+        if body["folder"] and body["differs_from_folder"]
+        else ""
+    )
+    say(f"revision {body['revision']} of the specifications{source}, by {body['who']}{differs}")
+
+
+@speaks
+def enable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+    """Let the events of these monitors happen again.
+
+    Example: rosrv monitor enable safeTrigger
+    """
+    _switch(appliance, names, True, as_json=as_json)
+
+
+@speaks
+def disable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+    """Let messages pass these monitors untouched; their variables stay.
+
+    Example: rosrv monitor disable safeTrigger
+    """
+    _switch(appliance, names, False, as_json=as_json)
+
+
+@speaks
+def load(
+    appliance: Appliance,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
+    msg: Annotated[
+        list[Path] | None,
+        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+    ] = None,
+    note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
+    as_json: Json = False,
+) -> None:
+    """Load specifications while the robot runs; a file of the same name is replaced.
+
+    They are compiled first: with an error nothing changes and the exit status is 1. Definitions of messages are
+    taken from `msg/` beside the files and from --msg.
+
+    Example: rosrv monitor load safe_zone.rv
+    """
+    from appliance.cli.monitor.input import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
+    from appliance.rosmop.syntax.errors import SpecificationError  # noqa: PLC0415  as above
+
+    try:
+        texts, definitions = read_to_send(files, msg or [])
+    except SpecificationError as error:
+        found = [printable(str(finding)) for finding in error.findings]
+        body_or_exit(
+            AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
+        )
+        return
+    _say_replaced(
+        appliance.ask_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json
+    )
+    if not as_json:
+        _say_disabled(appliance, texts)
+
+
+@speaks
+def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+    """Remove specifications, by the names of their monitors or files.
+
+    Example: rosrv monitor remove safeTrigger
+    """
+    _say_replaced(appliance.ask_or_exit(MonitorRemove(names), as_json=as_json), as_json=as_json)
+
+
+@speaks
+def reload(
+    appliance: Appliance,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Also remove what was loaded from elsewhere than the folder")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Take what the folder of specifications has now; what was loaded from elsewhere stays in force.
+
+    Example: rosrv monitor reload
+    """
+    body = appliance.ask_or_exit(MonitorReload(prune=prune), as_json=as_json)
+    _say_replaced(body, as_json=as_json)
+    if body["kept"] and not as_json:
+        say(
+            f"not of the folder, and still in force: {', '.join(body['kept'])} (--prune removes them)",
+            "yellow",
+        )
+    if not as_json:
+        _say_disabled(appliance, [*body["added"], *body["changed"]])
+
+
+@speaks
+def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+    """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
+
+    Example: rosrv monitor resume safeTrigger
+    """
+    body = appliance.ask_or_exit(MonitorResume(names), as_json=as_json)
+    if as_json:
+        say_json(body)
+    else:
+        say(f"resumed: {', '.join(body['names']) or 'none was held'}")
+
+
+@speaks
+def rv_state(appliance: Appliance, as_json: Json = False) -> None:
+    """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
+    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
+    real, port, rows = body["rv_state"]
+    if as_json:
+        say_json(body["rv_state"])
+        return
+    say(f"ROSMaster port {real}, RVMaster port {port}")
+    for name, topic, xmlrpc, tcp in rows:
+        say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
+
+
+def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
+    body = appliance.ask_or_exit(MonitorSwitch(names, enabled), as_json=as_json)
+    if as_json:
+        say_json(body)
+        return
+    word = "enabled" if enabled else "disabled"
+    say(f"{word}: {', '.join(body['names']) or 'nothing, it was so already'}")
+
+
+def _state(row: dict[str, Any]) -> str:
+    if row["held"]:
+        return "holds its topics"
+    if row["failing"]:
+        return "failing"
+    return "enabled" if row["enabled"] else "disabled"
+
+
+def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        say_json(body)
+        return
+    for warning in body["warnings"]:
+        say(warning, "yellow")
+    parts = [f"{word} {', '.join(body[word])}" for word in ("added", "changed", "removed") if body[word]]
+    what = "; ".join(parts) or "nothing is different"
+    say(f"revision {body['revision']} of the specifications is in force (was {body['replaced']}): {what}")
+    if body["moved"]:
+        names = ", ".join(body["moved"])
+        say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
+    if body["warnings"]:
+        say(counted(len(body["warnings"]), "warning"), "yellow")
+
+
+def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
+    """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
+    rows = appliance.ask_or_exit(MonitorsWanted(), as_json=False)["monitors"]
+    names = [row["name"] for row in rows if row["file"] in files and not row["enabled"]]
+    if names:
+        say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")

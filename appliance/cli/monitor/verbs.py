@@ -1,0 +1,153 @@
+"""`rosrv monitor check|run`: judge specifications, and try them on a recording; no appliance needs to run.
+
+Exit status: 0 right (warnings or not), whatever the verdicts; 1 a specification with errors; 2 usage.
+"""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rosbags.rosbag1 import Reader
+
+from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
+from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
+from appliance.cli.monitor.output import lines, record, say_finding
+from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.progress import progress
+from appliance.ros.definitions import Definitions
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.logics.interface import CompiledProperty
+from appliance.rosmop.logics.picture import dot_of, svg_of
+from appliance.rosmop.positions import Finding
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_TOLD_EVERY = 1000
+app = typer.Typer(
+    help="Monitors: check specifications, try them on a recording, run them on the robot.",
+    no_args_is_help=True,
+)
+
+_Files = Annotated[
+    list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
+]
+_Folders = Annotated[
+    list[Path] | None,
+    typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+]
+
+
+@app.command()
+def check(
+    files: _Files,
+    *,
+    as_json: Json = False,
+    msg: _Folders = None,
+    dot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz")] = None,
+    svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture")] = None,
+) -> None:
+    """Report every error and warning with its place; exit status 1 if there is an error.
+
+    Example: rosrv monitor check monitors/*.rv
+    """
+    try:
+        monitors = _load(files, msg or [])
+        findings = list(monitors.warnings)
+    except SpecificationError as error:
+        monitors = None
+        findings = list(error.findings)
+    for finding in findings:
+        say_finding(finding, as_json=as_json)
+    errors = sum(finding.severity == "error" for finding in findings)
+    if not as_json:
+        _summarise(findings, errors, monitors)
+    if monitors is not None:
+        properties = [each.code.property for monitor in monitors.monitors for each in monitor.properties]
+        _draw(properties, dot, svg)
+    raise typer.Exit(1 if errors else 0)
+
+
+@app.command()
+def run(
+    files: _Files,
+    *,
+    bag: Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)],
+    as_json: Json = False,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write what subscribers would have received")
+    ] = None,
+    msg: _Folders = None,
+) -> None:
+    """Give a recording to the monitors and report what came of every message, by the recording's clock.
+
+    Example: rosrv monitor run monitors/safe_triggering.rv --bag drive.bag
+    """
+    with closing(open_bag(bag)) as reader:
+        try:
+            monitors = _load(files, msg or [], definitions_of(reader))
+        except SpecificationError as error:
+            for finding in error.findings:
+                typer.echo(printable(str(finding)), err=True)
+            raise typer.Exit(1) from None
+        for text in refusals(monitors, reader):
+            typer.echo(f"rosrv monitor: {printable(text)}; its messages are dropped", err=True)
+        if output is None:
+            _report(monitors, reader, None, as_json=as_json)
+        else:
+            with Recording(output, monitors.definitions) as recording:
+                _report(monitors, reader, recording, as_json=as_json)
+
+
+def _load(files: list[Path], folders: list[Path], recorded: Definitions | None = None) -> MonitorSet:
+    definitions = read_definitions(files, folders)
+    if recorded is not None:
+        definitions = recorded.extended(definitions)
+    return MonitorSet.load(read_specifications(files), definitions)
+
+
+def _report(monitors: MonitorSet, reader: Reader, recording: Recording | None, *, as_json: bool) -> None:
+    counts = {"passed": 0, "changed": 0, "dropped": 0}
+    verdicts = faults = 0
+    with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
+        for number, replayed in enumerate(replay(monitors, reader, recording)):
+            outcome = replayed.outcome
+            if replayed.topic is not None:
+                counts[outcome.result] += 1
+            verdicts += len(outcome.verdicts)
+            faults += len(outcome.faults)
+            if as_json:
+                say_json(record(outcome, replayed.index, replayed.topic))
+            else:
+                for line in lines(outcome, replayed.index, replayed.topic):
+                    say(line)
+            if not number % _TOLD_EVERY:
+                told(sum(counts.values()))
+    if not as_json:
+        total = ", ".join(f"{number} {word}" for word, number in counts.items())
+        say(f"{counted(sum(counts.values()), 'message')}: {total}; "
+            f"{counted(verdicts, 'verdict')}, {counted(faults, 'fault')}")  # fmt: skip
+
+
+def _summarise(findings: list[Finding], errors: int, monitors: MonitorSet | None) -> None:
+    warnings = len(findings) - errors
+    tail = f", {counted(warnings, 'warning')}" if warnings else ""
+    if monitors is None:
+        say(f"{counted(errors, 'error')}: refused{tail}", "red")
+        return
+    number = len(monitors.monitors)
+    say(f"{counted(number, 'specification')} right{tail}", "green")
+
+
+def _draw(properties: list[CompiledProperty], dot: Path | None, svg: Path | None) -> None:
+    for path, draw in ((dot, dot_of), (svg, svg_of)):
+        if path is None:
+            continue
+        picture = draw(properties)
+        if picture is None:
+            text = "no property's monitor is a finite automaton: there is nothing to draw"
+            typer.echo(f"rosrv monitor: {text}, and {path} is not written", err=True)
+            continue
+        try:
+            path.write_text(picture, encoding="utf-8")
+        except OSError as error:
+            raise usage_error(f"cannot write {path}: {error.strerror}") from error

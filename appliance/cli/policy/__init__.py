@@ -1,0 +1,1 @@
+"""`rosrv policy`: a policy judged, learnt and loaded."""

@@ -1,0 +1,100 @@
+"""`rosrv policy learn`: a least-privilege policy out of the audit log."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.audit.database import LogUnreadableError
+from appliance.audit.moment import MomentError, parse_moment
+from appliance.audit.query import Filter, FilterError
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.output import counted, printable, say_json
+from appliance.cli.policy.input import Robot, networks_of, request_of, usage_error
+from appliance.cli.running import Appliance, speaks
+from appliance.policy import Category, PolicyError, compile_policy
+from appliance.policy.learn import Learned, Observation, learn
+
+_OWN_NODE = "the appliance's own node"
+
+
+@speaks
+def learn_policy(
+    appliance: Appliance,
+    *,
+    since: Annotated[
+        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
+    robot: Robot = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object: the text, and what it stands on")
+    ] = False,
+) -> None:
+    """Write the policy that grants what was done according to the audit log, and nothing else.
+
+    Run the robot with `audit-only = all` below [Options] first. Exit status 1 when nothing was found.
+
+    Example: rosrv policy learn --state /var/lib/rosrv --robot 192.168.1.10 --output learned.ini
+    """
+    learned = learn(_observations(appliance, since), networks_of(robot))
+    if not learned.requests:
+        typer.echo("rosrv: no request that passed is in the audit log (since then)", err=True)
+        raise typer.Exit(1)
+    _check(learned, robot)
+    if output is not None:
+        _write(output, learned.text)
+    if as_json:
+        fields = {"requests": learned.requests, "left_out": learned.left_out, "text": learned.text}
+        say_json(fields)
+        return
+    if output is None:
+        sys.stdout.write(learned.text)
+    left_out = (
+        f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
+        if learned.left_out
+        else ""
+    )
+    typer.echo(f"rosrv: learned from {counted(learned.requests, 'request')}{left_out}", err=True)
+
+
+def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
+    try:
+        start = None if since is None else parse_moment(since, time.time_ns())
+        passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
+        for entry in appliance.audit().export(passed):
+            record = entry.record
+            if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
+                continue
+            request = request_of(
+                record.host, record.caller_id or "", str(record.category), record.resource or ""
+            )
+            detail = record.detail
+            yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
+    except (LogUnreadableError, NotRunningError, MomentError, FilterError) as error:
+        raise usage_error(str(error)) from error
+
+
+def _check(learned: Learned, robot: list[str] | None) -> None:
+    try:
+        compile_policy(learned.text, file="learned", robot=networks_of(robot))
+    except PolicyError as error:
+        for finding in error.findings:
+            typer.echo(printable(str(finding)), err=True)
+        typer.echo(
+            "rosrv: what was learned is no policy (see above): these names need a rule by hand", err=True
+        )
+        raise typer.Exit(1) from error
+
+
+def _write(output: Path, text: str) -> None:
+    try:
+        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    except OSError as error:
+        raise usage_error(f"{output}: {error.strerror}") from error
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(text)

@@ -1,0 +1,71 @@
+"""What a policy would do to the running appliance: `rosrv policy check --state` (or `--api`). Nothing is changed.
+
+Over the socket it is judged here, with the hosts and the robot that the appliance knows; over REST it is a dry run.
+"""
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from appliance.channel.admin import AdminAnswer, PolicyWanted
+from appliance.cli.policy.input import compile_file, read_text, registrations_now
+from appliance.cli.running import Appliance, body_or_exit
+from appliance.policy import Address, Ending, Finding, PolicyError, Severity, compile_policy, diff, endings
+from appliance.policy.hosts import Network, canonical_address
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is wrong or doubtful with a policy, and what is live and would end."""
+
+    findings: list[Finding]
+    ends: list[Ending]
+
+
+def try_policy(
+    appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
+) -> Trial:
+    """Try a file; `robot` and `enrolled` go before what the appliance knows. Raises `NotRunningError`."""
+    if appliance.remote:
+        return _by_dry_run(appliance, file)
+    body = appliance.ask(PolicyWanted()).body
+    known = [f"{name}={address}" for name, address in body["hosts"].items()]
+    robots = robot or body["robot"]
+    try:
+        new = compile_file(file, robots, [*known, *(enrolled or ())])
+    except PolicyError as error:
+        return Trial(error.findings, [])
+    now = compile_policy(body["text"], file=body["file"], hosts=_hosts(body), robot=_robots(body))
+    return Trial(list(new.warnings), endings(diff(now, new, registrations_now(appliance))))
+
+
+def _hosts(body: dict[str, Any]) -> dict[str, Address]:
+    return {name: canonical_address(ipaddress.ip_address(one)) for name, one in body["hosts"].items()}
+
+
+def _robots(body: dict[str, Any]) -> list[Network]:
+    return [ipaddress.ip_network(one) for one in body["robot"]]
+
+
+def _by_dry_run(appliance: Appliance, file: Path) -> Trial:
+    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
+
+    assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
+    query, text = {"dry_run": "1"}, {"text": read_text(file)}
+    try:
+        report = appliance.way.client.call("POST", "/v1/policy", params=query, body=text, order=False)
+    except ProblemError as problem:
+        if problem.findings is None:
+            body_or_exit(AdminAnswer(False, error=problem.lines[0]), as_json=False)
+            raise
+        return Trial([_finding(one, file) for one in problem.findings], [])
+    warnings = [_finding(one, file) for one in report["warnings"]]
+    return Trial(warnings, [Ending(**one) for one in report["ends"]])
+
+
+def _finding(given: dict[str, Any], file: Path) -> Finding:
+    """A finding of REST, which calls the text `policy`."""
+    named = str(file) if given["file"] == "policy" else given["file"]
+    return Finding(named, given["line"], given["column"], Severity(given["severity"]), given["text"])

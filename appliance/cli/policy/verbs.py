@@ -1,0 +1,296 @@
+"""`rosrv policy check|explain|test|diff|learn`: judge a policy before it is in force; no appliance needs to run.
+
+Exit status: 0 allowed, right, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.policy.input import (
+    Enrolled,
+    Robot,
+    compile_file,
+    find_host,
+    read_text,
+    registrations_now,
+    requests_of_audit_log,
+    requests_of_file,
+    usage_error,
+)
+from appliance.cli.policy.learning import learn_policy
+from appliance.cli.policy.output import decision_fields, request_fields, say_finding
+from appliance.cli.policy.running import confirm, reload, revisions, rollback
+from appliance.cli.policy.trial import Trial, try_policy
+from appliance.cli.running import Appliance, speaks
+from appliance.policy import (
+    Category,
+    Difference,
+    Policy,
+    PolicyError,
+    Request,
+    diff,
+    explain,
+    run_cases,
+)
+from appliance.policy.actions import BadWordError, check_resource
+from appliance.policy.explain import Explanation, render
+from appliance.policy.findings import Severity
+from appliance.policy.rights import needs_node
+
+app = typer.Typer(
+    help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
+)
+app.command("learn")(learn_policy)
+for _verb in (reload, rollback, confirm, revisions):
+    app.command()(_verb)
+
+_File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
+
+
+@app.command()
+@speaks
+def check(
+    appliance: Appliance,
+    file: _File,
+    *,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+    as_json: Json = False,
+) -> None:
+    """Report every error and warning with its place; exit status 1 if there is an error.
+
+    With --state or --api the running appliance says who is enrolled, and what is live and the policy would end.
+
+    Example: rosrv policy check policies/landshark.ini --state /var/lib/rosrv
+    """
+    trial = _tried(appliance, file, robot, enrolled)
+    findings = trial.findings
+    errors = sum(finding.severity is Severity.ERROR for finding in findings)
+    for finding in findings:
+        say_finding(finding, as_json=as_json)
+    if not as_json:
+        warnings = len(findings) - errors
+        verdict = f"{counted(errors, 'error')}: the file is refused" if errors else f"{file} is right"
+        say(
+            f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
+            "red" if errors else "green",
+        )
+    for ending in trial.ends:
+        if as_json:
+            say_json({"ends": ending.what, **{k: v for k, v in asdict(ending).items() if k != "what"}})
+        else:
+            whose = f"{ending.caller_id or 'a client'} on {ending.host}"
+            say(
+                f"would end: {ending.what} {ending.resource or '(all)'} of {whose}: {ending.reason}", "yellow"
+            )
+    if trial.ends and not as_json:
+        say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
+    raise typer.Exit(1 if errors else 0)
+
+
+def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Trial:
+    if appliance.said:
+        try:
+            return try_policy(appliance, file, robot, enrolled)
+        except NotRunningError as error:
+            typer.echo(f"rosrv policy: {error}; checked without it", err=True)
+    try:
+        return Trial(list(compile_file(file, robot, enrolled).warnings), [])
+    except PolicyError as error:
+        return Trial(error.findings, [])
+
+
+@app.command("explain")
+def explain_request(
+    file: _File,
+    *,
+    host: Annotated[str, typer.Option(help="Who asks: an address, robot, or host:NAME")],
+    node: Annotated[str, typer.Option(help="Its node name (caller_id), where a node is needed")] = "",
+    publish: Annotated[str | None, typer.Option(metavar="TOPIC", help="publish a topic")] = None,
+    subscribe: Annotated[str | None, typer.Option(metavar="TOPIC", help="subscribe to a topic")] = None,
+    command: Annotated[str | None, typer.Option(metavar="CALL", help="make a call")] = None,
+    offer: Annotated[str | None, typer.Option(metavar="SERVICE", help="offer a service")] = None,
+    call: Annotated[str | None, typer.Option(metavar="SERVICE", help="call a service")] = None,
+    read: Annotated[str | None, typer.Option(metavar="PARAMETER", help="read a parameter")] = None,
+    write: Annotated[str | None, typer.Option(metavar="PARAMETER", help="write a parameter")] = None,
+    use_node: Annotated[str | None, typer.Option(metavar="NODE", help="use a node name")] = None,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+    as_json: Json = False,
+) -> None:
+    """Say whether a request is allowed, by which rule, and which rules lost; exit status 1 if it is denied.
+
+    Example: rosrv policy explain policies/landshark.ini --host 10.0.0.9 --node /joystick --publish /cmd_vel
+    """
+    asked = {
+        Category.PUBLISH: publish,
+        Category.SUBSCRIBE: subscribe,
+        Category.COMMAND: command,
+        Category.OFFER: offer,
+        Category.CALL: call,
+        Category.READ: read,
+        Category.WRITE: write,
+        Category.NODE: use_node,
+    }
+    chosen = [(category, name) for category, name in asked.items() if name is not None]
+    if len(chosen) != 1:
+        raise usage_error("say one thing that the host does: --publish TOPIC, --command CALL, …")
+    policy = _compile_or_exit(file, robot, enrolled)
+    category, name = chosen[0]
+    try:
+        request = Request(find_host(host, policy), node, category, check_resource(category, name))
+    except BadWordError as error:
+        raise usage_error(str(error)) from error
+    if needs_node(request) and not node:
+        raise usage_error("this makes a node part of the graph: say its name with --node /NAME")
+    explanation = explain(policy, request)
+    if as_json:
+        say_json(_explanation_fields(explanation))
+    else:
+        for line in render(explanation):
+            say(line, "green" if explanation.allowed else "red")
+    raise typer.Exit(0 if explanation.allowed else 1)
+
+
+def _explanation_fields(explanation: Explanation) -> dict[str, object]:
+    fields: dict[str, object] = {
+        **request_fields(explanation.request),
+        **decision_fields(explanation.decision),
+        "told": explanation.told,
+        "through": list(explanation.through),
+        "lost": [
+            {
+                "section": lost.rule.section,
+                "key": lost.rule.key,
+                "line": lost.rule.line,
+                "would": "allow" if lost.grants else "deny",
+                "why": lost.why,
+            }
+            for lost in explanation.lost
+        ],
+    }
+    if explanation.limit:
+        fields["limit"] = explanation.limit
+    for word, also in (("node", explanation.node), ("command", explanation.command)):
+        if also is not None:
+            fields[word] = _explanation_fields(also)
+    if explanation.also:
+        fields["together"] = "allow" if explanation.allowed else "deny"
+    return fields
+
+
+@app.command()
+def test(
+    file: _File,
+    cases: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The cases (default: FILE.tests.yaml)")
+    ] = None,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+    as_json: Json = False,
+) -> None:
+    """Run the cases beside a policy; exit status 1 if one of them is decided otherwise.
+
+    Example: rosrv policy test policies/landshark.ini
+    """
+    policy = _compile_or_exit(file, robot, enrolled)
+    beside = cases or file.with_name(file.name + ".tests.yaml")
+    text = read_text(beside)
+    try:
+        results = run_cases(policy, text, str(beside))
+    except PolicyError as error:
+        _refuse(error)
+    failed = [result for result in results if not result.passed]
+    for result in results if as_json else failed:
+        if as_json:
+            place = {"file": result.file, "line": result.line, "column": result.column}
+            expected = {"passed": result.passed, "expected": "allow" if result.expected else "deny"}
+            say_json(
+                {**place, **expected, **request_fields(result.request), **decision_fields(result.decision)}
+            )
+        else:
+            say(str(result), "red")
+    if not as_json:
+        say(f"{len(results) - len(failed)} passed, {len(failed)} failed", "red" if failed else "green")
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command("diff")
+@speaks
+def compare(
+    appliance: Appliance,
+    old: Annotated[Path, typer.Argument(metavar="OLD", help="The policy now", show_default=False)],
+    new: Annotated[Path, typer.Argument(metavar="NEW", help="The policy to be", show_default=False)],
+    *,
+    requests: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="NDJSON of requests: host, caller_id, category, resource"),
+    ] = None,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+    as_json: Json = False,
+) -> None:
+    """Show the requests that were seen and would be decided differently; exit status 1 if there are any.
+
+    Example: rosrv policy diff policies/now.ini policies/next.ini --state /var/lib/rosrv
+    """
+    if requests is None and not appliance.said:
+        raise usage_error(
+            "say where the requests are: --state DIR or --api URL (the audit log), or --requests FILE"
+        )
+    before, after = _compile_or_exit(old, robot, enrolled), _compile_or_exit(new, robot, enrolled)
+    differences = diff(before, after, _requests(requests, appliance))
+    for difference in differences:
+        if as_json:
+            say_json(_difference_fields(difference))
+        else:
+            for line in _difference_lines(difference):
+                say(line, "yellow" if difference.granted else "red")
+    if not as_json:
+        say(f"{counted(len(differences), 'request')} would be decided differently")
+    raise typer.Exit(1 if differences else 0)
+
+
+def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
+    if file is not None:
+        yield from requests_of_file(file)
+    else:
+        yield from requests_of_audit_log(appliance)
+        yield from registrations_now(appliance)
+
+
+def _difference_lines(difference: Difference) -> Iterator[str]:
+    request = difference.request
+    who = f"{request.host} {request.caller_id}".strip()
+    yield f"{difference.word}: {who}: {request.category} {request.resource}"
+    yield f"  seen in {counted(difference.count, 'record')}"
+    yield f"  old: {difference.old.reason}"
+    yield f"  new: {difference.new.reason}"
+
+
+def _difference_fields(difference: Difference) -> dict[str, object]:
+    return {
+        **request_fields(difference.request),
+        "count": difference.count,
+        "old": decision_fields(difference.old),
+        "new": decision_fields(difference.new),
+    }
+
+
+def _compile_or_exit(file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
+    try:
+        return compile_file(file, robot, enrolled)
+    except PolicyError as error:
+        _refuse(error)
+
+
+def _refuse(error: PolicyError) -> NoReturn:
+    for finding in error.findings:
+        typer.echo(printable(str(finding)), err=True)
+    raise typer.Exit(1) from error

@@ -1,0 +1,111 @@
+"""`rosrv selftest`: what an operator runs on a fresh machine, or when in doubt."""
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
+from appliance.cli.output import counted, printable, say_json
+from appliance.cli.running import Appliance, speaks
+from appliance.cli.selftest.findings import Found, fail
+from appliance.config import Settings, load_resolved
+from appliance.config_sources import ConfigError, resolve
+
+_STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
+
+
+@speaks
+def selftest(
+    appliance: Appliance,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for each check")] = False,
+) -> None:
+    """Try whether this machine can run the appliance, and whether the running one does what it must.
+
+    Without --api: programs, users, namespaces, firewall, tunnels, ports, and the files of the configuration.
+    Where an appliance runs also its status, its audit log, a call through RVMaster and a message through the relay.
+    With --api only the running appliance is tried, from here. Exit status: 0 nothing failed (warnings or not), 1
+    something failed.
+
+    Example: sudo rosrv selftest
+    """
+    failed = warned = 0
+    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for found in _all(appliance, config):
+        failed += found.outcome == "fail"
+        warned += found.outcome == "warn"
+        if as_json:
+            row = {"check": found.check, "outcome": found.outcome, "text": found.text, "advice": found.advice}
+            say_json(row)
+            sys.stdout.flush()
+        else:
+            text = Text(printable(found.text))
+            if found.advice:
+                text.append(
+                    f"\n-> {printable(found.advice)}", style="bold" if found.outcome == "fail" else "dim"
+                )
+            table.add_row(Text(found.outcome, style=_STYLES[found.outcome]), found.check, text)
+    if not as_json:
+        Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table)
+        end = f"{failed} failed, {counted(warned, 'warning')}" if failed else counted(warned, "warning")
+        Console(highlight=False).print(Text(end, style="bold red" if failed else "green"))
+    raise typer.Exit(1 if failed else 0)
+
+
+def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
+    from appliance.cli.selftest.running import running  # noqa: PLC0415  after what can be said without it
+
+    if appliance.place is not None:
+        yield from running(appliance)
+        return
+    yield from _here(appliance, config)
+    if appliance.said or _runs(appliance):
+        yield from running(appliance)
+
+
+def _here(appliance: Appliance, config: Path | None) -> Iterator[Found]:
+    from appliance.cli.selftest.files import files  # noqa: PLC0415  what it imports is slow
+    from appliance.cli.selftest.machine import machine  # noqa: PLC0415  the same
+
+    try:
+        settings = _settings(appliance, config)
+    except ConfigError as error:
+        for mistake in error.mistakes:
+            yield fail("configuration", f"{mistake.place}: {mistake.text}", "rosrv config check")
+        return
+    yield from machine(settings, running=_runs(appliance))
+    yield from files(settings)
+
+
+def _settings(appliance: Appliance, config: Path | None) -> Settings:
+    """Of the running appliance where one runs, else those that `rosrv up` would have here."""
+    state = _state(appliance)
+    resolved = None if state is None else state / "run" / "config.json"
+    if config is None and resolved is not None and _runs(appliance):
+        try:
+            return load_resolved(resolved)
+        except (OSError, ValueError):
+            pass  # not ours to read: the configuration here is what there is
+    environment = {name: value for name, value in os.environ.items() if name != "ROSRV_STATE"}
+    return resolve(config, environment, {"state": state if appliance.said else None})
+
+
+def _state(appliance: Appliance) -> Path | None:
+    return appliance.way.state if isinstance(appliance.way, AdminSocket) else None
+
+
+def _runs(appliance: Appliance) -> bool:
+    state = _state(appliance)
+    return state is not None and (state / ADMIN_SOCKET).exists()

@@ -1,0 +1,49 @@
+"""The admin socket: operators' tools ask, control answers."""
+
+import asyncio
+import contextlib
+import socket
+
+import msgspec
+import structlog
+
+from appliance.channel import admin
+from appliance.control.administration import Administration
+
+_log = structlog.get_logger()
+_LINE_LIMIT = 16 << 20
+_OPERATOR = "operator"
+
+
+class AdminServer:
+    """Answers requests on the admin socket."""
+
+    def __init__(self, administration: Administration) -> None:
+        self._administration = administration
+        self._decoder = msgspec.json.Decoder(admin.AnyRequest)
+        self._server: asyncio.Server | None = None  # held: a server that nobody holds is closed
+
+    async def start(self, sock: socket.socket) -> None:
+        """Serve the listening socket."""
+        self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while line := await reader.readline():
+                writer.write(msgspec.json.encode(await self._answer(line)) + b"\n")
+                await writer.drain()
+        except (ValueError, ConnectionError) as error:
+            _log.warning("a tool spoke nonsense on the admin socket", error=str(error))
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def _answer(self, line: bytes) -> admin.AdminAnswer:
+        try:
+            request = self._decoder.decode(line)
+        except msgspec.MsgspecError as error:
+            return admin.AdminAnswer(
+                False, error=f"not a request of this version: {error}", trouble="request"
+            )
+        return await self._administration.carry_out(request, who=_OPERATOR)

@@ -1,0 +1,91 @@
+"""Control's end of the link to the forwarder of the audit log: for status, metrics, and the log itself."""
+
+import asyncio
+from typing import Any
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.config import Syslog
+from appliance.recorder import Recorder
+
+_log = structlog.get_logger()
+_PATIENCE_SECONDS = 10.0  # a receiver that is started again is no event
+
+
+class Forwarded:
+    """The last report of the forwarder; `wanted` is what the configuration asks for."""
+
+    def __init__(self, wanted: Syslog, recorder: Recorder) -> None:
+        self._wanted = wanted
+        self._recorder = recorder
+        self._channel: Channel | None = None
+        self._report: messages.ForwardingReported | None = None
+        self._failing: asyncio.TimerHandle | None = None
+        self._failure_recorded = False
+
+    def attach(self, channel: Channel) -> None:
+        """A forwarder is there."""
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = channel
+
+        def received(message: object, _descriptors: tuple[int, ...]) -> None:
+            if isinstance(message, messages.ForwardingReported) and self._channel is channel:
+                self._reported(message)
+
+        def lost(_reason: str = "") -> None:
+            if self._channel is channel:
+                self._channel = None
+
+        channel.attach(asyncio.get_running_loop(), received, lost, lost)
+
+    def status(self) -> dict[str, Any] | None:
+        """For `rosrv status` and the metrics; None when nothing is to be forwarded."""
+        if self._wanted.to is None:
+            return None
+        report = self._report or messages.ForwardingReported(0, 0, 0, 0, 0.0, 0, "")
+        trouble = report.trouble
+        if self._channel is None or self._report is None:
+            trouble = trouble or "the forwarder does not run yet"
+        fields = {name: getattr(report, name) for name in report.__struct_fields__}
+        return {**fields, "to": self._wanted.to, "send": self._wanted.send, "trouble": trouble}
+
+    def _reported(self, report: messages.ForwardingReported) -> None:
+        before = self._report
+        self._report = report
+        if before is not None and report.missed > before.missed:
+            count = report.missed - before.missed
+            self._recorder.happened(
+                "forwarding gap",
+                f"retention removed {count} records before {self._wanted.to} had them",
+                severity=Severity.ALARM,
+                count=count,
+            )
+        if report.trouble and self._failing is None:
+            loop = asyncio.get_running_loop()
+            self._failing = loop.call_later(_PATIENCE_SECONDS, self._still_failing)
+        elif not report.trouble and self._failing is not None:
+            self._failing.cancel()
+            self._failing = None
+            if self._failure_recorded:
+                self._failure_recorded = False
+                self._recorder.happened(
+                    "forwarding resumed",
+                    f"{self._wanted.to} has the log again",
+                    severity=Severity.NOTICE,
+                    behind=report.behind,
+                )
+
+    def _still_failing(self) -> None:
+        assert self._report is not None  # noqa: S101  a report began this
+        self._failure_recorded = True
+        self._recorder.happened(
+            "forwarding failed",
+            f"{self._wanted.to}: {self._report.trouble}",
+            severity=Severity.WARNING,
+            behind=self._report.behind,
+            missed=self._report.missed,
+        )

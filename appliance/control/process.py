@@ -1,0 +1,417 @@
+"""The control process: lays the foundation, has the parts assembled, serves until told to stop.
+
+Order of a start: kept sockets come back, the store and the policy are read, the audit log opens, the registry is
+restored, the listeners serve, the first reconcile round makes ROSMaster whole, and only then `Ready` is said.
+"""
+
+import asyncio
+import contextlib
+import socket
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import structlog
+import uvloop
+
+from appliance.audit.budget import Budget
+from appliance.audit.log import AuditLog
+from appliance.audit.record import Severity
+from appliance.audit.retention import Retention
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.config import Settings, load_resolved
+from appliance.control.admin import AdminServer
+from appliance.control.administration import Administration
+from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts, assemble
+from appliance.control.doors import Doors
+from appliance.control.forwarded import Forwarded
+from appliance.control.lifeline import ControlLifeline
+from appliance.control.rest import RestLink
+from appliance.control.signing import Signing
+from appliance.control.spare_memory import SpareMemory
+from appliance.control.tokens import Tokens
+from appliance.hosts.authority import Authority
+from appliance.hosts.certification import Certification
+from appliance.hosts.declared import Declared
+from appliance.hosts.endpoint import find_endpoint
+from appliance.hosts.hosts import Hosts
+from appliance.hosts.rest_place import rest_place
+from appliance.hosts.table import HostRefusedError, HostTable
+from appliance.hosts.tunnels import Tunnels
+from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.journal import StoreJournal, restore
+from appliance.master.graph.registry import Life, Registry
+from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
+from appliance.master.reach.places import NoPortError
+from appliance.master.robot import own_address, robot_addresses
+from appliance.master.standing import HostStanding
+from appliance.recorder import Recorder
+from appliance.ros.uris import node_uri
+from appliance.rpc.server import listen
+from appliance.shares.pool import Standing
+from appliance.shares.table import AUDIT_RESERVE
+from appliance.specifications.allocation import TOPIC, Allocation
+from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.monitors import ALLOCATION, Monitors
+from appliance.store.database import StoreError
+from appliance.store.state import StateStore
+
+_log = structlog.get_logger()
+_OWN, _ADMIN = "own", "admin"
+_SWITCH_SECONDS = 0.001
+_SAVE_SECONDS = 1.0
+_WARNINGS = 100  # of the policy, that a start tells
+_RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of a host, in the disk's reserve
+
+
+def main(lifeline_fd: int, config_path: Path) -> None:
+    """Run control until the supervisor stops it."""
+    settings = load_resolved(config_path)
+    # The loop waits this long at most for a thread (audit log, store) that is in the middle of Python code.
+    sys.setswitchinterval(0.0005)
+    # Large values are read and written in threads: the loop waits no longer than this for the interpreter.
+    sys.setswitchinterval(_SWITCH_SECONDS)
+    uvloop.run(_Control(settings, lifeline_fd).run())
+
+
+class _Control:
+    """The life of control: start, restore, serve, end."""
+
+    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+        self._settings = settings
+        self._lifeline = ControlLifeline(lifeline_fd)
+        self._stopping = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._parameters_dirty = asyncio.Event()
+        self._reloading: set[asyncio.Task[None]] = set()
+        self._one_reload = asyncio.Lock()
+
+    async def run(self) -> None:
+        """Serve from start to end; a start that fails is told to the supervisor."""
+        self._lifeline.stopped = self._stopping.set
+        self._lifeline.attach()
+        try:
+            await self._start()
+        except (PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, OSError) as error:
+            self._lifeline.say(messages.Failed(str(error)))
+            await self._stopping.wait()
+            return
+        await self._stopping.wait()
+        await self._end()
+
+    # --- start ---
+
+    async def _start(self) -> None:
+        await self._lifeline.restored.wait()
+        restarted = RVMASTER in self._lifeline.sockets
+        base = await self._lay_foundation(restarted)
+        self._base, self._parts = base, assemble(base)
+        await _restore(base, self._parts)
+        await self._serve()
+        self._connect()
+        self._run_tasks()
+        await self._parts.reconciler.ready.wait()
+        token = await self._tokens.first() if self._settings.api_address is not None else None
+        self._say_ready(restarted, token)
+
+    async def _lay_foundation(self, restarted: bool) -> Foundation:
+        self._authority = Authority()
+        self._signing = Signing(self._authority)
+        self._standing: HostStanding | None = None
+        self._audit = _open_audit(self._settings, self._signing, self._log_held(), self._standing_of)
+        audit = self._settings.audit
+        recorder = Recorder(
+            self._audit,
+            strict=audit.durability == "strict",
+            deny_when_failed=audit.on_audit_failure == "deny",
+        )
+        store = StateStore(
+            self._settings.state / "control",
+            failed=lambda reason: _log.error("state is not written", reason=reason),
+        )
+        hosts = await self._make_hosts(store, recorder)
+        policies = Policies(
+            self._settings.policy,
+            store,
+            recorder,
+            robot=robot_addresses(self._settings),
+            hosts=lambda: hosts.addresses,
+        )
+        policies.start(restarted=restarted)
+        monitors = Monitors(
+            self._settings.monitors,
+            self._settings.enable,
+            store,
+            recorder,
+            on_fault=self._settings.on_fault,
+            allocation=Allocation(self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)),
+        )
+        monitors.start(restarted=restarted)
+        registry = Registry(StoreJournal(store))
+        self._standing = standing = HostStanding(lambda: policies.current, registry.registrations_of)
+        return Foundation(
+            settings=self._settings,
+            lifeline=self._lifeline,
+            store=store,
+            recorder=recorder,
+            policies=policies,
+            monitors=monitors,
+            hosts=hosts,
+            registry=registry,
+            standing=standing,
+            doors=Doors(self._settings, recorder, lambda: policies.current, standing),
+            sockets=self._take_sockets(),
+            parameters_dirty=self._parameters_dirty,
+        )
+
+    def _standing_of(self, host: str) -> Standing:
+        """What is known of a host; until the policy has been read nobody is a stranger."""
+        return Standing.NAMED if self._standing is None else self._standing.of_text(host)
+
+    async def _make_hosts(self, store: StateStore, recorder: Recorder) -> Hosts:
+        """Before the policy, which names them: their addresses count once clear text is kept out."""
+        table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
+        listen = self._settings.listen_address
+        self._tunnels = Tunnels(table, recorder, self._authority, listen=listen, say=self._lifeline.say)
+        certification = Certification(
+            store,
+            recorder,
+            self._authority,
+            table,
+            self._tunnels,
+            master_port=listen[1],
+            rest=rest_place(self._settings),
+        )
+        self._served = certification.served_by
+        configured = self._settings.ipsec.endpoint
+        hosts = Hosts(certification, partial(find_endpoint, configured, self._lifeline.endpoint))
+        self._lifeline.tunnels_enclosed = self._tunnels.answered
+        await hosts.start()
+        return hosts
+
+    def _take_sockets(self) -> dict[str, socket.socket]:
+        host, port = self._settings.listen_address
+        sockets = self._lifeline.sockets
+        for name, address in ((RVMASTER, (host, port)), (INNER, ("127.0.0.1", 0)), (_OWN, ("127.0.0.1", 0))):
+            if name not in sockets:
+                try:
+                    sockets[name] = listen(*address)
+                except OSError as error:
+                    raise OSError(
+                        f"{address[0]}:{address[1]} cannot be listened on: {error.strerror}; "
+                        "is a ROS Master running there? Stop it, or choose another --listen"
+                    ) from error
+                self._lifeline.keep(name, sockets[name])
+        return sockets
+
+    async def _serve(self) -> None:
+        base, parts, sockets = self._base, self._parts, self._base.sockets
+        doors = base.doors
+        await doors.open(sockets[RVMASTER], parts.pipeline.handler(MASTER_CALLS), guarded=True)
+        await doors.open(sockets[_OWN], parts.pipeline.handler(MASTER_CALLS, own=True), guarded=False)
+        await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
+        self._tokens = Tokens(base.store, base.recorder)
+        if self._lifeline.announced:
+            self._tokens.told()
+        self._lifeline.was_announced = self._tokens.told
+        self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
+        administration = Administration(
+            parts.master,
+            base.policies,
+            self._tokens,
+            base.store,
+            self._lifeline.surroundings,
+            hosts=base.hosts,
+            lag=lambda: self._audit.lag,
+            on_audit_failure=self._settings.audit.on_audit_failure,
+            audit_failed=lambda: self._audit.failed,
+            audit_degraded=lambda: self._audit.degraded,
+            queued_deliveries=lambda: parts.delivery.waiting,
+            forwarded=self._forwarded.status,
+        )
+        self._rest = RestLink(
+            administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof
+        )
+        self._rest.served = self._served
+        if _ADMIN in sockets:
+            self._admin = AdminServer(administration)
+            await self._admin.start(sockets[_ADMIN].dup())
+
+    def _connect(self) -> None:
+        """From now on the supervisor's messages and links to other processes are taken."""
+        lifeline, base = self._lifeline, self._base
+        lifeline.links["relay"] = self._relay_link
+        lifeline.links["signer"] = lambda _index, descriptor: self._signing.attach(descriptor, self._audit)
+        lifeline.links["api"] = lambda _index, descriptor: self._rest.attach(
+            Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
+        )
+        lifeline.links["charon"] = lambda _index, descriptor: self._tunnels.attach(
+            Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
+        )
+        lifeline.links["syslog"] = lambda _index, descriptor: self._forwarded.attach(
+            Channel(socket.socket(fileno=descriptor), messages.ForwardingLink)
+        )
+        lifeline.probed = base.doors.probed
+        lifeline.processes_changed = self._parts.reconciler.wake
+        lifeline.reload_requested = self._reload_on_signal
+        lifeline.open_links()
+
+    def _run_tasks(self) -> None:
+        base, parts = self._base, self._parts
+        for work in (
+            parts.reconciler.run(),
+            parts.master.liveness.run(),
+            base.doors.visitors.sweep(),
+            SpareMemory().watch(),
+            self._save_parameters(),
+            self._tunnels.run(),
+            parts.publisher.run(parts.reconciler.ready),
+        ):
+            self._tasks.append(asyncio.get_running_loop().create_task(work))
+
+    def _log_held(self) -> Callable[[list[int]], None]:
+        """Tells the supervisor, from the log's thread, who keeps the log locked."""
+        loop, say = asyncio.get_running_loop(), self._lifeline.say
+
+        def tell(processes: list[int]) -> None:
+            with contextlib.suppress(RuntimeError):  # it has ended
+                loop.call_soon_threadsafe(say, messages.LogHeld(processes))
+
+        return tell
+
+    def _say_ready(self, restarted: bool, token: str | None) -> None:
+        host, base = self._settings.listen_address[0], self._base
+        told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
+        uri = node_uri(told, base.port(RVMASTER))
+        self._lifeline.surroundings.master = uri.rstrip("/")
+        if not restarted:
+            base.recorder.happened(
+                "appliance started", f"nodes may connect at {uri}", severity=Severity.NOTICE
+            )
+        detail = {
+            "master": uri.rstrip("/"),
+            "revision": base.policies.revision,
+            "rosout_master": node_uri("127.0.0.1", base.port(_OWN)).rstrip("/"),
+            "inner_port": base.port(INNER),
+            "token": token,
+            "own_port": base.port(_OWN),
+            "warnings": [str(one) for one in base.policies.current.warnings[:_WARNINGS]],
+        }
+        self._lifeline.say(messages.Ready(detail))
+
+    # --- end ---
+
+    async def _end(self) -> None:
+        base, parts = self._base, self._parts
+        for task in self._tasks:
+            task.cancel()
+        base.doors.close()
+        parts.master.faces.close_all()
+        parts.reminders.close()
+        parts.delivery.close()
+        parts.master.rosmaster.close()
+        base.recorder.happened(
+            "appliance stopped", "control ended in an orderly way", severity=Severity.NOTICE
+        )
+        base.store.save_parameters(parts.master.parameters.tree)
+        base.store.close()
+        self._audit.close()
+
+    # --- what the supervisor says ---
+
+    def _reload_on_signal(self) -> None:
+        task = asyncio.get_running_loop().create_task(self._reload())
+        self._reloading.add(task)  # held until it is done
+        task.add_done_callback(self._reloading.discard)
+
+    async def _reload(self) -> None:
+        async with self._one_reload:
+            try:
+                await _reload_policy(self._base.policies)
+            except PolicyRefusedError as error:
+                _log.error(
+                    "the policy was refused, the last good one stays in force", findings=error.findings
+                )
+            await self._reload_hosts()
+
+    async def _reload_hosts(self) -> None:
+        try:
+            await self._base.hosts.reload("disk")
+        except HostRefusedError as error:
+            _log.error("hosts.yaml was refused", reason=str(error))
+
+    def _relay_link(self, index: int, descriptor: int) -> None:
+        relay = self._parts.master.relay
+        relay.attach(index, Channel(socket.socket(fileno=descriptor), messages.RelayLink))
+        self._parts.master.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
+        self._parts.reminders.begin()
+
+    async def _save_parameters(self) -> None:
+        while True:
+            await self._parameters_dirty.wait()
+            self._parameters_dirty.clear()
+            self._base.store.save_parameters(self._parts.master.parameters.tree)
+            await asyncio.sleep(_SAVE_SECONDS)
+
+
+async def _reload_policy(policies: Policies) -> None:
+    """The file as it is now, also when another revision comes into force meanwhile. Raises `PolicyRefusedError`."""
+    while True:
+        try:
+            await policies.reload()
+        except RevisionChangedError:
+            continue
+        return
+
+
+def _open_audit(
+    settings: Settings,
+    signing: Signing,
+    held_by: Callable[[list[int]], None],
+    standing: Callable[[str], Standing],
+) -> AuditLog:
+    audit = settings.audit
+    reserve = AUDIT_RESERVE.bounds.sized(
+        int(audit.reserve_bytes), int(audit.reserve_bytes) // _RESERVED_SHARES
+    )
+    return AuditLog(
+        settings.state / "control" / "audit.db",
+        durability=audit.durability,
+        checkpoint_every=audit.checkpoint_records,
+        checkpoint_seconds=audit.checkpoint_seconds,
+        signer=signing.want,
+        removals=signing.want_removal,
+        held_by=held_by,
+        budget=Budget(standing, reserve=reserve),
+        reserve=reserve.whole,
+        retention=Retention(
+            days=audit.retention_days,
+            size=None if audit.retention_bytes is None else int(audit.retention_bytes),
+        ),
+    )
+
+
+async def _restore(base: Foundation, parts: Parts) -> None:
+    """Bring back the nodes of before a restart, with their ports and grants, as far as the policy allows."""
+    registry, places = parts.master.registry, parts.places
+    for name, sock in base.sockets.items():
+        if name.startswith("port:"):
+            places.adopt(name, sock)
+    restore(registry, base.store)
+    parts.master.relay.load()
+    claimed: set[int] = set()
+    for incarnation in registry.all():
+        if incarnation.life is Life.REPLACED:
+            continue
+        try:
+            await parts.master.faces.reopen(incarnation)
+        except NoPortError as error:
+            _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
+            registry.forget(incarnation)
+            continue
+        claimed |= set(incarnation.ports)
+    places.close_unclaimed(claimed)
+    # The file was changed while the appliance was down, or control died while it carried out a change.
+    base.policies.changed(base.policies.current)

@@ -1,0 +1,196 @@
+"""Control's end of the link to the api: takes what REST asks, one request after the other, and what it did.
+
+Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
+
+1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
+   nodes. Those that wait for charon or the signer (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
+2. What is not of the link ends it; an api that does not read its answers loses the link.
+3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
+4. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
+   with its proof (`rest_proof.py`). What is not is refused and recorded, by control itself.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.channel.admin import (
+    AdminAnswer,
+    ChallengeWanted,
+    HostAdd,
+    HostEnrol,
+    HostRenew,
+    HostRenewed,
+    HostRenewItself,
+    HostToken,
+    RestChange,
+    verb_of,
+)
+from appliance.channel.channel import Channel, ChannelFullError
+from appliance.control.administration import Administration
+from appliance.control.rest_proof import Askers, UnprovenError
+from appliance.control.tokens import Tokens
+from appliance.recorder import Recorder
+
+_log = structlog.get_logger()
+_MOST_WAITING = 64
+_TEXT = 300
+_DENIED = (401, 403, 421, 429)
+_ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
+_CHANGES = RestChange | HostEnrol | HostRenewItself | HostRenewed
+_SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself
+_MOST_SLOW = 16
+
+
+class RestLink:
+    """Serves whichever api is there."""
+
+    def __init__(
+        self, administration: Administration, tokens: Tokens, recorder: Recorder, *, require_proof: bool
+    ) -> None:
+        """`require_proof`: a change is made for a signed request only, not for a bare token."""
+        self._administration = administration
+        self._tokens = tokens
+        self._askers = Askers(tokens, require_proof=require_proof)
+        self._recorder = recorder
+        self._channel: Channel | None = None
+        self._waiting: deque[messages.RequestMade] = deque()
+        self._worker: asyncio.Task[None] | None = None  # of the present link
+        self._slow: set[asyncio.Task[None]] = set()
+        self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
+        self.served: Callable[[str], None] = lambda pin: None  # noqa: ARG005 - set by control
+        tokens.changed = self._state_tokens
+
+    def attach(self, channel: Channel) -> None:
+        """An api is there: serve it, and tell it the tokens."""
+        if self._channel is not None:
+            self._channel.close()
+        self._channel, self._worker = channel, None
+        self._waiting.clear()
+        channel.attach(
+            asyncio.get_running_loop(),
+            lambda message, _descriptors: self._received(channel, message),
+            lambda: self._lost(channel, None),
+            lambda reason: self._lost(channel, reason),
+        )
+        self._state_tokens()
+
+    def _received(self, channel: Channel, message: object) -> None:
+        if channel is not self._channel:
+            return
+        match message:
+            case messages.RequestMade(number):
+                if len(self._waiting) >= _MOST_WAITING:
+                    text = "too many requests wait for the appliance: try again"
+                    self._send(
+                        messages.RequestAnswered(number, AdminAnswer(False, error=text, trouble="busy"))
+                    )
+                    return
+                self._waiting.append(message)
+                if self._worker is None or self._worker.done():
+                    self._worker = asyncio.get_running_loop().create_task(self._work(channel))
+                    self._workers.add(self._worker)
+                    self._worker.add_done_callback(self._workers.discard)
+            case messages.RestCalled():
+                self._record(message)
+            case messages.RestServed(pin):
+                self.served(pin)
+            case _:
+                channel.close()
+                self._lost(channel, f"it sent {type(message).__name__}")
+
+    async def _work(self, channel: Channel) -> None:
+        while self._waiting and channel is self._channel:
+            made = self._waiting.popleft()
+            if isinstance(made.request, _SLOW):
+                self._begin(channel, made)
+            else:
+                await self._serve(channel, made)
+            await asyncio.sleep(0)
+
+    def _begin(self, channel: Channel, made: messages.RequestMade) -> None:
+        """Serve beside the others what waits for charon or the signer."""
+        if len(self._slow) >= _MOST_SLOW:
+            text = "too many hosts are being enrolled: try again"
+            self._send(messages.RequestAnswered(made.number, AdminAnswer(False, error=text, trouble="busy")))
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(channel, made))
+        self._slow.add(task)
+        task.add_done_callback(self._slow.discard)
+
+    async def _serve(self, channel: Channel, made: messages.RequestMade) -> None:
+        answer = await self._answer(made)
+        if channel is self._channel:
+            self._send(messages.RequestAnswered(made.number, answer))
+
+    async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
+        if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
+            return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
+        try:
+            who = await self._askers.asker(made)
+            if isinstance(made.request, ChallengeWanted):
+                return AdminAnswer(True, self._askers.challenge())
+            return await self._administration.carry_out(made.request, who=who)
+        except UnprovenError as error:
+            self._refused(made, error)
+            return AdminAnswer(False, error=str(error), trouble="forbidden")
+        except Exception as error:  # noqa: BLE001  a defect of one request is that request's failure
+            _log.exception("a request of the api failed", request=type(made.request).__name__)
+            return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
+
+    def _refused(self, made: messages.RequestMade, error: UnprovenError) -> None:
+        asked = made.asked
+        self._recorder.happened(
+            "order refused",
+            str(error)[:_TEXT],
+            severity=error.severity,
+            decision="deny",
+            host=asked.host[:_TEXT] if asked is not None else None,
+            category="rest",
+            resource=asked.target.partition("?")[0][:_TEXT] if asked is not None else "",
+            who=error.who or None,
+            verb=verb_of(made.request),
+        )
+
+    def _record(self, call: messages.RestCalled) -> None:
+        denied = call.status in _DENIED or (call.method in _ORDERS and call.status >= 400 and not call.dry)
+        self._recorder.happened(
+            "rest call",
+            call.reason[:_TEXT],
+            severity=Severity.WARNING if denied else Severity.INFO,
+            decision="deny" if denied else "allow",
+            host=call.host,
+            category="rest",
+            resource=call.path[:_TEXT],
+            who=call.who or None,
+            method=call.method[:_TEXT],
+            more={"dry_run": True} if call.dry else None,
+            status=call.status,
+            took_us=call.duration_us,
+            count=call.count,
+        )
+
+    def _state_tokens(self) -> None:
+        self._send(messages.TokensStated(self._tokens.usable()))
+
+    def _send(self, message: messages.Message) -> None:
+        if self._channel is None:
+            return
+        try:
+            self._channel.send(message)
+        except ChannelFullError:
+            channel, self._channel = self._channel, None
+            channel.close()
+            _log.error("the api does not read its answers: its link is closed")
+
+    def _lost(self, channel: Channel, wrong: str | None) -> None:
+        """The link is gone; `wrong` is what the api did to lose it, None when it ended: the supervisor says why."""
+        if self._channel is channel:
+            self._channel = None
+            self._waiting.clear()
+            if wrong is not None:
+                _log.error("the api's link is closed; another one is started", reason=wrong)

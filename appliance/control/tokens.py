@@ -1,0 +1,140 @@
+"""The access tokens of REST: made, listed and revoked here, and nowhere else.
+
+The api is told what it needs to recognise a token (never the secret). Every token that is made or revoked is
+recorded.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from appliance.audit.record import Severity
+from appliance.channel.messages import TokenKept
+from appliance.recorder import Recorder
+from appliance.store.state import StateStore
+from appliance.store.tokens import BadTokenNameError, TokenRow, make_token
+
+FIRST_NAME = "first"
+_UNTOLD = "first token untold"  # the setting that says that nobody may know it yet
+DEFAULT_SECONDS = 90 * 86_400.0
+LONGEST_SECONDS = 3650 * 86_400.0
+_MOST = 1000
+
+
+class TokenRefusedError(Exception):
+    """The token cannot be made or revoked; the text says why."""
+
+
+class Tokens:
+    """All tokens. `changed()` is called when what may be used has changed."""
+
+    def __init__(self, store: StateStore, recorder: Recorder) -> None:
+        self._store = store
+        self._recorder = recorder
+        self._rows = {row.id: row for row in store.tokens()}
+        self._untold = bool(store.settings().get(_UNTOLD))
+        self.changed: Callable[[], None] = lambda: None
+
+    def rows(self) -> list[TokenRow]:
+        """Every token that was made, the oldest first."""
+        return list(self._rows.values())
+
+    def usable(self) -> list[TokenKept]:
+        """What the api recognises tokens by; it looks at `expires` itself."""
+        now = time.time()
+        return [
+            TokenKept(
+                row.id,
+                row.name,
+                row.role,
+                row.salt,
+                row.hash,
+                row.expires,
+                row.keys.reading if row.keys is not None else b"",
+            )
+            for row in self._rows.values()
+            if row.usable(now)
+        ]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """The token with this id, if it can be used now."""
+        row = self._rows.get(token_id)
+        return row if row is not None and row.usable(time.time()) else None
+
+    async def first(self) -> str | None:
+        """The text of the first token, if there never was one; of another, if nobody was told that one (`told`)."""
+        if self._rows and not self._untold:
+            return None
+        self._untold = True
+        self._store.save_setting(_UNTOLD, "yes")
+        if self._named(FIRST_NAME, time.time()) is not None:
+            await self.revoke(FIRST_NAME)
+        _row, text = await self.add(FIRST_NAME, "admin", DEFAULT_SECONDS)
+        return text
+
+    def told(self) -> None:
+        """Whoever started the appliance has the first token."""
+        if self._untold:
+            self._untold = False
+            self._store.save_setting(_UNTOLD, "")
+
+    async def add(self, name: str, role: str, seconds: float) -> tuple[TokenRow, str]:
+        """Make a token that ends after `seconds`; its text is given here and never again.
+
+        Raises `TokenRefusedError`.
+        """
+        now = time.time()
+        if not 0 < seconds <= LONGEST_SECONDS:
+            raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
+        if self._named(name, now) is not None:
+            raise TokenRefusedError(
+                f"there is a token {name!r} already: revoke it first, or choose another name"
+            )
+        self._require_room(now)
+        try:
+            row, text = make_token(name, role, now=now, seconds=seconds)
+        except BadTokenNameError as error:
+            raise TokenRefusedError(str(error)) from error
+        self._keep(row)
+        self._recorder.happened(
+            "token added",
+            f"token {row.name} ({row.role}) was made",
+            severity=Severity.NOTICE,
+            token=row.name,
+            id=row.id,
+            role=row.role,
+            expires=row.expires,
+        )
+        await self._store.settled()
+        return row, text
+
+    async def revoke(self, name: str) -> TokenRow:
+        """End a token now. Raises `TokenRefusedError`."""
+        now = time.time()
+        row = self._named(name, now)
+        if row is None:
+            known = ", ".join(sorted(one.name for one in self._rows.values() if one.usable(now))) or "none"
+            raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
+        revoked = replace(row, revoked=now)
+        self._keep(revoked)
+        self._recorder.happened(
+            "token revoked",
+            f"token {row.name} ({row.role}) was revoked",
+            severity=Severity.NOTICE,
+            token=row.name,
+            id=row.id,
+        )
+        await self._store.settled()
+        return revoked
+
+    def _named(self, name: str, now: float) -> TokenRow | None:
+        return next((row for row in self._rows.values() if row.name == name and row.usable(now)), None)
+
+    def _require_room(self, now: float) -> None:
+        if sum(row.usable(now) for row in self._rows.values()) >= _MOST:
+            raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
+
+    def _keep(self, row: TokenRow) -> None:
+        self._rows[row.id] = row
+        self._store.save_token(row)
+        self.changed()

@@ -1,0 +1,1 @@
+"""The hosts that come through tunnels: their table, certificates, enrolment and tunnels."""

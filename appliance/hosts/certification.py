@@ -1,0 +1,218 @@
+"""Certificates of hosts: asked of the signer, kept, told to charon, and given out as what a kit is made of.
+
+Invariants:
+
+1. What is under way for a name (an enrolment, a renewal) is refused when the name is revoked meanwhile, however it
+   was begun.
+2. Every certificate that is given or taken is recorded.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import ssl
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from appliance.audit.record import Severity
+from appliance.channel.messages import CertificateMade
+from appliance.hosts.authority import Authority, AuthorityError
+from appliance.hosts.awaited import Awaited
+from appliance.hosts.rest_place import RestPlace
+from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostTable
+from appliance.hosts.tunnels import Tunnels
+from appliance.hosts.view import soon
+from appliance.recorder import Recorder
+from appliance.store.state import StateStore
+
+_SERVED_SECONDS = 10.0
+
+
+class Certification:
+    """What enrolment by an operator and by a host itself have in common.
+
+    `changed()` is called when it has changed who is enrolled.
+    """
+
+    def __init__(
+        self,
+        store: StateStore,
+        recorder: Recorder,
+        authority: Authority,
+        table: HostTable,
+        tunnels: Tunnels,
+        *,
+        master_port: int,
+        rest: RestPlace,
+    ) -> None:
+        self.store = store
+        self.recorder = recorder
+        self.table = table
+        self.tunnels = tunnels
+        self.rest = rest
+        self.awaited = Awaited(store.hosts)
+        self.changing = asyncio.Lock()
+        self.changed: Callable[[], int] = lambda: 0
+        self._authority = authority
+        self._master_port = master_port
+        self._revocations: Counter[str] = Counter()  # of each name, in this life
+        self._warned: set[str] = set()  # serials
+        self._pin = ""
+        self._served = asyncio.Event()
+        tunnels.each_hour = self._each_hour
+
+    def served_by(self, pin: str) -> None:
+        """The api says by what hosts recognise it."""
+        self._pin = pin
+        self._served.set()
+
+    def revoked(self, name: str) -> None:
+        """A name is revoked: what is under way for it comes to nothing."""
+        self._revocations[name] += 1
+
+    @contextlib.contextmanager
+    def unless_revoked(self, name: str) -> Iterator[None]:
+        """What a block awaits comes to nothing when the name is revoked meanwhile."""
+        before = self._revocations[name]
+        yield
+        if self._revocations[name] != before:
+            raise HostForbiddenError(f"{name} was revoked meanwhile")
+
+    async def issue(
+        self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """Ask the authority. Raises `HostRefusedError`."""
+        self.table.require_room(name)
+        try:
+            return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=not error.refused) from error
+
+    def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
+        """A host has its first certificate, or another after it was revoked."""
+        self.awaited.forget(name)
+        self.keep(name, address, made)
+        self.recorder.happened(
+            "host enrolled",
+            f"{name} may come through its tunnel as {address}",
+            severity=Severity.NOTICE,
+            name=name,
+            address=address,
+            serial=made.serial,
+            expires=made.expires,
+            who=who,
+            **more,
+        )
+
+    def renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
+        """Record that a host has another certificate in the place of the one before."""
+        self.recorder.happened(
+            "host renewed",
+            f"{name} has a new certificate; its tunnel comes back with it",
+            severity=Severity.NOTICE,
+            name=name,
+            serial=serial,
+            replaced=before,
+            expires=expires,
+            who=who,
+        )
+
+    def keep(self, name: str, address: str, made: CertificateMade) -> None:
+        """This is the certificate of the host now; charon and the policy are told."""
+        self.table.keep(name, address, made)
+        self.tunnels.state_anew()
+        self.changed()
+
+    async def finish(self, name: str) -> dict[str, Any]:
+        """The answer to an enrolment, when all of it is on the disk and charon knows it."""
+        await self.store.settled()
+        taken = await self.tunnels.until_taken()
+        return await self.kit(
+            name, None if taken else "charon does not know it yet; `rosrv status` and the log say why"
+        )
+
+    async def kit(self, name: str, warning: str | None) -> dict[str, Any]:
+        """What a host's kit is made of. Raises `HostRefusedError`."""
+        if self.rest.inner_port is not None and not await self.until_served():
+            warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
+        authority = await self.authority_certificate()
+        row, certificate = self.table.rows[name], self.table.certificates.get(name)
+        if certificate is None or not certificate.certificate:
+            raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+        return {
+            **self.places(),
+            "revision": self.table.revision,
+            "name": name,
+            "address": row.address,
+            "warning": warning,
+            "serial": row.serial,
+            "expires": row.expires,
+            "certificate": certificate.certificate,
+            "authority": authority.decode(),
+            "authority_fingerprint": fingerprint(authority),
+        }
+
+    async def revocations(self) -> dict[str, Any]:
+        """The authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
+        try:
+            listed = await self.tunnels.revocations.signed()
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=True) from error
+        return {"revocations": listed.decode()}
+
+    async def authority(self) -> dict[str, Any]:
+        """The authority's certificate, in PEM. Raises `HostRefusedError`."""
+        return {"authority": (await self.authority_certificate()).decode()}
+
+    async def authority_certificate(self) -> bytes:
+        """The authority's own, in PEM. Raises `HostRefusedError`."""
+        try:
+            return await self._authority.certificate()
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=True) from error
+
+    async def until_served(self) -> bool:
+        """Wait until the api, which starts after control, is there; False when it does not come in time."""
+        try:
+            await asyncio.wait_for(self._served.wait(), _SERVED_SECONDS)
+        except TimeoutError:
+            return False
+        return True
+
+    def places(self) -> dict[str, Any]:
+        """Where hosts reach the appliance."""
+        own, rest = self.table.own_address, self.rest
+        return {
+            "appliance": own,
+            "master": f"http://{own}:{self._master_port}",
+            "rest_port": rest.port,
+            "rest_trouble": rest.trouble,
+            "rest_url": f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
+            "pin": self._pin,
+        }
+
+    def _each_hour(self) -> None:
+        """Certificates that follow ended ones count; those that end soon are recorded, once each."""
+        now = time.time()
+        self.table.revoked.forget_ended()
+        for row in self.table.enrolled():
+            if row.expires <= now:
+                self.table.take_next(row.name)
+        for row in self.table.enrolled():
+            if soon(self.table, row, now) and row.serial not in self._warned:
+                self._warned.add(row.serial)
+                self.recorder.happened(
+                    "certificate ends soon" if row.expires > now else "certificate ended",
+                    f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
+                    severity=Severity.WARNING,
+                    name=row.name,
+                    serial=row.serial,
+                    expires=row.expires,
+                )
+
+
+def fingerprint(certificate: bytes) -> str:
+    """SHA-256 of a certificate (PEM), in hexadecimal."""
+    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()

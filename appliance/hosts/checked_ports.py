@@ -1,0 +1,79 @@
+"""Whether machines' ROS ports are closed to all but the appliance, as somebody saw who tried from outside."""
+
+import ipaddress
+import time
+from collections.abc import Callable
+from typing import Any
+
+from appliance.audit.record import Severity
+from appliance.hosts.certification import Certification
+from appliance.hosts.table import HostRefusedError
+from appliance.hosts.view import HostView
+from appliance.store.hosts import PortsRow
+
+_CLOCKS_DIFFER = 86_400.0
+_MOST_PORTS = 100
+
+
+class CheckedPorts:
+    """What was told of ports; `machines()` is the number of nodes by address."""
+
+    def __init__(self, certification: Certification, view: HostView) -> None:
+        self._certification = certification
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._recorder = certification.recorder
+        self._view = view
+        self.machines: Callable[[], dict[str, int]] = dict
+
+    async def tell(
+        self,
+        name: str,
+        state: str,
+        opened: list[int],
+        *,
+        checked: float,
+        who: str,
+        expected: int | None = None,
+    ) -> dict[str, Any]:
+        """What somebody saw of a machine's ports from outside. Raises as `add`."""
+        self._table.require(expected)
+        key = self._known_machine(name)
+        now = time.time()
+        if checked > now + _CLOCKS_DIFFER:
+            raise HostRefusedError("the moment of the check is more than a day ahead")
+        row = PortsRow(key, state, sorted(set(opened))[:_MOST_PORTS], min(checked, now), who)
+        self._table.keep_ports(row)
+        self._recorder.happened(
+            "ports checked",
+            f"the ROS ports of {key} are {state}" + (f": {row.open}" if row.open else ""),
+            severity=Severity.WARNING if state == "open" else Severity.NOTICE,
+            name=key,
+            state=state,
+            open=row.open,
+            checked=row.checked,
+            who=who,
+        )
+        await self._certification.store.settled()
+        return {"revision": self._table.revision, "name": key, "ports": self._view.ports(key)}
+
+    def in_clear_text(self) -> dict[str, int]:
+        """Machines on which nodes run without a tunnel."""
+        pool = self._table.pool
+        return {
+            address: nodes
+            for address, nodes in self.machines().items()
+            if not (one := ipaddress.ip_address(address)).is_loopback and one not in pool
+        }
+
+    def _known_machine(self, name: str) -> str:
+        if name in self._table.rows or name in self._table.declared.hosts:
+            return name
+        try:
+            address = str(ipaddress.ip_address(name))
+        except ValueError:
+            self._table.enrolled_row(name)  # says which there are
+            raise
+        behind = [one.name for one in self._tunnels.seen.values() if one.remote == address]
+        row = self._table.at(address)
+        return row.name if row is not None else behind[0] if len(behind) == 1 else address

@@ -1,0 +1,32 @@
+"""At which address hosts reach the appliance where whoever enrols them does not say it."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from appliance.channel.messages import EndpointFound
+from appliance.hosts.table import HostRefusedError
+
+_PATIENCE_SECONDS = 20.0
+
+
+async def find_endpoint(
+    configured: str | None, look: Callable[[], Awaitable[EndpointFound]]
+) -> dict[str, Any]:
+    """`endpoint` and why it is that (`reason`): what is configured, else what the supervisor sees.
+
+    Raises `HostRefusedError`, which says what to give instead.
+    """
+    if configured is not None:
+        return {"endpoint": configured, "reason": "ipsec.endpoint of the configuration"}
+    try:
+        found = await asyncio.wait_for(look(), _PATIENCE_SECONDS)
+    except TimeoutError:
+        raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
+    if found.address is None:
+        raise HostRefusedError(
+            f"at which address the host reaches the appliance cannot be told: {found.reason}; give it:"
+            " --appliance ADDRESS (REST: `endpoint`), or for all hosts `ipsec: {endpoint: ADDRESS}` in appliance.yaml"
+            " (compose: ROSRV_ENDPOINT=ADDRESS in .env)"
+        )
+    return {"endpoint": found.address, "reason": found.reason}

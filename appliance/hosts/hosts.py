@@ -1,0 +1,295 @@
+"""The hosts that come through tunnels, as operators deal with them: enrolled, awaited, given kits, revoked.
+
+Invariants:
+
+1. `addresses` (what `host:NAME` means in the policy) is empty until the supervisor has said that these addresses
+   are taken through IPsec only: where clear text is not kept out, they stand for nobody.
+2. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
+3. No answer but the one to `token` has a token in it, and no answer has a private key.
+"""
+
+import ipaddress
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.hosts.awaited import LONGEST_SECONDS, MOST
+from appliance.hosts.certification import Certification, fingerprint
+from appliance.hosts.checked_ports import CheckedPorts
+from appliance.hosts.declared import DeclaredHostsError
+from appliance.hosts.self_service import SelfService
+from appliance.hosts.table import LONGEST_DAYS, HostRefusedError
+from appliance.hosts.view import HostView
+from appliance.policy.model import Address
+from appliance.store.hosts import AwaitedRow
+
+_log = structlog.get_logger()
+
+
+class Hosts:
+    """All hosts; `itself` is what they do themselves.
+
+    `changed()` is called when `addresses` has changed, `expel(address, reason)` takes back what a host has; both
+    say how much that was. `endpoint()` finds where hosts reach the appliance, as `appliance.hosts.endpoint` has it.
+    """
+
+    def __init__(
+        self, certification: Certification, endpoint: Callable[[], Awaitable[dict[str, Any]]]
+    ) -> None:
+        self._certification = certification
+        self._store = certification.store
+        self._recorder = certification.recorder
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._awaited = certification.awaited
+        self._view = HostView(self._table, self._awaited, self._tunnels)
+        self.itself = SelfService(certification)
+        self.revocations = certification.revocations
+        self.authority = certification.authority
+        self.ports = CheckedPorts(certification, self._view)
+        self.changed: Callable[[], int] = lambda: 0
+        self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
+        self.endpoint = endpoint
+        certification.changed = lambda: self.changed()  # noqa: PLW0108  it is set later
+
+    # --- what others ask ---
+
+    @property
+    def addresses(self) -> dict[str, Address]:
+        """What `host:NAME` means now."""
+        if not self._tunnels.enclosed:
+            return {}
+        return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
+
+    def overview(self) -> dict[str, Any]:
+        """Every host and machine, and how the tunnels stand."""
+        machines = self.ports.in_clear_text()
+        status = self._view.status(machines)
+        return {
+            "revision": self._table.revision,
+            "hosts": self._view.rows(),
+            "machines": self._view.machines(machines),
+            **{name: status[name] for name in _OVERVIEW},
+        }
+
+    def status(self) -> dict[str, Any]:
+        """For `rosrv status`."""
+        return self._view.status(self.ports.in_clear_text())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Every host, enrolled, awaited or declared."""
+        return self._view.rows()
+
+    async def start(self) -> None:
+        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
+        if not self._table.admitted():
+            return
+        try:
+            await self._tunnels.open()
+        except HostRefusedError as error:
+            _log.error("enrolled hosts stay outside", reason=str(error))
+
+    # --- what operators do ---
+
+    async def add(
+        self,
+        name: str,
+        request: str,
+        *,
+        days: float,
+        who: str,
+        address: str | None = None,
+        expected: int | None = None,
+    ) -> dict[str, Any]:
+        """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
+        async with self._certification.changing:
+            self._table.require(expected)
+            self._require_not_enrolled(name)
+            self._table.require_name(name)
+            wanted = self._table.address_for(name, address, self._awaited.addresses())
+            await self._tunnels.open()
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(name, request, days)
+            self._certification.enrolled(name, wanted, made, who)
+            return await self._certification.finish(name)
+
+    async def renew(
+        self, name: str, request: str, *, days: float, who: str, expected: int | None = None
+    ) -> dict[str, Any]:
+        """A new certificate for a host, the one before revoked. Raises as `add`."""
+        async with self._certification.changing:
+            self._table.require(expected)
+            row = self._table.enrolled_row(name)
+            await self._tunnels.open()
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(name, request, days)
+            self._certification.keep(name, row.address, made)
+            self._certification.renewed(name, row.serial, made.serial, made.expires, who)
+            return await self._certification.finish(name)
+
+    async def token(
+        self,
+        name: str,
+        *,
+        kit: dict[str, str],
+        seconds: float,
+        days: float,
+        address: str | None,
+        new: bool,
+        who: str,
+        expected: int | None = None,
+    ) -> dict[str, Any]:
+        """A one-time token for a host. Raises as `add`."""
+        async with self._certification.changing:
+            self._table.require(expected)
+            self._table.require_name(name)
+            if new:
+                self._require_not_enrolled(name)
+            if not 0 < seconds <= LONGEST_SECONDS:
+                raise HostRefusedError(
+                    f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
+                )
+            if not 0 < days <= LONGEST_DAYS:
+                raise HostRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
+            if self._certification.rest.port is None:
+                raise HostRefusedError(self._certification.rest.trouble)
+            if not await self._certification.until_served():
+                raise HostRefusedError("REST is not there: `rosrv status` and the log say why", ours=True)
+            if len(self._awaited.rows()) >= MOST:
+                raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
+            promised = self._table.address_for(name, address, self._awaited.addresses())
+            await self._tunnels.open()
+            authority = await self._certification.authority_certificate()
+            row, text = self._awaited.add(
+                name, seconds=seconds, address=promised, days=days, kit=kit, who=who
+            )
+            self._table.changed()
+            self._recorder.happened(
+                "host awaited",
+                f"whoever brings the one-time token {row.id} is enrolled as {name}",
+                severity=Severity.NOTICE,
+                name=name,
+                address=promised,
+                id=row.id,
+                expires=row.expires,
+                who=who,
+            )
+            await self._store.settled()
+            return {
+                **self._certification.places(),
+                "revision": self._table.revision,
+                "name": name,
+                "address": promised,
+                "token": text,
+                "token_expires": row.expires,
+                "authority_fingerprint": fingerprint(authority),
+            }
+
+    async def revoke(self, name: str, who: str, expected: int | None = None) -> dict[str, Any]:
+        """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
+        self._table.require(expected)
+        self._certification.revoked(name)
+        awaited = self._awaited.rows().get(name)
+        self._awaited.forget(name)
+        if awaited is not None and (
+            name not in self._table.rows or self._table.rows[name].revoked is not None
+        ):
+            return await self._await_no_longer(awaited, who)
+        row = self._table.revoke(name)
+        self._tunnels.state_anew()
+        taken = self.changed()
+        taken += self.expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
+        self._recorder.happened(
+            "host revoked",
+            f"{name} ({row.address}) may no longer come; {taken} registrations and grants were taken back",
+            severity=Severity.WARNING,
+            name=name,
+            address=row.address,
+            serial=row.serial,
+            taken_back=taken,
+            who=who,
+        )
+        await self._store.settled()
+        return {
+            "revision": self._table.revision,
+            "name": name,
+            "address": row.address,
+            "serial": row.serial,
+            "taken_back": taken,
+        }
+
+    async def reload(self, who: str, expected: int | None = None) -> dict[str, Any]:
+        """Read hosts.yaml again: which tunnels are wanted. Raises as `add`; a bad file changes nothing."""
+        self._table.require(expected)
+        before = {row.name for row in self._table.admitted()}
+        try:
+            self._table.declared.reload()
+        except DeclaredHostsError as error:
+            raise HostRefusedError(f"{error}; what was declared before holds") from error
+        after = {row.name for row in self._table.admitted()}
+        self._table.changed()
+        taken = 0
+        if before != after:
+            taken = self.changed()
+            self._tunnels.state_anew()
+        for name in sorted(before - after):
+            address = ipaddress.ip_address(self._table.rows[name].address)
+            taken += self.expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
+        meant = self.addresses
+        await self.start()
+        if self.addresses != meant:  # the first tunnel of all: only now is clear text kept out
+            taken += self.changed()
+        divergence = [f"{row['name']}: {row['divergence']}" for row in self._view.rows() if row["divergence"]]
+        self._recorder.happened(
+            "hosts reloaded",
+            f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
+            severity=Severity.NOTICE,
+            opened=sorted(after - before),
+            closed=sorted(before - after),
+            taken_back=taken,
+            divergence=divergence,
+            who=who,
+        )
+        return {
+            "revision": self._table.revision,
+            "declared": sorted(self._table.declared.hosts),
+            "opened": sorted(after - before),
+            "closed": sorted(before - after),
+            "divergence": divergence,
+        }
+
+    async def kit(self, name: str) -> dict[str, Any]:
+        """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
+        self._table.enrolled_row(name)
+        return await self._certification.kit(name, None)
+
+    def _require_not_enrolled(self, name: str) -> None:
+        row = self._table.rows.get(name)
+        if row is not None and row.revoked is None:
+            raise HostRefusedError(
+                f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
+            )
+
+    async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> dict[str, Any]:
+        self._table.changed()
+        self._recorder.happened(
+            "host awaited no longer",
+            f"the one-time token {awaited.id} of {awaited.name} was revoked",
+            severity=Severity.NOTICE,
+            name=awaited.name,
+            id=awaited.id,
+            who=who,
+        )
+        await self._store.settled()
+        return {
+            "revision": self._table.revision,
+            "name": awaited.name,
+            "address": awaited.address,
+            "serial": "",
+            "taken_back": 0,
+        }
+
+
+_OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")

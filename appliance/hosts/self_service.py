@@ -1,0 +1,131 @@
+"""What a host does itself: enrols with its one-time token, renews its certificate through its tunnel.
+
+Invariants:
+
+1. A token is used up before the authority is asked, and is good again when no certificate was made: its bearer may
+   come with a better request. When its name was revoked meanwhile it is good for nothing any more.
+2. Who renews is at the virtual address of the name he says, which the firewall takes through IPsec only, and has the
+   name's present key.
+3. Until the host says that the next certificate is in place, the present one is good: a host that is cut off in the
+   middle comes back with either.
+4. A host renews at most 20 times in the life of its certificate, over restarts too: each time makes the list of
+   revoked certificates longer.
+"""
+
+import asyncio
+import ipaddress
+import time
+from typing import Any
+
+from appliance.audit.record import Severity
+from appliance.hosts.awaited import BadEnrolmentTokenError
+from appliance.hosts.certification import Certification
+from appliance.hosts.table import HostForbiddenError, HostRefusedError
+from appliance.hosts.view import span
+from appliance.store.hosts import HostRow
+
+_ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
+_RENEWALS = 20  # in the life of a certificate: each leaves one on the list of revoked ones
+_RENEWED = "hosts.renewed."
+
+
+class SelfService:
+    """Serves hosts."""
+
+    def __init__(self, certification: Certification) -> None:
+        self._certification = certification
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._recorder = certification.recorder
+        kept = certification.store.settings()
+        self._renewals = {  # by name, seconds since the epoch
+            name.removeprefix(_RENEWED): float(moment)
+            for name, moment in kept.items()
+            if name.startswith(_RENEWED)
+        }
+
+    async def enrol(self, token: str, request: str, peer: str) -> dict[str, Any]:
+        """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
+        async with self._certification.changing:
+            try:
+                awaited = self._certification.awaited.take(token)
+            except BadEnrolmentTokenError as error:
+                self._recorder.happened(
+                    "enrolment refused", str(error), severity=Severity.WARNING, decision="deny", host=peer
+                )
+                raise HostForbiddenError(str(error)) from error
+            name = awaited.name
+            try:
+                await self._tunnels.open()
+                with self._certification.unless_revoked(name):
+                    made = await self._certification.issue(name, request, awaited.days)
+            except HostForbiddenError:
+                raise
+            except HostRefusedError:
+                self._certification.awaited.give_back(awaited)
+                raise
+            self._certification.enrolled(
+                name, awaited.address, made, awaited.who, token=awaited.id, peer=peer
+            )
+            return {**await self._certification.finish(name), "kit": awaited.kit}
+
+    async def renew(self, name: str, request: str, proof: bytes, peer: str) -> dict[str, Any]:
+        """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
+        async with self._certification.changing:
+            row = self._in_its_tunnel(name, peer)
+            certificate = self._table.certificates.get(name)
+            if certificate is None or not certificate.certificate:
+                raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+            life = row.expires - certificate.made
+            self._require_patience(name, life)
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(
+                    name, request, life / 86_400, proof=proof, former=certificate.certificate.encode()
+                )
+            self._table.keep_next(name, made)
+            self._note_renewal(name)
+            await self._certification.store.settled()
+            authority = await self._certification.authority_certificate()
+            return {
+                "name": name,
+                "serial": made.serial,
+                "expires": made.expires,
+                "certificate": made.certificate.decode(),
+                "authority": authority.decode(),
+            }
+
+    async def renewed(self, name: str, peer: str) -> dict[str, Any]:
+        """A host has put its next certificate in place. Raises `HostRefusedError`."""
+        before = self._in_its_tunnel(name, peer).serial
+        row = self._table.take_next(name)
+        if row is None:
+            raise HostRefusedError(f"{name} was given no certificate that is to follow: renew first")
+        self._certification.renewed(name, before, row.serial, row.expires, name)
+        await self._certification.store.settled()
+        asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
+        return {"name": name}
+
+    def _in_its_tunnel(self, name: str, peer: str) -> HostRow:
+        address = ipaddress.ip_address(peer)
+        mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+        row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
+        if row is None or row.name != name or not self._table.declared.wants(name):
+            self._recorder.happened(
+                "renewal refused",
+                f"not in the tunnel of {name[:80]}",
+                severity=Severity.WARNING,
+                decision="deny",
+                host=peer,
+            )
+            raise HostForbiddenError(f"{peer} is not the address of {name} in its tunnel")
+        return row
+
+    def _require_patience(self, name: str, life: float) -> None:
+        wait = life / _RENEWALS
+        since = time.time() - self._renewals.get(name, -wait)
+        if 0 <= since < wait:  # a clock that was set back makes nobody wait
+            raise HostRefusedError(f"{name} renewed {span(since)} ago: again in {span(wait - since)}")
+
+    def _note_renewal(self, name: str) -> None:
+        self._renewals[name] = time.time()
+        self._certification.store.save_setting(_RENEWED + name, repr(self._renewals[name]))

@@ -1,0 +1,167 @@
+"""The hosts as operators see them: one row for each, what diverges from hosts.yaml, what to look at."""
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from appliance.hosts.awaited import Awaited
+from appliance.hosts.table import HostTable
+from appliance.hosts.tunnels import Tunnels
+from appliance.store.hosts import AwaitedRow, HostRow
+
+SOON_SECONDS = 14 * 86_400.0
+_NEVER: dict[str, Any] = {"state": "unknown", "checked": None, "open": [], "who": ""}
+
+
+def soon(table: HostTable, row: HostRow, now: float) -> bool:
+    """Whether a certificate ends within 14 days, or a third of its life if that is shorter."""
+    certificate = table.certificates.get(row.name)
+    life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
+    return row.expires - now < min(SOON_SECONDS, life / 3)
+
+
+class HostView:
+    """Shows table, tokens and tunnels; `machines()` is the number of nodes by address, those in tunnels left out."""
+
+    def __init__(self, table: HostTable, awaited: Awaited, tunnels: Tunnels) -> None:
+        self._table = table
+        self._awaited = awaited
+        self._tunnels = tunnels
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Every host, enrolled, awaited or declared, by name."""
+        awaited = self._awaited.rows()
+        names = {*self._table.rows, *self._table.declared.hosts, *awaited}
+        return [self._row(name, awaited.get(name)) for name in sorted(names)]
+
+    def _row(self, name: str, awaited: AwaitedRow | None) -> dict[str, Any]:
+        declared = self._table.declared.hosts.get(name)
+        row, seen = self._table.rows.get(name), self._tunnels.seen.get(name)
+        promised = awaited.address if awaited else declared.address if declared else None
+        certificate = self._table.certificates.get(name)
+        now = time.time()
+        return {
+            "name": name,
+            "address": row.address if row else promised,
+            "state": self._state(name, row, now, awaited=awaited is not None),
+            "groups": list(declared.groups) if declared else [],
+            "declared": declared is not None,
+            "wanted": self._table.declared.wants(name),
+            "divergence": self.divergence(name),
+            "serial": row.serial if row else None,
+            "enrolled": row.enrolled if row else None,
+            "expires": row.expires if row else None,
+            "expires_soon": row is not None and row.revoked is None and soon(self._table, row, now),
+            "renewing": certificate is not None and certificate.next is not None,
+            "revoked": row.revoked if row else None,
+            "remote": seen.remote if seen else None,
+            "seconds": seen.seconds if seen else None,
+            "bytes_in": seen.bytes_in if seen else None,
+            "bytes_out": seen.bytes_out if seen else None,
+            "last_seen": self._tunnels.last.get(name),
+            "token_expires": awaited.expires if awaited else None,
+            "ports": self.ports(name),
+        }
+
+    def divergence(self, name: str) -> str | None:
+        """What is different from hosts.yaml; None also where nothing is declared at all."""
+        if not self._table.declared.there:
+            return None
+        declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
+        if declared is None:
+            return "enrolled, not in hosts.yaml" if row is not None and row.revoked is None else None
+        if row is None:
+            return "in hosts.yaml, not enrolled"
+        if row.revoked is not None:
+            return "in hosts.yaml, revoked"
+        if declared.address is not None and declared.address != row.address:
+            return f"hosts.yaml keeps {declared.address} for it; it has {row.address} for good"
+        return None
+
+    def ports(self, name: str) -> dict[str, Any]:
+        """What was last seen of its ROS ports from outside."""
+        row = self._table.ports.get(name)
+        if row is None:
+            return dict(_NEVER)
+        return {"state": row.state, "checked": row.checked, "open": row.open, "who": row.who}
+
+    def status(self, machines: Mapping[str, int]) -> dict[str, Any]:
+        """How the tunnels stand, and what a person should look at."""
+        charon = self._tunnels.charon
+        return {
+            "esp": self._tunnels.esp,
+            "key_exchange": charon.key_exchange if charon else [],
+            "post_quantum": any("mlkem" in one for one in charon.key_exchange) if charon else None,
+            "charon": charon.version if charon else None,
+            "pool": str(self._table.pool),
+            "address": self._table.own_address,
+            "hosts_file": str(self._table.declared.path),
+            "enrolled": len(self._table.enrolled()),
+            "awaited": len(self._awaited.rows()),
+            "up": len(self._tunnels.seen),
+            "troubles": [*self._troubles(), *self._open_ports()],
+            "ports": self._known_ports(machines),
+        }
+
+    def machines(self, machines: Mapping[str, int]) -> list[dict[str, Any]]:
+        """Machines in clear text on which nodes run, and those of which somebody told."""
+        told = self._table.ports.keys() - self._table.rows.keys() - self._table.declared.hosts.keys()
+        return [
+            {"address": address, "nodes": machines.get(address, 0), "ports": self.ports(address)}
+            for address in sorted({*machines, *told})
+        ]
+
+    def _known_ports(self, machines: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+        """Of every host that may have nodes, by name or address."""
+        return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
+
+    def _open_ports(self) -> list[str]:
+        return [
+            f"ROS ports of {name} are open to others than the appliance (seen by {row.who}): rosrv protect there"
+            for name, row in self._table.ports.items()
+            if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
+        ]
+
+    def _state(self, name: str, row: HostRow | None, now: float, *, awaited: bool) -> str:
+        if row is None:
+            return "awaited" if awaited else "not enrolled"
+        if row.revoked is not None:
+            return "awaited" if awaited else "revoked"
+        if not self._table.declared.wants(name):
+            return "not wanted"
+        if name in self._tunnels.seen:
+            return "up"
+        return "expired" if row.expires <= now else "down"
+
+    def _troubles(self) -> list[str]:
+        now, found = time.time(), []
+        if self._table.admitted() and not self._tunnels.enclosed:
+            found.append(f"enrolled hosts stay outside: {self._tunnels.obstacle}")
+        for row in self._table.enrolled():
+            left = row.expires - now
+            if left <= 0:
+                found.append(f"the certificate of {row.name} has ended: rosrv host kit {row.name}")
+            elif soon(self._table, row, now):
+                found.append(
+                    f"the certificate of {row.name} ends in {span(left)} and was not renewed:"
+                    f" rosrv host kit {row.name}"
+                )
+        missing = self._table.missing_as_revoked()
+        if missing:
+            found.append(
+                f"the list of revoked certificates is full: {missing} are not on it, and their hosts' tunnels can be"
+                " opened with them until they end"
+            )
+        if self._table.declared.error:
+            found.append(self._table.declared.error)
+        return found
+
+
+def span(seconds: float) -> str:
+    """Days, hours, minutes or seconds in words, whichever says enough."""
+    if seconds >= 2 * 86_400:
+        return f"{int(seconds // 86_400)} days"
+    if seconds >= 7200:
+        return f"{int(seconds // 3600)} hours"
+    return f"{int(seconds // 60)} minutes" if seconds >= 120 else f"{math.ceil(seconds)} seconds"

@@ -1,0 +1,1 @@
+"""The Master API: the way of a request, the table of calls, and what each call does."""

@@ -1,0 +1,252 @@
+"""The one decision point: the policy first, then the binding of claims to hosts, then the limits per host.
+
+`Gate.decide` is a function of the running policy, the registry and the parameters; it forwards nothing and records
+nothing. A question that only the network can answer (is the node that holds this name still there?) is returned as
+`Contest`, and asked again with the answer.
+"""
+
+import enum
+import ipaddress
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+from appliance.master.calls.arguments import ApiUri
+from appliance.master.calls.call import Call, Caller, Identity
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.reach.own_node import OWN, ROSOUT
+from appliance.policy import Policy
+from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.rights import decide, request_of, rights_of_call
+from appliance.ros.parameter_tree import Tree
+from appliance.ros.xmlrpc import Value
+from appliance.shares.table import NAMES
+
+_TIMES_THE_REST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """Another host holds the name; the call is granted only if its node is gone. `decision` is then the answer."""
+
+    holder: Incarnation
+    decision: Decision
+
+
+class Presence(enum.Enum):
+    """What came of an attempt to call a node."""
+
+    GONE = "gone"  # it refuses connections, or cannot be reached
+    SILENT = "silent"  # it takes connections and does not answer
+    ANSWERS = "answers"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """The answer to a contest's question; `patience` is seconds until a silent node is unregistered."""
+
+    holder: Incarnation
+    presence: Presence
+    patience: float
+
+
+@dataclass(frozen=True, slots=True)
+class HostLimits:
+    """How much of the registry one host may take."""
+
+    nodes: int = 500
+    registrations: int = NAMES.bounds.host
+    registrations_in_all: int = NAMES.bounds.whole
+
+
+class Gate:
+    """Decides calls by the policy that `policy()` returns at that moment."""
+
+    def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
+        self._policy = policy
+        self._registry = registry
+        self._limits = limits
+
+    def asked(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Request:
+        """What a call is decided and recorded as."""
+        resource = "" if call.resource is None else str(arguments[call.resource])
+        return request_of(call.policy_name, caller.peer.host, caller.caller_id, resource)
+
+    def decide(
+        self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
+    ) -> Decision | Contest:
+        """Whether `caller` may make this call with these canonical arguments, while `tree` are the parameters."""
+        if caller.own:
+            return ROSOUT.decide(caller.caller_id, call, arguments)
+        if self._asks_for_its_topic(caller, call, arguments):
+            return Decision(True, None, OWN)
+        decision = self._by_policy(caller, call, arguments, tree)
+        if not decision.allowed:
+            return decision
+        if call.identity is Identity.NOBODY or not caller.caller_id:
+            return decision
+        denial = (
+            self._late(caller, call, arguments)
+            or self._unreachable(caller, call, arguments)
+            or self._over_limit(caller, call, arguments)
+        )
+        if denial is not None:
+            return denial
+        return self._bound(caller, call, decision)
+
+    def may_have(self, call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> Decision:
+        """Decide again what a call gave: what is live, or seems to be."""
+        request = request_of(call, host, caller_id, resource)
+        return decide(self._policy(), rights_of_call(request, call, resource, tree=tree))
+
+    def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree) -> Decision:
+        key = None if call.resource is None else str(arguments[call.resource])
+        value = cast(Value, arguments[1]) if call.touches is Category.WRITE and len(arguments) > 1 else None
+        request = self.asked(caller, call, arguments)
+        return decide(self._policy(), rights_of_call(request, call.policy_name, key, value=value, tree=tree))
+
+    # --- the binding of claims ---
+
+    def _late(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        if call.api is None:
+            return None
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        known = self._registry.find(caller.caller_id, caller.peer.host, api.text)
+        if known is not None and known.life is Life.REPLACED:
+            return _no(
+                f"this call is late: the node {known.name} at {api.text} was replaced by another of its name"
+            )
+        return None
+
+    def _unreachable(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
+        if call.api is None or call.gives_up is not None or caller.peer.host.is_loopback:
+            return None
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        if not _is_loopback(api.uri.host):
+            return None
+        return _no(
+            f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): nobody else can "
+            f"call it; start it with ROS_IP={caller.peer.text}, or without ROS_IP and ROS_HOSTNAME"
+        )
+
+    def _bound(self, caller: Caller, call: Call, decision: Decision) -> Decision | Contest:
+        holder = self._registry.holder(caller.caller_id)
+        if holder is None:
+            return decision
+        if holder.own:  # without isolation the robot's nodes have its address
+            return _no(f"the name {holder.name} belongs to the appliance")
+        if holder.host == caller.peer.host:
+            return decision
+        if call.registers not in {None, Kind.PARAMETER}:
+            if self._policy().takeover == "granted":
+                return decision
+            return Contest(holder, decision)
+        held, other = f"{caller.caller_id} is held by", f"{caller.peer.host} cannot speak for it"
+        return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
+
+    def _asks_for_its_topic(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> bool:
+        asks = caller.target is not None and call.category is Category.SUBSCRIBE
+        return asks and self.is_own_subscriber(caller, str(arguments[0]))
+
+    def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
+        """Whether a node of the appliance calls another node, at its outer face, for a topic that it subscribed to.
+
+        RVMaster has a listener for the appliance's own nodes, the faces have not.
+        """
+        holder = self._registry.holder(caller.caller_id) if caller.peer.here else None
+        return holder is not None and holder.own and (Kind.SUBSCRIPTION, topic) in holder.registrations
+
+    # --- limits ---
+
+    def _over_limit(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
+        if call.api is None or call.gives_up is not None:
+            return None
+        host = caller.peer.host
+        if self._registry.registrations_of(host) >= self._limits.registrations:
+            return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
+        denial = self._too_many_names(host)
+        if denial is not None:
+            return denial
+        api = arguments[call.api]
+        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+        if self._is_one_too_many(caller, api) and self._registry.spare_of(host) is None:
+            return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
+        return None
+
+    def _too_many_names(self, host: Address) -> Decision | None:
+        """Hosts that the policy names as one network count as one: nobody gains by many addresses."""
+        left = max(0, self._limits.registrations_in_all - self._registry.registrations)
+        if self._registry.registrations < _TIMES_THE_REST * left:
+            return None  # nobody has so many
+        policy = self._policy()
+        named = policy.named_as(host)
+        mine = sum(
+            count
+            for other, count in self._registry.registrations_by_host()
+            if policy.named_as(other) == named
+        )
+        if mine < _TIMES_THE_REST * left:
+            return None
+        who = named if named.num_addresses > 1 else host
+        return _no(
+            f"{who} has {mine} registrations, and {left} are left for all other hosts: a host may have"
+            f" {_TIMES_THE_REST} times as many as are left"
+        )
+
+    def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """The node of the caller's host that is gone and goes for good, so that a new one has room."""
+        return self._registry.spare_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
+
+    def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
+        host = caller.peer.host
+        return (
+            self._registry.nodes_of(host) >= self._limits.nodes
+            and self._registry.find(caller.caller_id, host, api.text) is None
+        )
+
+
+def contested(contest: Contest, probe: Probe | None) -> Decision:
+    """The decision of a contest, once the holder's node was probed; not, when another has come to hold the name."""
+    holder = contest.holder
+    if probe is not None and probe.holder is holder:
+        if probe.presence is Presence.GONE:
+            return contest.decision
+        if probe.presence is Presence.SILENT:
+            return _held_by(
+                holder,
+                "a node",
+                " that takes connections and does not answer (it "
+                f"hangs, or was stopped); unless it answers it is unregistered in {math.ceil(probe.patience)} s: "
+                "start this node again then (or at once with [Options] takeover = granted)",
+            )
+    return _held_by(
+        holder,
+        "a running node",
+        "; another host may take the name over once that node is gone "
+        "(or at once with [Options] takeover = granted)",
+    )
+
+
+def _held_by(holder: Incarnation, what: str, rest: str) -> Decision:
+    return _no(
+        f"{holder.name} is held by {what} on {holder.host}{rest}",
+        told=f"{holder.name} is held by {what} of another host{rest}",
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    if host.lower() in ("localhost", "localhost.localdomain", "ip6-localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _no(reason: str, told: str | None = None) -> Decision:
+    """A denial by no rule; `told` where the reason names another host."""
+    return Decision(False, None, reason, told=told)

@@ -1,0 +1,1 @@
+"""The graph: who is who, who registered what, who is told, and what a change of the policy ends."""

@@ -1,0 +1,230 @@
+"""Which nodes are still there: looked at every few seconds, and at once when something of a node breaks.
+
+A node whose API refuses connections (twice in a row), cannot be reached or does not answer for `silent` seconds is
+*lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations kept as a shadow. A shadow whose API
+answers again gets them back, because a ROS 1 node never registers twice.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+
+import structlog
+
+from appliance.master.calls.gate import Presence, Probe
+from appliance.master.graph.delivery import NodeCall
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.reach.relays import RELAY_NAME
+from appliance.policy.model import Address
+from appliance.ros.xmlrpc import Limits
+from appliance.rpc.client import (
+    BrokenOffError,
+    CallFailedError,
+    RefusedError,
+    UnansweredError,
+    UnreachedError,
+    XmlRpcClient,
+)
+from appliance.rpc.turns import Turns
+from appliance.shares.pool import Standing
+from appliance.shares.table import PROBES
+
+_log = structlog.get_logger()
+_REPLACED_SECONDS = 60.0
+_IDLE_SECONDS = 30.0  # longer than a registering call can be on its way
+_LOOK_AGAIN_SECONDS = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class LivenessSettings:
+    """Seconds: between looks, without an answer until lost, as a shadow until forgotten, for one call."""
+
+    interval: float = 5.0
+    silent: float = 20.0
+    shadow: float = 600.0
+    call: float = 3.0
+
+
+@dataclass(slots=True)
+class _Missed:
+    """What a node could not be told: topics, and whether it were parameters; when it was told again, monotonic."""
+
+    topics: set[str] = field(default_factory=set)
+    parameters: bool = False
+    made_up: float | None = None
+
+
+class Liveness:
+    """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster.
+
+    `returned(incarnation)` hears of a node that was away, once what it had counts again. Hosts take turns: nodes of one
+    that answer nothing delay no look at another's.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        graph: Graph,
+        settings: LivenessSettings,
+        limits: Limits,
+        *,
+        withdraw: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        returned: Callable[[Incarnation], None],
+        standing: Callable[[Address], Standing],
+    ) -> None:
+        self._registry = registry
+        self._graph = graph
+        self._settings = settings
+        self._limits = limits
+        self._withdraw = withdraw
+        self._put_back = put_back
+        self._returned = returned
+        self._answered: dict[str, float] = {}
+        self._missed: dict[str, _Missed] = {}
+        self._looks: dict[str, asyncio.Task[None]] = {}
+        self._turns = Turns(PROBES.bounds, standing)
+
+    def client(self, incarnation: Incarnation) -> XmlRpcClient:
+        """A client that calls the node at its peer address."""
+        return XmlRpcClient(incarnation.call_uri, timeout=self._settings.call, limits=self._limits)
+
+    async def run(self) -> None:
+        """Look at every incarnation every `interval` seconds, until cancelled."""
+        while True:
+            await asyncio.sleep(self._settings.interval)
+            known = self._registry.all()
+            self._answered = {one.key: self._answered[one.key] for one in known if one.key in self._answered}
+            self._missed = {one.key: self._missed[one.key] for one in known if one.key in self._missed}
+            for incarnation in known:
+                self.look_at(incarnation)
+
+    def look_at(self, incarnation: Incarnation) -> None:
+        """Look at a node now (unless it is being looked at).
+
+        The publisher of what monitors publish is control itself: it is there, and the firewall lets only the ROS Master
+        call it.
+        """
+        if incarnation.key not in self._looks and not incarnation.of_monitors:
+            task = asyncio.get_running_loop().create_task(self._look(incarnation))
+            self._looks[incarnation.key] = task
+            task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
+
+    def missed(self, incarnation: Incarnation, call: NodeCall) -> None:
+        """The node could not be told this: it is looked at, and told how things are once it answers."""
+        missed = self._missed.setdefault(incarnation.key, _Missed())
+        if call.method == "publisherUpdate":
+            missed.topics.add(str(call.parameters[0]))
+        missed.parameters |= call.method == "paramUpdate"
+        self.look_at(incarnation)
+
+    async def probe(self, incarnation: Incarnation) -> Probe:
+        """Whether the node is there, asked now."""
+        now = time.monotonic()
+        since = self._answered.setdefault(incarnation.key, now)
+        patience = max(0.0, self._settings.silent - (now - since)) + self._settings.interval
+        try:
+            await self.client(incarnation).call("getPid", RELAY_NAME)
+        except (RefusedError, UnreachedError):
+            presence = Presence.GONE
+        except (UnansweredError, BrokenOffError):
+            presence = Presence.SILENT
+        except CallFailedError:
+            presence = Presence.ANSWERS
+        else:
+            presence = Presence.ANSWERS
+        return Probe(incarnation, presence, patience)
+
+    async def revive(self, incarnation: Incarnation) -> None:
+        """A shadow registers: it is there again, and so is all it had."""
+        self._answered[incarnation.key] = time.monotonic()
+        await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
+
+    def _bring_back(self, incarnation: Incarnation) -> list[Registration]:
+        registrations = self._graph.returned(incarnation)
+        self._returned(incarnation)
+        return registrations
+
+    async def _look(self, incarnation: Incarnation) -> None:
+        await self._turns.enter(incarnation.host)
+        try:
+            there, why = await self._ask(incarnation)
+        finally:
+            self._turns.leave(incarnation.host)
+        if self._registry.by_key(incarnation.key) is not incarnation:
+            return
+        now = time.monotonic()
+        since = self._answered.setdefault(incarnation.key, now)
+        if there:
+            self._answered[incarnation.key] = now
+        if incarnation.life is Life.LIVE:
+            refused = there is None
+            if refused or (not there and now - since >= self._settings.silent):
+                await self._lose(incarnation, why)
+        else:
+            await self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
+        if there and incarnation.life is Life.LIVE:
+            await self._make_up(incarnation)
+
+    async def _make_up(self, incarnation: Incarnation) -> None:
+        """Tell a node what it has missed: once in a while, for one that answers may still take no update."""
+        missed, now = self._missed.get(incarnation.key), time.monotonic()
+        if missed is None or (missed.made_up is not None and now - missed.made_up < self._settings.interval):
+            return
+        topics, parameters = missed.topics, missed.parameters
+        self._missed[incarnation.key] = _Missed(made_up=now)
+        for topic in sorted(topics):
+            self._graph.remind(incarnation, topic)
+        subscribed = [one for one in incarnation.registrations.values() if one.kind is Kind.PARAMETER]
+        if parameters and subscribed:
+            await self._tell(self._put_back, incarnation, subscribed)
+
+    async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
+        """Whether it answers: True, False, or None when it refuses connections; and why."""
+        for attempt in (1, 2):
+            try:
+                await self.client(incarnation).call("getPid", RELAY_NAME)
+            except RefusedError as error:
+                if attempt == 2:
+                    return None, f"{incarnation.name}: {error}"
+                await asyncio.sleep(_LOOK_AGAIN_SECONDS)
+            except CallFailedError as error:
+                return False, f"{incarnation.name}: {error}"
+            else:
+                return True, ""
+        return False, ""
+
+    async def _lose(self, incarnation: Incarnation, why: str) -> None:
+        if not incarnation.registrations and not incarnation.shelf:
+            if time.monotonic() - incarnation.touched > _IDLE_SECONDS:
+                self._forget(incarnation)
+            return
+        registrations = list(incarnation.registrations.values())
+        self._graph.lost(incarnation, why)
+        await self._tell(self._withdraw, incarnation, registrations)
+
+    async def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
+        age = time.time() - incarnation.changed
+        if incarnation.life is Life.REPLACED:
+            if refused or age > _REPLACED_SECONDS:
+                self._forget(incarnation)
+        elif age > self._settings.shadow:
+            self._forget(incarnation)
+        elif answered and self._registry.occupant(incarnation.name) is None:
+            await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
+
+    async def _tell(
+        self,
+        tell: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        incarnation: Incarnation,
+        registrations: list[Registration],
+    ) -> None:
+        try:
+            await tell(incarnation, registrations)
+        except CallFailedError as error:
+            _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
+
+    def _forget(self, incarnation: Incarnation) -> None:
+        self._graph.forgotten(incarnation)

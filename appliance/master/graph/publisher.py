@@ -1,0 +1,78 @@
+"""What monitors publish, as a node of the graph: the appliance registers as that topic's publisher.
+
+Its node API is the listener of the inner faces, under a path of its own (`PUBLISHER_PATH`): there is nothing to tell
+it, so every call of a master is acknowledged there. The relay serves its messages (`NodePlaced.monitors`).
+"""
+
+import asyncio
+import ipaddress
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import structlog
+
+from appliance.master.calls.arguments import ApiUri
+from appliance.master.calls.call import Caller
+from appliance.master.calls.registration import register_publisher, withdraw
+from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind
+from appliance.master.reach.places import NoPortError
+from appliance.ros.uris import node_uri, parse_node_uri
+from appliance.rpc.client import CallFailedError
+from appliance.rpc.server import Peer
+
+if TYPE_CHECKING:
+    from appliance.master.core import Master
+
+_log = structlog.get_logger()
+_LOOPBACK = "127.0.0.1"
+_AGAIN_SECONDS = 1.0
+
+
+class OwnPublisher:
+    """Registers what `wanted()` says (topic to type), and nothing else, under `name`."""
+
+    def __init__(
+        self, master: "Master", name: str, inner_port: int, wanted: Callable[[], dict[str, str]]
+    ) -> None:
+        self._master = master
+        self._name = name
+        self._uri = node_uri(_LOOPBACK, inner_port, PUBLISHER_PATH)
+        self._wanted = wanted
+        self._woken = asyncio.Event()
+        self._woken.set()
+
+    def wake(self) -> None:
+        """Other topics may be published."""
+        self._woken.set()
+
+    async def run(self, ready: asyncio.Event) -> None:
+        """Register and unregister until cancelled; `ready` is set when ROSMaster is whole."""
+        await ready.wait()
+        while True:
+            await self._woken.wait()
+            self._woken.clear()
+            try:
+                await self._settle()
+            except (CallFailedError, NoPortError) as error:
+                _log.error("what monitors publish is not registered", error=str(error))
+                await asyncio.sleep(_AGAIN_SECONDS)
+                self._woken.set()
+
+    async def _settle(self) -> None:
+        wanted = self._wanted()
+        for incarnation in self._mine():
+            for topic in incarnation.resources(Kind.PUBLICATION):
+                if incarnation.api_text != self._uri or topic not in wanted:
+                    await withdraw(self._master, incarnation, Kind.PUBLICATION, topic)
+                    self._master.graph.unregistered(incarnation, Kind.PUBLICATION, topic)
+        for topic, type_name in wanted.items():
+            peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
+            caller = Caller(peer, self._name, time.monotonic_ns(), own=True)
+            api = ApiUri(self._uri, parse_node_uri(self._uri))
+            answer = await register_publisher(self._master, caller, (topic, type_name, api))
+            if answer[0] != 1:
+                raise CallFailedError(f"{self._name} cannot publish {topic}: {answer[1]!s}")
+
+    def _mine(self) -> list[Incarnation]:
+        return [one for one in self._master.registry.live() if one.of_monitors]

@@ -1,0 +1,238 @@
+"""The reconcile loop: *wanted* (the registry, the parameter mirror) against *seen* (ROSMaster), mended.
+
+Whatever happened (ROSMaster died, control died, a call was cut in its middle) is the same to it:
+
+- a ROSMaster that is new is told everything again, in the original order, while calls wait at the door;
+- a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it
+  carries the key of a known incarnation and the policy in force grants it (control died before it was written down),
+  and unregistered otherwise, as when the policy has taken it and ROSMaster is not told yet: that ROSMaster has it is
+  a claim, no right;
+- after a rebuild, or when a relay is new, every subscriber gets each of its lists once; when control is new, the values
+  of its parameters.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import cast
+
+import structlog
+
+from appliance.master.calls.call import Answer
+from appliance.master.calls.parameter_updates import settled
+from appliance.master.calls.parameters import ParameterMirror
+from appliance.master.calls.registration import NO_SERVICE, stand_in
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.reach.faces import Faces
+from appliance.master.rosmaster import RosMaster
+from appliance.recorder import Recorder
+from appliance.ros.parameter_tree import Tree, standing_at
+from appliance.rpc.client import CallFailedError
+
+_log = structlog.get_logger()
+_RETRY_SECONDS = 0.1
+_NAME = "/master"
+Seen = set[tuple[Kind, str, str]]
+
+
+class Reconciler:
+    """Runs rounds when woken and every `interval` seconds. `ready` is set after the first whole round.
+
+    `may_have(node, kind, resource)` says whether the policy in force grants it.
+    """
+
+    def __init__(  # noqa: PLR0917 - the parts it compares
+        self,
+        rosmaster: RosMaster,
+        registry: Registry,
+        faces: Faces,
+        graph: Graph,
+        parameters: ParameterMirror,
+        recorder: Recorder,
+        *,
+        own_parameters: Callable[[], Tree],
+        may_have: Callable[[Incarnation, Kind, str], bool],
+        interval: float = 30.0,
+    ) -> None:
+        self._rosmaster = rosmaster
+        self._registry = registry
+        self._faces = faces
+        self._graph = graph
+        self._parameters = parameters
+        self._recorder = recorder
+        self._own_parameters = own_parameters
+        self._may_have = may_have
+        self._interval = interval
+        self._pid: int | None = None
+        self._woken = asyncio.Event()
+        self.ready = asyncio.Event()
+
+    def wake(self) -> None:
+        """Something happened: run a round now."""
+        self._woken.set()
+
+    async def run(self) -> None:
+        """Run until cancelled; a round that fails is tried again until it succeeds."""
+        while True:
+            self._woken.clear()
+            try:
+                await self._round()
+            except CallFailedError as error:
+                self._rosmaster.shut()
+                _log.warning("the ROS Master is away", error=str(error))
+                await asyncio.sleep(_RETRY_SECONDS)
+                continue
+            self.ready.set()
+            try:
+                async with asyncio.timeout(self._interval):
+                    await self._woken.wait()
+            except TimeoutError:
+                pass
+
+    async def _round(self) -> None:
+        async with self._rosmaster.alone():
+            pid = (await self._rosmaster.call_now("getPid", _NAME))[2]
+            if pid == self._pid:
+                await self._compare()
+            elif (
+                self._pid is None
+                and (await self._rosmaster.call_now("hasParam", _NAME, "/run_id"))[2] is True
+            ):
+                tree = (await self._rosmaster.call_now("getParam", _NAME, "/"))[2]
+                self._parameters.replace(cast(Tree, tree))
+                await self._compare()
+                self._tell_parameters()
+            else:
+                await self._rebuild()
+            self._pid = cast(int, pid)
+
+    def _tell_parameters(self) -> None:
+        """Control is new: what it had not told yet, or not even heard of as done, is told."""
+        for node, registration in self._registry.in_order():
+            if registration.kind is Kind.PARAMETER:
+                value, _ = standing_at(self._parameters.tree, registration.resource)
+                self._graph.tell_parameter(
+                    node, registration.resource, {} if value is None else settled(value)
+                )
+
+    # --- a new ROSMaster ---
+
+    async def _rebuild(self) -> None:
+        tree = {**self._own_parameters(), **self._parameters.tree}
+        await self._rosmaster.call_now("setParam", _NAME, "/", tree)
+        self._parameters.replace(tree)
+        made = 0
+        for incarnation, registration in self._registry.in_order():
+            await self._register(incarnation, registration)
+            made += 1
+        self._graph.tell_everybody()
+        if made:
+            text = (
+                f"a new ROS Master was told {made} registrations and {len(tree)} parameter namespaces again"
+            )
+            self._recorder.happened("reconciled", text, registrations=made)
+
+    async def _register(self, incarnation: Incarnation, registration: Registration) -> Answer:
+        name, inner, resource = incarnation.name, self._faces.inner_uri(incarnation), registration.resource
+        call = self._rosmaster.call_now
+        match registration.kind:
+            case Kind.PUBLICATION:
+                return await call("registerPublisher", name, resource, registration.detail, inner)
+            case Kind.SUBSCRIPTION:
+                return await call("registerSubscriber", name, resource, registration.detail, inner)
+            case Kind.SERVICE:
+                return await call("registerService", name, resource, stand_in(incarnation), inner)
+            case Kind.PARAMETER:
+                return await call("subscribeParam", name, inner, resource)
+
+    async def put_back(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
+        """Register what a returned node had, as far as it still has it when ROSMaster can be told.
+
+        What was taken from it meanwhile is left out; and an earlier life of a node would have ROSMaster end the later.
+        """
+        try:
+            async with self._rosmaster.alone():
+                if (await self._rosmaster.call_now("getPid", _NAME))[2] != self._pid:
+                    raise CallFailedError("the ROS Master is new: the next round tells it everything")
+                for one in registrations:
+                    if (
+                        incarnation.life is Life.LIVE
+                        and (one.kind, one.resource) in incarnation.registrations
+                    ):
+                        answer = await self._register(incarnation, one)
+                        if one.kind is Kind.PARAMETER and answer[0] == 1:
+                            # It heard of no change in the meantime, and ROSMaster tells each change once.
+                            self._graph.tell_parameter(incarnation, one.resource, answer[2])
+        except CallFailedError:
+            self.wake()
+            raise
+
+    # --- the same ROSMaster ---
+
+    async def _compare(self) -> None:
+        seen = await self._seen()
+        wanted = {
+            (registration.kind, registration.resource, incarnation.name): (incarnation, registration)
+            for incarnation, registration in self._registry.in_order()
+            if registration.kind
+            is not Kind.PARAMETER  # ROSMaster does not tell who subscribed to a parameter
+        }
+        uris = await self._inner_uris({name for _kind, _resource, name in seen})
+        missing = [
+            pair
+            for key, pair in wanted.items()
+            if key not in seen or uris.get(pair[0].name) != self._faces.inner_uri(pair[0])
+        ]
+        for incarnation, registration in missing:
+            await self._register(incarnation, registration)
+        extra = [one for one in seen if one not in wanted]
+        for kind, resource, name in sorted(extra):
+            await self._settle(kind, resource, name, uris.get(name))
+        if missing or extra:
+            text = f"{len(missing)} registrations were made again, {len(extra)} adopted or removed"
+            self._recorder.happened("reconciled", text, made=len(missing), settled=len(extra))
+
+    async def _seen(self) -> Seen:
+        state = (await self._rosmaster.call_now("getSystemState", _NAME))[2]
+        publishers, subscribers, services = cast(list[list[tuple[str, list[str]]]], state)
+        return {
+            (kind, resource, name)
+            for kind, rows in (
+                (Kind.PUBLICATION, publishers),
+                (Kind.SUBSCRIPTION, subscribers),
+                (Kind.SERVICE, services),
+            )
+            for resource, holders in rows
+            for name in holders
+        }
+
+    async def _inner_uris(self, nodes: set[str]) -> dict[str, str]:
+        names = sorted(nodes)
+        answers = await asyncio.gather(
+            *(self._rosmaster.call_now("lookupNode", _NAME, name) for name in names)
+        )
+        return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
+
+    async def _settle(self, kind: Kind, resource: str, name: str, inner: str | None) -> None:
+        incarnation = self._faces.by_inner_uri(inner) if inner is not None else None
+        if (
+            incarnation is not None
+            and incarnation.life is Life.LIVE
+            and kind is not Kind.SERVICE
+            and incarnation.name == name
+            and (kind, resource) not in incarnation.shelf
+            and self._may_have(incarnation, kind, resource)
+        ):
+            types = dict(
+                cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", _NAME))[2])
+            )
+            self._graph.registered(incarnation, kind, resource, types.get(resource, "*"))
+            return
+        # A service's real port is not known to ROSMaster, so an offer that was not written down is withdrawn.
+        call = self._rosmaster.call_now
+        if kind is Kind.SERVICE:
+            uri = stand_in(incarnation) if incarnation is not None else NO_SERVICE
+            await call("unregisterService", name, resource, uri)
+        elif inner is not None:
+            method = "unregisterPublisher" if kind is Kind.PUBLICATION else "unregisterSubscriber"
+            await call(method, name, resource, inner)

@@ -1,0 +1,61 @@
+"""After a relay is new: subscribers that do not come back are told their lists again, a few times.
+
+rospy forgets a connection that broke and opens another only for a list that arrives *after* it saw the break; a list
+that overtakes the break (the machine is busy, the relay hung before it died) changes nothing, and there would never
+be another. roscpp comes back by itself to a port that stayed open; where it was shut for a while (the whole appliance
+was restarted) it gives up, and takes a list it knows for no news. So who is still away after the first reminders is
+told to drop the publisher and to take it again.
+"""
+
+import asyncio
+
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.relays import RelayControl
+
+_GENTLE = 2  # reminders before the publisher is to be dropped and taken again
+_PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look
+
+
+class Reminders:
+    """Looks whether everybody is back whenever a relay was attached."""
+
+    def __init__(self, registry: Registry, relay: RelayControl, graph: Graph) -> None:
+        self._registry = registry
+        self._relay = relay
+        self._graph = graph
+        self._round: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """A relay is new."""
+        self.close()
+        self._round = asyncio.get_running_loop().create_task(self._remind())
+
+    def close(self) -> None:
+        """Stop looking."""
+        if self._round is not None:
+            self._round.cancel()
+
+    async def _remind(self) -> None:
+        for number, pause in enumerate(_PAUSES):
+            await asyncio.sleep(pause)
+            absent = self.absent()
+            if not absent:
+                return
+            for subscriber, topic, publishers in absent:
+                if number < _GENTLE:
+                    self._graph.remind(subscriber, topic)
+                else:
+                    self._graph.renew(subscriber, topic, publishers)
+
+    def absent(self) -> list[tuple[Incarnation, str, list[Incarnation]]]:
+        """Subscribers, topics, and the publishers they hold a grant for and are not connected to."""
+        found: dict[tuple[str, str], tuple[Incarnation, str, list[Incarnation]]] = {}
+        for row in self._relay.unconnected():
+            publisher = self._registry.by_key(row.key)
+            for subscriber in self._registry.registered(Kind.SUBSCRIPTION, row.resource):
+                if publisher is None or (subscriber.name, str(subscriber.host)) != (row.caller_id, row.host):
+                    continue
+                entry = found.setdefault((subscriber.key, row.resource), (subscriber, row.resource, []))
+                entry[2].append(publisher)
+        return list(found.values())

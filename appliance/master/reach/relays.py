@@ -1,0 +1,453 @@
+"""Control's side of the relays: states what is wanted, answers where publishers are, keeps who may have what.
+
+What is wanted is derived from the registry (nodes, publications, services) and the grants, which are kept in the
+store because a ROS node never asks twice. Each topic and service is stated to the relay that carries it
+(`allocation`), a node to every relay that carries something of it. When a relay (re)appears everything of its is
+stated afresh between `StateBegan` and `StateEnded`; what is not said again is gone.
+"""
+
+import asyncio
+import ipaddress
+from collections.abc import Callable, Iterable
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.carried import Carried, Connection, Traffic
+from appliance.master.reach.places import Places
+from appliance.master.reach.relay_post import RelayPost
+from appliance.policy import Policy
+from appliance.policy.limits import Part, Rate
+from appliance.policy.model import Address
+from appliance.recorder import Recorder
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.client import CallFailedError
+from appliance.shares.pool import Bounds
+from appliance.shares.table import GRANTS
+from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
+from appliance.store.state import PermissionRow, StateStore
+
+RELAY_NAME = "/rosrv"
+_CLEARED_AT_ONCE = 1000
+_KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
+_WORDS = {kind: word for word, kind in _KINDS.items()}
+
+
+class RelayControl:
+    """What control knows and wants of the relays. `broken(incarnation)` hears of lost upstreams."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        places: Places,
+        store: StateStore,
+        delivery: Delivery,
+        recorder: Recorder,
+        *,
+        allocation: Allocation,
+        policy: Callable[[], Policy],
+        broken: Callable[[Incarnation], None],
+        grants: Bounds = GRANTS.bounds,
+    ) -> None:
+        self._registry = registry
+        self._grants = grants
+        self._places = places
+        self._store = store
+        self._delivery = delivery
+        self._broken = broken
+        self._allocation = allocation
+        self._policy = policy
+        self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
+        self._permissions: dict[str, set[PermissionRow]] = {}
+        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
+        self._granted = 0
+        self._asking: set[asyncio.Task[None]] = set()
+        self.statement: Callable[[int], messages.Message | None] = lambda relay: None  # noqa: ARG005 - set when wired
+        self.heard: Callable[[messages.Message, int], None] = lambda message, relay: None  # noqa: ARG005 - the same
+        self.lost: Callable[[int], None] = lambda relay: None  # noqa: ARG005 - the same
+        self.own_header: messages.OwnHeaderStated | None = None  # of what control publishes itself
+        self.carried = Carried(recorder, self._known_name, allocation.relays, is_own=self._is_own)
+
+    @property
+    def presence(self) -> str:
+        """`connected` when every relay is there, `away` when none is, else how many are away."""
+        away = sum(not post.there for post in self._posts)
+        if not away:
+            return "connected"
+        return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
+
+    def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
+        """The port that stands for a publication or a service of an incarnation."""
+        return incarnation.relay_ports[self._allocation.of(_WORDS[kind], resource)]
+
+    @property
+    def connections(self) -> dict[tuple[int, int], Connection]:
+        """Who is connected through which relay."""
+        return self.carried.connections
+
+    @property
+    def traffic(self) -> dict[tuple[str, str], Traffic]:
+        """What went through each topic and service of each incarnation."""
+        return self.carried.traffic
+
+    def flow(self, key: str, resource: str) -> dict[str, float]:
+        """What went and goes through a topic or service of an incarnation, in plain values."""
+        return self.carried.flow(key, resource)
+
+    # --- the links ---
+
+    def load(self) -> None:
+        """Read the kept grants."""
+        for row in self._store.permissions():
+            if not row.caller_id:  # of an earlier version, for every name of the host: it looks up again
+                self._store.remove_permission(row)
+                continue
+            self._permissions.setdefault(row.key, set()).add(row)
+            self._of_host.setdefault(row.host, {})[row] = None
+            self._granted += 1
+
+    def attach(self, index: int, channel: Channel) -> None:
+        """A relay is there: serve its link and state everything that it is to carry."""
+        post = self._posts[index]
+        self.carried.lost(index)
+        post.attach(channel, lambda message, _descriptors: self._received(post, message), self._lost)
+        specifications = self.statement(index)  # before anything is placed: nothing goes past the monitors
+        if specifications is not None:
+            post.send(specifications)
+        if self.own_header is not None:
+            post.send(self.own_header)
+        with post.restating():
+            for incarnation in self._registry.live():
+                self._place(post, incarnation)
+
+    def _lost(self, post: RelayPost) -> None:
+        self.carried.lost(post.index)
+        self.lost(post.index)
+
+    def send(self, message: messages.Message, relay: int) -> bool:
+        """Tell a relay; False when it is not there."""
+        return self._posts[relay].send(message)
+
+    def publish(self, message: messages.OwnPublished) -> None:
+        """Publish as the appliance's own publisher, to whoever subscribes now."""
+        self._post(TOPIC, message.topic).send(message)
+
+    def carries(self, relay: int, kind: str, resource: str) -> bool:
+        """Whether a topic or service is carried by this relay."""
+        return self._allocation.of(kind, resource) == relay
+
+    def carried_now(self) -> set[Resource]:
+        """Topics and services of nodes that live."""
+        return {
+            (_WORDS[one.kind], one.resource)
+            for _incarnation, one in self._registry.in_order()
+            if one.kind in _WORDS
+        }
+
+    def _post(self, kind: str, resource: str) -> RelayPost:
+        return self._posts[self._allocation.of(kind, resource)]
+
+    # --- what is wanted ---
+
+    def _place(self, post: RelayPost, incarnation: Incarnation) -> None:
+        """State what a relay is to carry of an incarnation."""
+        for registration in incarnation.registrations.values():
+            word = _WORDS.get(registration.kind)
+            if word is not None and self.carries(post.index, word, registration.resource):
+                self._place_one(
+                    post, incarnation, registration.kind, registration.resource, registration.detail
+                )
+        for row in self._permissions.get(incarnation.key, ()):
+            if self.carries(post.index, row.kind, row.resource):
+                self._state(row)
+
+    def _place_one(
+        self, post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str, detail: str
+    ) -> None:
+        if incarnation.key not in post.placed:
+            post.placed.add(incarnation.key)
+            listening = self._places.socket(incarnation.relay_ports[post.index])
+            post.send(
+                messages.NodePlaced(
+                    incarnation.key, incarnation.name, str(incarnation.host), incarnation.of_monitors
+                ),
+                (listening.fileno(),),
+            )
+        if kind is Kind.PUBLICATION:
+            post.send(self._publication(self._policy(), incarnation, resource, detail))
+        else:
+            post.send(messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail)))
+
+    def _state(self, row: PermissionRow) -> None:
+        post = self._post(row.kind, row.resource)
+        if row.kind == TOPIC:
+            post.send(_grant(self._policy(), row))
+        else:
+            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id))
+
+    def placed(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
+        """The incarnation registered a publication or a service."""
+        if kind in _WORDS:
+            self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
+
+    def withdrawn(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        """The incarnation has a publication or a service no longer."""
+        if kind in _WORDS:
+            _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
+
+    def withdraw_moving(self, moves: Iterable[Move]) -> None:
+        """Stop carrying what is about to be carried by another relay; the allocation is still the old one.
+
+        Its grants go, too: one that is revoked later is revoked where it is carried then, and may come back.
+        """
+        for move in moves:
+            post = self._posts[move.source]
+            for incarnation in self._registry.registered(_KINDS[move.kind], move.name):
+                _withdraw(post, incarnation, _KINDS[move.kind], move.name)
+                for row in self._rows_of(incarnation, move):
+                    _revoke(post, row)
+
+    def place_moved(self, moves: Iterable[Move]) -> None:
+        """Carry what has moved, with its grants; the allocation is the new one."""
+        for move in moves:
+            kind, post = _KINDS[move.kind], self._posts[move.target]
+            for incarnation in self._registry.registered(kind, move.name):
+                detail = incarnation.registrations[kind, move.name].detail
+                self._place_one(post, incarnation, kind, move.name, detail)
+                for row in self._rows_of(incarnation, move):
+                    self._state(row)
+
+    def _rows_of(self, incarnation: Incarnation, move: Move) -> list[PermissionRow]:
+        rows = self._permissions.get(incarnation.key, ())
+        return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
+
+    def node_withdrawn(self, incarnation: Incarnation) -> None:
+        """The incarnation is gone (for now): nothing of it is carried."""
+        for post in self._posts:
+            if incarnation.key in post.placed:
+                post.placed.discard(incarnation.key)
+                post.send(messages.NodeWithdrawn(incarnation.key))
+
+    def node_returned(self, incarnation: Incarnation) -> None:
+        """The incarnation is back with all it had."""
+        for post in self._posts:
+            self._place(post, incarnation)
+
+    def forgotten(self, incarnation: Incarnation) -> None:
+        """The incarnation is gone for good, its grants with it."""
+        self.node_withdrawn(incarnation)
+        for row in self._permissions.pop(incarnation.key, ()):
+            self._drop(row)
+        self.carried.forgotten(incarnation.key)
+
+    def policy_changed(self, before: Policy, now: Policy) -> None:
+        """Another policy is in force: the relays are told of limits that are others now."""
+        if not before.limits_anything and not now.limits_anything:
+            return
+        for incarnation in self._registry.live():
+            for registration in incarnation.registrations.values():
+                if registration.kind is not Kind.PUBLICATION:
+                    continue
+                topic, detail = registration.resource, registration.detail
+                was, is_now = (self._publication(one, incarnation, topic, detail) for one in (before, now))
+                if was != is_now:
+                    self._post(TOPIC, topic).send(is_now)
+            for row in self._permissions.get(incarnation.key, ()):
+                if row.kind == TOPIC and _grant(before, row) != _grant(now, row):
+                    self._state(row)
+
+    def _publication(
+        self, policy: Policy, incarnation: Incarnation, topic: str, detail: str
+    ) -> messages.PublicationPlaced:
+        return messages.PublicationPlaced(
+            incarnation.key,
+            topic,
+            detail,
+            _flow(policy.limit(Part.PUBLISHER, topic, incarnation.host)),
+            _flow(policy.limit(Part.TOPIC, topic)),
+        )
+
+    def unconnected(self) -> list[PermissionRow]:
+        """Grants for topics of live publishers whose subscriber is not connected."""
+        there = {
+            (one.key, one.resource, one.host, one.caller_id) for one in self.carried.connections.values()
+        }
+        return [
+            row
+            for incarnation in self._registry.live()
+            for row in self._permissions.get(incarnation.key, ())
+            if row.kind == TOPIC
+            and (Kind.PUBLICATION, row.resource) in incarnation.registrations
+            and (row.key, row.resource, row.host, row.caller_id) not in there
+        ]
+
+    # --- grants ---
+
+    def permissions(self) -> list[PermissionRow]:
+        """Every grant."""
+        return [row for rows in self._permissions.values() for row in rows]
+
+    def grant_topic(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> None:
+        """This subscriber may have this topic of that publisher."""
+        self._grant(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
+
+    def grant_service(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
+        """This client may call this service of that provider. Nobody calls without a name."""
+        if caller_id:
+            self._grant(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
+
+    def _grant(self, row: PermissionRow) -> None:
+        rows = self._permissions.setdefault(row.key, set())
+        mine = self._of_host.setdefault(row.host, {})
+        mine[row] = mine.pop(row, None)  # it is the newest, whenever it was granted first
+        if row not in rows:
+            rows.add(row)
+            self._store.save_permission(row)
+            self._granted += 1
+            if len(mine) > self._grants.host:
+                self._clear_unused(row.host, row)
+            elif self._granted > self._grants.whole:
+                self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
+        self._state(row)
+
+    def _clear_unused(self, host: str, newest: PermissionRow) -> None:
+        """A host that has too many grants loses its oldest ones that nobody is connected by."""
+        used = {
+            (one.key, one.kind, one.resource, one.host, one.caller_id)
+            for one in self.carried.connections.values()
+        }
+        unused = [
+            row
+            for row in self._of_host[host]
+            if row != newest and (row.key, row.kind, row.resource, row.host, row.caller_id) not in used
+        ]
+        for row in unused[:_CLEARED_AT_ONCE]:
+            self.revoke(row)
+
+    def _drop(self, row: PermissionRow) -> None:
+        self._store.remove_permission(row)
+        mine = self._of_host.get(row.host, {})
+        if row in mine:
+            del mine[row]
+            self._granted -= 1
+        if not mine:
+            self._of_host.pop(row.host, None)
+
+    def revoke(self, row: PermissionRow) -> None:
+        """Take a grant back; its connection is cut."""
+        rows = self._permissions.get(row.key, set())
+        rows.discard(row)
+        self._drop(row)
+        _revoke(self._post(row.kind, row.resource), row)
+
+    def revoke_subscriber(self, host: Address, caller_id: str, topic: str) -> None:
+        """The subscriber gave the topic up: its grants for it, on every publisher, are gone."""
+        for publisher in list(self._registry.registered(Kind.PUBLICATION, topic)):
+            row = PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id)
+            if row in self._permissions.get(publisher.key, ()):
+                self.revoke(row)
+
+    # --- what the relays say ---
+
+    def _received(self, post: RelayPost, message: messages.Message) -> None:
+        match message:
+            case messages.UpstreamWanted():
+                work = self._find_upstream(post, message.key, message.topic)
+                task = asyncio.get_running_loop().create_task(work)
+                self._asking.add(task)
+                task.add_done_callback(self._asking.discard)
+            case messages.UpstreamLost():
+                incarnation = self._registry.by_key(message.key)
+                if incarnation is not None:
+                    self.carried.upstream_lost(message, str(incarnation.host))
+                    self._broken(incarnation)
+            case messages.LatchRefused() | messages.MessagesLimited():
+                self._held_back(message)
+            case messages.TrafficReported():
+                self.carried.reported(message.rows, message.over)
+                self.carried.unrecorded(message.unrecorded)
+                self.carried.memory[post.index] = message.memory
+            case messages.ConnectionOpened():
+                self.carried.opened(post.index, message)
+            case messages.ConnectionClosed():
+                self.carried.closed(post.index, message)
+            case messages.ConnectionRefused():
+                self.carried.refused(message)
+            case messages.PublicationRefused():
+                self.carried.publication_refused(message)
+            case _:
+                self.heard(message, post.index)
+
+    def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
+        """Messages were not kept or not passed on."""
+        if isinstance(message, messages.MessagesLimited):
+            for row in message.rows:
+                self.carried.limited(row, self._policy().limit_rule(row.topic) if row.topic else None)
+        else:
+            incarnation = self._registry.by_key(message.key)
+            if incarnation is not None:
+                self.carried.latch_refused(message, str(incarnation.host))
+
+    async def _find_upstream(self, post: RelayPost, key: str, topic: str) -> None:
+        incarnation = self._registry.by_key(key)
+        if incarnation is None or (Kind.PUBLICATION, topic) not in incarnation.registrations:
+            post.send(messages.UpstreamRefused(key, topic, "the node does not publish this topic any more"))
+            return
+        try:
+            answer = await self._delivery.client(incarnation).call(
+                "requestTopic", RELAY_NAME, topic, [["TCPROS"]]
+            )
+            port = tcpros_port(answer)
+        except CallFailedError as error:
+            post.send(messages.UpstreamRefused(key, topic, str(error)))
+            self._broken(incarnation)
+            return
+        post.send(messages.UpstreamFound(key, topic, str(incarnation.host), port))
+
+    def _known_name(self, key: str) -> str | None:
+        incarnation = self._registry.by_key(key)
+        return incarnation.name if incarnation is not None else None
+
+    def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
+        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
+        holder = self._registry.holder(caller_id)
+        return (
+            holder is not None
+            and holder.own
+            and host in (str(holder.host), holder.told)
+            and (Kind.SUBSCRIPTION, topic) in holder.registrations
+        )
+
+
+def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
+    limit = policy.limit(Part.SUBSCRIBER, row.resource, ipaddress.ip_address(row.host))
+    return messages.GrantInstalled(row.key, row.resource, row.host, row.caller_id, _flow(limit))
+
+
+def _flow(rate: Rate) -> messages.FlowLimit:
+    return messages.FlowLimit(rate.messages, rate.bytes)
+
+
+def _withdraw(post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+    if kind is Kind.PUBLICATION:
+        post.send(messages.PublicationWithdrawn(incarnation.key, resource))
+    else:
+        post.send(messages.ServiceWithdrawn(incarnation.key, resource))
+
+
+def _revoke(post: RelayPost, row: PermissionRow) -> None:
+    if row.kind == TOPIC:
+        post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
+    else:
+        post.send(messages.ClientRevoked(row.key, row.resource, row.host, row.caller_id))
+
+
+def tcpros_port(answer: Value) -> int:
+    """The port in a node's answer to `requestTopic`; the host in it is never followed."""
+    match answer:
+        case [1, str(), ["TCPROS", str(), int(port)]] if 0 < port < 65536:
+            return port
+        case [int(), str(text), *_]:
+            raise CallFailedError(f"the publisher refused: {text[:200]}")
+    raise CallFailedError("the publisher's answer to requestTopic is not of the ROS form")

@@ -1,0 +1,1 @@
+"""Connections of publishers, subscribers, clients and services."""

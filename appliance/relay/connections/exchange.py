@@ -1,0 +1,135 @@
+"""The conversation of one service connection after the headers, without sockets.
+
+The client sends a request, the service a reply, in turns; on a persistent connection over and over. A request
+that comes before its turn waits, and the client is not read while one does (`may_read`).
+
+Both are taken apart and written afresh: what passes here are whole requests and replies, one at a time, which
+is where a monitor can stand (`_request`, `_reply`).
+
+Invariants:
+- There is at most one request at the service, and no reply without one.
+- A client that does not read its replies gets no further request through.
+"""
+
+from collections import deque
+from collections.abc import Callable
+
+from appliance.relay.monitors.middle import Judged
+from appliance.ros.errors import ProtocolError
+from appliance.ros.tcpros import (
+    FrameParser,
+    ServiceReply,
+    ServiceReplyParser,
+    encode_frame,
+    encode_service_error,
+    encode_service_reply,
+)
+
+_REPLY_HEAD = 5  # bytes before the body of a reply
+
+
+class ServiceExchange:
+    """Requests one way, replies the other: `to_service(data)` and `to_client(data)` write.
+
+    `count(size)` is called for each request and reply. `held` is the bytes of requests that are not whole or have to
+    wait, `held_replies` those of replies that are not whole. `judge(part, body)` is where monitors stand: it says what
+    becomes of a `request` or `response`.
+    """
+
+    def __init__(
+        self,
+        limit: int,
+        *,
+        persistent: bool,
+        to_service: Callable[[bytes], None],
+        to_client: Callable[[bytes], None],
+        count: Callable[[int], None],
+        judge: Callable[[str, bytes], Judged] | None = None,
+    ) -> None:
+        self._persistent = persistent
+        self._to_service = to_service
+        self._to_client = to_client
+        self._count = count
+        self._judge = judge
+        self._requests = FrameParser(limit)
+        self._replies = ServiceReplyParser(limit)
+        self._waiting: deque[bytes] = deque()
+        self._busy = False
+        self.done = False
+        self.held = 0
+        self.held_replies = 0
+
+    @property
+    def may_read(self) -> bool:
+        """Whether the client may be read: no request is at the service or waits for it."""
+        return not self._busy and not self._waiting and not self.done
+
+    @property
+    def ready(self) -> bool:
+        """Whether a request waits that may go to the service."""
+        return bool(self._waiting) and not self._busy and not self.done
+
+    @property
+    def unfinished(self) -> int:
+        """The bytes of a request or reply that is not whole; 0 while whole requests wait for their turn."""
+        return self.held_replies + (0 if self._waiting else self.held)
+
+    def from_client(self, data: bytes) -> None:
+        """Bytes from the client. Raises `PeerError` when they are no request."""
+        self.held += len(data)
+        self._waiting.extend(self._requests.feed(data))
+
+    def from_service(self, data: bytes) -> None:
+        """Bytes from the service. Raises `PeerError` when they are no reply, or one that nobody asked for."""
+        self.held_replies += len(data)
+        for reply in self._replies.feed(data):
+            if not self._busy:
+                raise ProtocolError("the service sent a reply without a request")
+            self._reply(reply)
+
+    def advance(self) -> None:
+        """The client has taken all that was written to it: its next request goes to the service."""
+        if self.ready:
+            self._request(self._waiting.popleft())
+
+    def _request(self, body: bytes) -> None:
+        data = encode_frame(body)
+        self._pass_on(data)
+        if self._judge is not None:
+            judged = self._judge("request", body)
+            if judged.refused is not None:
+                self._refuse(judged.refused)
+                return
+            if judged.body is not body:
+                data = encode_frame(judged.body)
+        self._busy = True
+        self._to_service(data)
+
+    def _refuse(self, reason: str) -> None:
+        """The client reads the reason where it expects a reply."""
+        self.done = not self._persistent
+        data = encode_service_error(reason)
+        self._count(len(data))
+        self._to_client(data)
+
+    def _reply(self, reply: ServiceReply) -> None:
+        self.held_replies -= len(reply.body) + _REPLY_HEAD
+        if reply.ok and self._judge is not None:
+            judged = self._judge("response", reply.body)
+            reply = (
+                ServiceReply(True, judged.body)
+                if judged.refused is None
+                else ServiceReply(False, judged.refused.encode())
+            )
+        if reply.ok:
+            data = encode_service_reply(reply.body)
+        else:
+            data = encode_service_error(reply.body.decode("utf-8", "replace"))
+        self._busy = False
+        self.done = not self._persistent
+        self._count(len(data))
+        self._to_client(data)
+
+    def _pass_on(self, data: bytes) -> None:
+        self.held -= len(data)
+        self._count(len(data))

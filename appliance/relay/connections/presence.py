@@ -1,0 +1,89 @@
+"""Subscribers that their publisher must see by name: the topics of actions.
+
+A publisher sees one connection of the relay for any number of subscribers. An action client, though, waits until the
+topics it sends goals and cancellations on are connected to *its server*, which it knows by the `callerid` of the
+status messages (actionlib, `wait_for_server`). For these topics every subscriber that is served gets a presence: one
+more connection to the publisher, under the subscriber's own `callerid`, whose messages are thrown away. It is opened
+only after the subscriber is served, so that what the publisher then sends does reach it. These topics carry a message
+now and then, so that sending it once more costs nothing.
+"""
+
+from functools import partial
+
+from appliance.relay.connections.sockets import Stream, begin_connect
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import Timer
+from appliance.ros.tcpros import encode_header
+
+_GOAL = "ActionGoal"
+_CANCEL = "actionlib_msgs/GoalID"
+_RETRY_SECONDS = 1.0
+
+
+def looks_for_names(type_name: str) -> bool:
+    """Whether a publisher of this type waits for a subscriber of a certain name."""
+    return type_name.endswith(_GOAL) or type_name == _CANCEL
+
+
+class Presences:
+    """The presences at one publisher of one topic, at `host:port` while its main connection is open."""
+
+    def __init__(self, context: RelayContext, topic: str) -> None:
+        self._context = context
+        self._topic = topic
+        self._wanted: frozenset[str] = frozenset()
+        self._address: tuple[str, int] | None = None
+        self._streams: dict[str, Stream] = {}
+        self._retry: Timer | None = None
+
+    def want(self, names: frozenset[str], address: tuple[str, int]) -> None:
+        """These subscribers are served now, of the publisher at this address."""
+        self._wanted, self._address = names, address
+        for name in [one for one in self._streams if one not in names]:
+            self._streams.pop(name).close()
+        self._open_missing()
+
+    def close(self) -> None:
+        """The main connection is gone, and they with it."""
+        self._wanted, self._address = frozenset(), None
+        for stream in self._streams.values():
+            stream.close()
+        self._streams.clear()
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+
+    def _open_missing(self) -> None:
+        self._retry = None
+        if self._address is None:
+            return
+        for name in sorted(self._wanted - self._streams.keys()):
+            try:
+                sock = begin_connect(*self._address)
+            except (OSError, OverflowError):
+                self._try_again()
+                return
+            self._streams[name] = Stream(
+                self._context.loop,
+                sock,
+                partial(self._received, name),
+                partial(self._broken, name),
+                opened=partial(self._connected, name),
+            )
+
+    def _connected(self, name: str) -> None:
+        fields = {"callerid": name, "topic": self._topic, "type": "*", "md5sum": "*", "tcp_nodelay": "1"}
+        self._streams[name].send(encode_header(fields))
+
+    def _received(self, name: str, data: bytes) -> None:
+        if not data:
+            self._streams[name].close()
+            self._broken(name, "")
+
+    def _broken(self, name: str, _reason: str) -> None:
+        self._streams.pop(name, None)
+        self._try_again()
+
+    def _try_again(self) -> None:
+        if self._retry is None:
+            self._retry = self._context.loop.after(_RETRY_SECONDS, self._open_missing)

@@ -1,0 +1,222 @@
+"""A subscriber's connection: the publisher's header, then frames; nothing is expected from the subscriber.
+
+Invariants:
+- No send ever blocks. What the socket does not take waits in the subscriber's own `Outbox`.
+- A subscriber that sends anything after its header is cut: its connection is for the one topic it was
+  granted.
+"""
+
+import socket
+from collections.abc import Callable, Mapping
+
+from appliance.relay.connections.flow import Flow
+from appliance.relay.connections.frames import LARGE, Batch
+from appliance.relay.connections.memory import Stall
+from appliance.relay.connections.outbox import Outbox
+from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import READ, WRITE
+from appliance.ros.tcpros import encode_header
+
+_ANY = "*"
+
+
+class Subscriber:
+    """One subscriber of one relayed topic.
+
+    Either `ended()` is called once, when its connection is closed, or `refuse(sock, reason)`, which takes the
+    socket over, when the types differ.
+    """
+
+    def __init__(
+        self,
+        context: RelayContext,
+        sock: socket.socket,
+        topic: RelayedTopic,
+        host: str,
+        fields: Mapping[str, str],
+        *,
+        refuse: Callable[[socket.socket, str], None],
+        ended: Callable[[], None],
+    ) -> None:
+        self.topic = topic
+        self.host = host
+        self.caller_id = fields["callerid"]
+        self.flow: Flow | None = None
+        self.missed = False
+        self.behind_since: float | None = None
+        self._loop = context.loop
+        self._socket = sock
+        self._send = sock.send
+        self._fields = fields
+        self._reporter = context.reporter
+        self._refuse = refuse
+        self._ended = ended
+        self._share = context.memory.queues.of(host)
+        self._outbox = Outbox(context.limits, self._share)
+        self._stall = Stall(context.limits.stall_seconds)
+        self._number = 0
+        self._live = True
+        self._loop.watch(sock.fileno(), READ, self._ready)
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Answer with the publisher's header, or with an error header where type and md5sum do not fit."""
+        mismatch = describe_mismatch(self._fields, header)
+        if mismatch:
+            self._live = False
+            self._loop.unwatch(self._socket.fileno())
+            self.topic.leave(self)
+            self._refuse(self._socket, mismatch)
+            return False
+        self._number = self._reporter.opened(
+            self.topic.key, self.topic.topic, "topic", self.host, self.caller_id
+        )
+        data = encode_header(header)
+        try:
+            sent = self._send(data)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
+            self._close(f"cannot be written to: {error.strerror}")
+            return False
+        if sent < len(data):
+            self._outbox.begin(memoryview(data)[sent:])
+            self._loop.change(self._socket.fileno(), READ | WRITE)
+        return True
+
+    def deliver(self, batch: Batch) -> int:
+        """Send the frames, or queue what the socket does not take; how many it does not get.
+
+        Large ones are not begun while its host has no memory for what the socket may leave.
+        """
+        if self.flow is not None:
+            passing = self._limited(self.flow, batch)
+            if passing is None:
+                return 0
+            batch = passing
+        outbox = self._outbox
+        if outbox:
+            outbox.append(batch.keep(), batch.messages)
+        else:
+            view = batch.view
+            if len(view) > LARGE and self._share.exhausted:
+                return batch.messages
+            try:
+                sent = self._send(view)
+            except BlockingIOError:
+                sent = 0
+            except OSError as error:
+                self._close(f"cannot be written to: {error.strerror}")
+                return 0
+            if sent == len(view):
+                return 0
+            outbox.append(batch.keep(), batch.messages, sent)
+            self._loop.change(self._socket.fileno(), READ | WRITE)
+        if self.behind_since is None and outbox.behind:
+            self.behind_since = self._loop.clock()
+        return 0
+
+    def _limited(self, flow: Flow, batch: Batch) -> Batch | None:
+        """The first messages, as many as its limit lets pass; the others are told."""
+        count = flow.room(batch, batch.messages, self._loop.clock())
+        self.missed = count < batch.messages
+        if self.missed:
+            part = batch.head(count)
+            topic, gone = self.topic, len(batch.view) - len(part.view)
+            self._reporter.limited(
+                (topic.key, topic.topic, "subscriber", self.host, self.caller_id),
+                batch.messages - count,
+                gone,
+            )
+            batch = part
+        if not count:
+            return None
+        flow.take(batch)
+        return batch
+
+    @property
+    def full(self) -> bool:
+        """Whether the queue has reached its bounds."""
+        return self._outbox.full
+
+    def trim(self) -> int:
+        """Drop the oldest messages beyond the bounds; how many."""
+        return self._outbox.trim()
+
+    def look(self) -> None:
+        """A second is over: beyond its host's share, one that takes nothing of a message that has begun is cut."""
+        begun = self._outbox.begun if self._outbox.short else 0
+        if self._stall.seen(begun, self._loop.clock()):
+            self._close(
+                "its host has no memory left in the relay, and it does not take the rest of a message"
+            )
+
+    def cut(self, reason: str) -> None:
+        """Close the connection: what it stands on is gone."""
+        self._close(reason)
+
+    def _ready(self, events: int) -> None:
+        if events & WRITE:
+            self._flush()
+        if self._live and events & ~WRITE:
+            self._listen()
+
+    def _flush(self) -> None:
+        outbox = self._outbox
+        try:
+            sent = self._socket.sendmsg(outbox.vectors())
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._close(f"cannot be written to: {error.strerror}")
+            return
+        outbox.advance(sent)
+        if not outbox:
+            self.behind_since = None
+            self._loop.change(self._socket.fileno(), READ)
+            self.topic.relieve()
+
+    def _listen(self) -> None:
+        try:
+            data = self._socket.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._close(f"broke: {error.strerror}")
+            return
+        if not data:
+            self._close("")
+            return
+        reason = (
+            "sent data after its header; a connection is for one topic, ask for another on another connection"
+        )
+        asked = ("topic", self.topic.topic)
+        self._reporter.refused(self.topic.key, asked, self.host, self.caller_id, reason)
+        self._close(reason)
+
+    def _close(self, reason: str) -> None:
+        if self._live:
+            self._live = False
+            self._loop.discard(self._socket)
+            self._outbox.clear()
+            self.topic.leave(self)
+            self._reporter.closed(self._number, reason)
+            self._ended()
+
+
+def describe_mismatch(wanted: Mapping[str, str], offered: Mapping[str, str]) -> str:
+    """Why a subscriber's header does not fit a publisher's; empty when it does.
+
+    As in ROS, the md5sum decides.
+    """
+    md5sum, real_md5sum = wanted.get("md5sum", _ANY), offered.get("md5sum", _ANY)
+    if _ANY in {md5sum, real_md5sum} or md5sum == real_md5sum:
+        return ""
+    name, real_name = wanted.get("type", _ANY), offered.get("type", _ANY)
+    if _ANY not in {name, real_name} and name != real_name:
+        return f"topic types do not match: [{name}] vs. [{real_name}]"
+    return (
+        f"Client [{wanted.get('callerid', '')}] wants topic [{wanted.get('topic', '')}] to have"
+        f" datatype/md5sum [{name}/{md5sum}], but our version has [{real_name}/{real_md5sum}]."
+        " Dropping connection."
+    )

@@ -1,0 +1,405 @@
+"""One relayed topic of one publisher: who gets its messages, without sockets.
+
+A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header,
+and subscribers that are served. The upstream exists while there is a subscriber, and a short linger beyond.
+
+When the upstream is lost, the subscribers stay: the publication still stands, so its node lives or control
+will withdraw it, and then they are cut. Keeping them is what keeps traffic flowing: rospy never connects
+again to an address that closed on it (only a `publisherUpdate` makes it), roscpp waits up to 20 s between two
+tries; but when the publisher is reached again, messages go on at once for both. Frames are passed on whole
+(`frames`), so nobody has been left with a torn one. Only when the publisher comes back with another type or
+md5sum are they cut: they must read the new header. A publisher that is killed and restarted is another
+incarnation with another key and port; its subscribers are told by control, and the old connections end with
+the withdrawal.
+
+A topic that monitors want has its upstream without any subscriber, too. What they leave of a batch (`middle`) is
+what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
+(`published`). What a new publisher says first is kept for those that are on their way (`first_words`).
+
+A latched message that the publisher's host has no memory for is passed on and not kept (`latch`). Who comes later
+gets it from the publisher, which is connected to anew when there is room again; the others get it once more.
+
+When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
+most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
+and large messages do not pile up. One that takes longer is slow: what is beyond its bounds is dropped until it
+has caught up completely, and it never delays the others, since one that keeps up is never behind.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from appliance.channel.messages import LatchRefused, TopicTraffic
+from appliance.relay.connections.delays import Delays
+from appliance.relay.connections.first_words import APPEARED, FirstWords
+from appliance.relay.connections.flow import Part, PublicationFlow
+from appliance.relay.connections.frames import Batch
+from appliance.relay.connections.headers import to_subscriber
+from appliance.relay.connections.memory import HostShare
+
+
+class Member(Protocol):
+    """A subscriber, as its topic sees it."""
+
+    caller_id: str
+    """Who it says it is."""
+
+    missed: bool
+    """Whether its limit kept the last message from it."""
+
+    behind_since: float | None
+    """When so much waited for it first that it is behind; None once it has caught up completely."""
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Answer with the publisher's header, or refuse if the types differ; whether it is served now."""
+
+    def deliver(self, batch: Batch) -> int:
+        """Send the batch or queue it; how many messages it does not get."""
+
+    @property
+    def full(self) -> bool:
+        """Whether its queue has reached its bounds."""
+
+    def trim(self) -> int:
+        """Drop what is beyond the bounds, oldest first; how many messages."""
+
+    def look(self) -> None:
+        """A second is over."""
+
+    def cut(self, reason: str) -> None:
+        """Close its connection."""
+
+
+class Upstream(Protocol):
+    """The connection to the publisher, as its topic sees it."""
+
+    def want(self) -> None:
+        """There is somebody to serve."""
+
+    def spare(self) -> None:
+        """There is nobody to serve any more."""
+
+    def pause(self, seconds: float) -> None:
+        """Do not read until `resume`, or for so long."""
+
+    def resume(self) -> None:
+        """Read on."""
+
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """These are served now, of a topic of this type."""
+
+    def give_again(self) -> None:
+        """Have a latching publisher give its message again."""
+
+
+Through = Callable[[Batch], Batch | None]
+"""Monitors: the frames that go on, as they leave them; None when none does."""
+
+
+class RelayedTopic:
+    """A topic of an incarnation at `host`, with its subscribers; `share` counts what is kept of it.
+
+    `fresh`: the publisher has just appeared. `limited(part, messages, size)` hears what limits
+    dropped; `flow` is where they are set. `make_room(size)` tries to have others give up so much of
+    theirs, `refused(message)` is called when a latched message is not kept.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        topic: str,
+        name: str,
+        host: str,
+        *,
+        grace: float,
+        clock: Callable[[], float],
+        share: HostShare,
+        fresh: bool,
+        limited: Callable[[Part, int, int], None],
+        make_room: Callable[[int], None],
+        refused: Callable[[LatchRefused], None],
+    ) -> None:
+        self.key = key
+        self.topic = topic
+        self.host = host
+        self.name = name
+        self.upstream: Upstream | None = None
+        self._grace = grace
+        self._clock = clock
+        self._share = share
+        self.flow = PublicationFlow(share, limited)
+        self._make_room = make_room
+        self._refused = refused
+        self._unkept: LatchRefused | None = None
+        self._fresh_until = clock() + (APPEARED if fresh else -1)
+        self._header: dict[str, str] | None = None
+        self._waiting: tuple[Member, ...] = ()
+        self._served: tuple[Member, ...] = ()
+        self._latched: Batch | None = None
+        self._latching = False
+        self._withheld = False
+        self._first_words: FirstWords | None = None
+        self._paused = False
+        self._connected = False
+        self._through: Through | None = None
+        self._wanted = False
+        self._reported = True
+        self._next = 1
+        self._messages = self._bytes = self._dropped = 0
+        self._delays = Delays()
+
+    @property
+    def members(self) -> tuple[Member, ...]:
+        """Everybody who is connected for this topic."""
+        return self._waiting + self._served
+
+    def join(self, member: Member) -> None:
+        """A subscriber with a grant: served at once when the publisher's header is known, else when it is."""
+        if self._header is None:
+            self._waiting += (member,)
+        else:
+            self._serve(member, self._header)
+        if self.upstream is not None:
+            self.upstream.want()
+
+    def leave(self, member: Member) -> None:
+        """A subscriber's connection is closed."""
+        self._waiting = tuple(one for one in self._waiting if one is not member)
+        self._served = tuple(one for one in self._served if one is not member)
+        self._announce()
+        self._reported = False
+        self._forget_header()
+        self.relieve()
+        if not self.members and not self._wanted and self.upstream is not None:
+            self.upstream.spare()
+
+    def monitor(self, through: Through | None, *, wanted: bool) -> None:
+        """From the next batch on messages go `through` monitors (None: past them), who want them or do not."""
+        self._through = through
+        if wanted == self._wanted:
+            return
+        self._wanted = wanted
+        if self.upstream is None:
+            return
+        if wanted:
+            self.upstream.want()
+        elif not self.members:
+            self.upstream.spare()
+
+    def upstream_opened(self, header: Mapping[str, str]) -> None:
+        """The publisher has answered with its header."""
+        header = to_subscriber(header, self.name, self.topic)
+        before, self._header = self._header, header
+        self._latching = header.get("latching", "0") == "1"
+        self._connected = True
+        self._listen()
+        if before is not None and _identity(before) != _identity(header):
+            for member in self._served:
+                member.cut("the publisher has come back with another type")
+        waiting, self._waiting = self._waiting, ()
+        for member in waiting:
+            self._serve(member, header)
+        self._announce()
+        if (self.members or self._wanted) and self.upstream is not None:
+            self.upstream.want()
+
+    @property
+    def lacks_latched(self) -> bool:
+        """Whether monitors have kept back what a latching publisher gave, and nothing came through since."""
+        return self._latching and self._withheld and self._latched is None
+
+    def upstream_closed(self) -> None:
+        """The connection to the publisher is gone; its subscribers stay (see above)."""
+        self._latch(None)
+        self.flow.forget()
+        self._withheld = False
+        self._paused = False
+        self._connected = False
+        self._forget_first_words()
+        self._forget_header()
+
+    def received(self, batch: Batch, since: float) -> None:
+        """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers."""
+        self._messages += batch.messages
+        self._bytes += len(batch.view)
+        self._reported = False
+        batch.first = self._next
+        self._next += batch.messages
+        if self.flow:
+            passing = self.flow.passing(batch, self._clock(), latching=self._latching)
+            if passing is None:
+                return
+            batch = passing
+        self._admit(batch, since)
+
+    def _admit(self, batch: Batch, since: float) -> None:
+        left = batch if self._through is None else self._through(batch)
+        if left is None:
+            self._withheld = True
+        else:
+            self._pass_on(left)
+            if self._served:
+                self._delays.add(self._clock() - since, left.messages)
+
+    def published(self, batch: Batch) -> None:
+        """A monitor publishes: to the subscribers, and to no monitor."""
+        self._messages += batch.messages
+        self._bytes += len(batch.view)
+        self._reported = False
+        self._pass_on(batch)
+
+    def _pass_on(self, batch: Batch) -> None:
+        if self._latching:
+            self._latch(batch)
+        if self._first_words is not None:
+            now = self._clock()
+            if self._first_words.over(now) or not self._first_words.add(batch, now):
+                self._forget_first_words()
+        congested = False
+        for member in self._served:
+            self._dropped += member.deliver(batch)
+            congested = congested or member.behind_since is not None
+        if congested:
+            self._pause_or_trim()
+
+    def relieve(self) -> None:
+        """A subscriber has caught up, or is gone, or time is up: the publisher is read."""
+        if self._paused:
+            self._paused = False
+            if self.upstream is not None:
+                self.upstream.resume()
+
+    def cut_all(self, reason: str) -> None:
+        """The topic is withdrawn: every subscriber's connection is closed."""
+        for member in self.members:
+            member.cut(reason)
+
+    def tidy(self) -> None:
+        """A second is over: what was kept for a moment is given up, and what is beyond the share of a subscriber.
+
+        What a limit kept back of a latching publisher goes on when it may.
+        """
+        now = self._clock()
+        waiting = self.flow.later(now)
+        if waiting is not None:
+            self._admit(waiting, now)
+        if self._first_words is not None and self._first_words.over(now):
+            self._forget_first_words()
+        for member in self._served:
+            if self._latched is not None and member.missed:
+                self._dropped += member.deliver(self._latched)
+            if member.full:
+                self._dropped += member.trim()
+                self._reported = False
+            member.look()
+
+    @property
+    def latched(self) -> int:
+        """The bytes of the latched message that is kept."""
+        return 0 if self._latched is None else len(self._latched.view)
+
+    def give_up_latched(self) -> None:
+        """Make room for a host that has less."""
+        size = self.latched
+        self._latch(None)
+        self._keep_not(size)
+
+    def repeat(self) -> None:
+        """There is a new control: it is told what is not kept."""
+        if self._unkept is not None:
+            self._refused(self._unkept)
+
+    def traffic(self) -> TopicTraffic | None:
+        """The counters since the last call; None when nothing has changed."""
+        if self._reported:
+            return None
+        row = TopicTraffic(
+            self.key,
+            self.topic,
+            self._messages,
+            self._bytes,
+            self._dropped,
+            len(self._served),
+            *self._delays.take(),
+        )
+        self._messages = self._bytes = self._dropped = 0
+        self._reported = True
+        return row
+
+    def _serve(self, member: Member, header: Mapping[str, str]) -> None:
+        if not member.greet(header):
+            return
+        self._served += (member,)
+        self._announce()
+        self._reported = False
+        if self._latched is not None:
+            self._dropped += member.deliver(self._latched)
+        elif self._unkept is not None:
+            if self.upstream is not None and not self._share.refusal(self._unkept.size):
+                self.upstream.give_again()
+        elif self._first_words is not None and not self._first_words.over(self._clock()):
+            for batch in self._first_words.give(member.caller_id):
+                self._dropped += member.deliver(batch)
+        self.relieve()
+
+    def _listen(self) -> None:
+        """Begin to keep what a publisher says first that has just appeared and has nobody but a monitor."""
+        now = self._clock()
+        if now <= self._fresh_until and self._wanted and not self._latching and not self.members:
+            self._first_words = FirstWords(self._share, now)
+        self._fresh_until = now - 1  # the next connection is not its first
+
+    def _forget_first_words(self) -> None:
+        if self._first_words is not None:
+            self._first_words.forget()
+            self._first_words = None
+
+    def _forget_header(self) -> None:
+        """Without a connection the header is only good for those who have been given it."""
+        if not self._connected and not self._served:
+            self._header = None
+
+    def _announce(self) -> None:
+        """Tell the upstream who is served."""
+        if self.upstream is not None and self._header is not None:
+            names = frozenset(member.caller_id for member in self._served)
+            self.upstream.announce(names, self._header.get("type", ""))
+
+    def _latch(self, batch: Batch | None) -> None:
+        """Remember the last message of a batch, if its host has the memory for it; None forgets."""
+        if self._latched is not None:
+            self._share.add(-len(self._latched.view))
+            self._latched = None
+        if batch is None:
+            self._unkept = None
+            return
+        size = len(batch.view) - batch.find_last()
+        if self._share.refusal(size):
+            self._make_room(size)
+        if self._share.refusal(size):
+            self._keep_not(size)
+        else:
+            self._unkept = None
+            self._share.add(size)
+            self._latched = batch.keep_last()
+
+    def _keep_not(self, size: int) -> None:
+        before, self._unkept = self._unkept, LatchRefused(self.key, self.topic, size)
+        if before is None:
+            self._refused(self._unkept)
+
+    def _pause_or_trim(self) -> None:
+        """Let the subscribers catch up if all are behind and have not been for long; else drop for the full."""
+        since = [member.behind_since for member in self._served if member.behind_since is not None]
+        if since and len(since) == len(self._served) and self.upstream is not None:
+            left = max(since) + self._grace - self._clock()
+            if left > 0:
+                self._paused = True
+                self.upstream.pause(left)
+                return
+        for member in self._served:
+            if member.full:
+                self._dropped += member.trim()
+
+
+def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
+    return tuple(header.get(field) for field in ("type", "md5sum", "message_definition", "latching"))

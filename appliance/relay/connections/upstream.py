@@ -1,0 +1,318 @@
+"""The relay's one connection to a publisher for one topic: ask control for the address, connect, receive.
+
+    idle --want--> asked --UpstreamFound--> connecting --connected--> greeting --header--> flowing
+      ^               |                          |                        |                  |
+      +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
+
+A `Publisher` keeps at it while somebody wants the topic. A flow of more than `retry_longest` resets the wait: one that
+answers its header and then closes, or breaks the protocol, is waited for ever longer.
+"""
+
+import socket
+from collections.abc import Callable
+
+from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
+from appliance.channel.messages.relay import Violation
+from appliance.relay.connections.frames import SMALL, FrameReceiver
+from appliance.relay.connections.headers import size_of
+from appliance.relay.connections.memory import Stall, Weight
+from appliance.relay.connections.presence import Presences, looks_for_names
+from appliance.relay.connections.sockets import Stream, begin_connect
+from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import READ, Timer
+from appliance.ros.errors import LimitExceededError, PeerError
+from appliance.ros.tcpros import HeaderParser, encode_header
+
+_CALLER_ID = "/rosrv"
+_REASON = 1000  # characters that are reported; an error in a header is as long as the publisher likes
+
+
+class Publisher:
+    """The upstream of one relayed topic. `objection(header)` says why a publisher is refused, if it is."""
+
+    def __init__(
+        self,
+        context: RelayContext,
+        topic: RelayedTopic,
+        objection: Callable[[dict[str, str]], str] = lambda _header: "",
+    ) -> None:
+        self._loop = context.loop
+        self._clock = context.loop.clock
+        self._topic = topic
+        self._reporter = context.reporter
+        self._limits = limits = context.limits
+        self._weight = Weight(context.memory.frames.of(topic.host))
+        self._receiver = FrameReceiver(
+            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
+        )
+        self._stall = Stall(limits.stall_seconds)
+        self._buffer = self._receiver.buffer
+        self._received = self._receiver.received
+        self._wanted = False
+        self._asked = False
+        self._failures = 0
+        self._flowing = 0.0  # since when
+        self._timer: Timer | None = None
+        self._linger: Timer | None = None
+        self._pause: Timer | None = None
+        self._stream: Stream | None = None
+        self._socket: socket.socket | None = None
+        self._recv_into: Callable[[memoryview], int]
+        self._parser = HeaderParser(limits.header_bytes)
+        self._address = ("", 0)
+        self._header: dict[str, str] = {}
+        self._presences = Presences(context, topic.topic)
+        self._objection = objection
+        self._objected = ""
+
+    def want(self) -> None:
+        """Somebody is to be served: connect unless that is done or under way."""
+        self._wanted = True
+        if self._linger is not None:
+            self._linger.cancel()
+            self._linger = None
+        if self._socket is None and self._stream is None and self._timer is None:
+            self.ask()
+
+    def spare(self) -> None:
+        """Nobody is left; the connection is kept for a moment, for whoever comes back at once."""
+        self._wanted = False
+        if self._linger is None:
+            self._linger = self._loop.after(self._limits.linger, self._close_unwanted)
+
+    def ask(self) -> None:
+        """Ask control where the publisher is, and again if no answer comes."""
+        self._asked = True
+        self._set_timer(self._limits.answer_seconds, self.ask)
+        self._reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
+
+    def ask_again(self) -> None:
+        """There is a new control: an open question is put to it."""
+        if self._asked:
+            self.ask()
+
+    def found(self, host: str, port: int) -> None:
+        """Control's answer; one that nobody waits for is ignored."""
+        if not self._asked:
+            return
+        self._asked = False
+        self._address = (host, port)
+        try:
+            sock = begin_connect(host, port)
+        except (OSError, OverflowError) as error:
+            self._lose(f"cannot connect to {host}:{port}: {error}")
+            return
+        self._parser = HeaderParser(self._limits.header_bytes)
+        self._stream = Stream(self._loop, sock, self._header_received, self._broken, opened=self._connected)
+        self._set_timer(self._limits.connect_seconds, self._late(f"no answer from {host}:{port}"))
+
+    def refused(self) -> None:
+        """Control could not get the address; it is asked again later."""
+        if self._asked:
+            self._asked = False
+            self._retry()
+
+    def close(self) -> None:
+        """The publication is withdrawn."""
+        self._wanted = False
+        self._asked = False
+        for timer in (self._timer, self._linger, self._pause):
+            if timer is not None:
+                timer.cancel()
+        self._timer = self._linger = self._pause = None
+        self._drop_connection()
+
+    def pause(self, seconds: float) -> None:
+        """Leave what comes in the kernel's buffer until `resume`, but no longer than `seconds`."""
+        if self._socket is not None and self._pause is None:
+            self._loop.unwatch(self._socket.fileno())
+            self._pause = self._loop.after(seconds, self._topic.relieve)
+
+    def resume(self) -> None:
+        """Read on."""
+        if self._pause is not None:
+            self._pause.cancel()
+            self._pause = None
+            if self._socket is not None:
+                self._loop.watch(self._socket.fileno(), READ, self._ready)
+
+    def look(self) -> None:
+        """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
+        self._receiver.rest()
+        held = self._receiver.unfinished if self._pause is None else 0
+        if self._stall.seen(held, self._clock()):
+            self._lose(
+                f"{held} bytes of a message have come, and nothing for {self._limits.stall_seconds:g} s",
+                "limit exceeded",
+            )
+
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """Who is served: the publishers of some types must see it by name."""
+        if self._socket is not None and looks_for_names(type_name):
+            self._presences.want(names, self._address)
+
+    def _connected(self) -> None:
+        fields = {
+            "callerid": _CALLER_ID,
+            "topic": self._topic.topic,
+            "type": "*",
+            "md5sum": "*",
+            "tcp_nodelay": "1",
+        }
+        if self._stream is not None:
+            self._stream.send(encode_header(fields))
+
+    def _header_received(self, data: bytes) -> None:
+        if self._stream is None:
+            return
+        if not data:
+            self._lose("the publisher closed the connection before its header")
+            return
+        try:
+            header = self._parser.feed(data)
+        except PeerError as error:
+            self._lose(f"the publisher's header cannot be read: {error}", _violation(error))
+            return
+        if header is None:
+            return
+        size = size_of(header)
+        refusal = _refusal(header) or self._no_room(size)
+        if refusal is not None:
+            self._lose(*refusal)
+            return
+        reason = self._objection(header)
+        if reason:
+            self._object(reason)
+            return
+        self._weight.set(size)
+        self._header = header
+        self._flow(header, self._stream.take(), self._parser.rest)
+
+    def _no_room(self, size: int) -> tuple[str, Violation] | None:
+        if size > SMALL and self._weight.share.refusal(size):
+            return "the relay has no memory left for headers of this host", "limit exceeded"
+        return None
+
+    def give_again(self) -> None:
+        """Have a latching publisher give its message again, on a new connection."""
+        if self._socket is not None and self._wanted:
+            self._drop_connection()
+            self.ask()
+
+    def judge_again(self) -> None:
+        """Other specifications are in force: a publisher that does not fit them is refused, or again carried."""
+        if self._socket is not None:
+            reason = self._objection(self._header)
+            if reason:
+                self._object(reason)
+        elif self._objected and self._timer is not None and not self._asked and self._stream is None:
+            self._failures = 0
+            self.ask()
+
+    def _object(self, reason: str) -> None:
+        """The publisher is not carried; it is tried again, for it may come back with another definition."""
+        if reason != self._objected:
+            self._objected = reason
+            self._reporter.send(PublicationRefused(self._topic.key, self._topic.topic, reason))
+        self._drop_connection()
+        self._retry()
+
+    def _flow(self, header: dict[str, str], sock: socket.socket, rest: bytes) -> None:
+        self._stream = None
+        self._socket = sock
+        self._objected = ""
+        self._flowing = self._clock()
+        self._set_timer(0, None)
+        self._loop.watch(sock.fileno(), READ, self._ready)
+        self._recv_into = sock.recv_into
+        self._topic.upstream_opened(header)
+        while rest and self._socket is sock:
+            buffer = self._buffer()
+            count = min(len(rest), len(buffer))
+            buffer[:count] = rest[:count]
+            rest = rest[count:]
+            self._take(count)
+
+    def _ready(self, _events: int) -> None:
+        try:
+            count = self._recv_into(self._buffer())
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lose(f"the connection to the publisher broke: {error.strerror}")
+            return
+        if count:
+            self._take(count)
+        else:
+            self._lose("the publisher closed the connection")
+
+    def _take(self, count: int) -> None:
+        since = self._clock()
+        try:
+            batch = self._received(count)
+        except PeerError as error:
+            self._lose(str(error), _violation(error))
+            return
+        if batch is not None:
+            self._topic.received(batch, since)
+
+    def _broken(self, reason: str) -> None:
+        self._lose(f"no connection to the publisher: {reason}")
+
+    def _late(self, reason: str) -> Callable[[], None]:
+        return lambda: self._lose(f"{reason} within {self._limits.connect_seconds:g} s")
+
+    def _lose(self, reason: str, violation: Violation = "") -> None:
+        self._drop_connection()
+        self._reporter.send(UpstreamLost(self._topic.key, self._topic.topic, reason[:_REASON], violation))
+        self._retry()
+
+    def _retry(self) -> None:
+        self._set_timer(0, None)
+        if self._wanted:
+            wait = min(self._limits.retry_first * 2.0**self._failures, self._limits.retry_longest)
+            self._failures = min(self._failures + 1, 32)
+            self._set_timer(wait, self.ask)
+
+    def _close_unwanted(self) -> None:
+        self._linger = None
+        self._set_timer(0, None)
+        self._asked = False
+        self._drop_connection()
+
+    def _drop_connection(self) -> None:
+        self._presences.close()
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+        if self._pause is not None:
+            self._pause.cancel()
+            self._pause = None
+        if self._socket is not None:
+            if self._clock() - self._flowing > self._limits.retry_longest:
+                self._failures = 0
+            self._loop.discard(self._socket)
+            self._socket = None
+            self._weight.set(0)
+            self._receiver.abandon()
+            self._topic.upstream_closed()
+
+    def _set_timer(self, seconds: float, callback: Callable[[], None] | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None if callback is None else self._loop.after(seconds, callback)
+
+
+def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
+    """Why a publisher's header begins no conversation, and what that is."""
+    if "error" in header:
+        return f"the publisher says: {header['error']}", "connection refused"
+    missing = [field for field in ("type", "md5sum") if field not in header]
+    if missing:
+        return f"the publisher says nothing about its {missing[0]}", "malformed"
+    return None
+
+
+def _violation(error: PeerError) -> Violation:
+    return "limit exceeded" if isinstance(error, LimitExceededError) else "malformed"

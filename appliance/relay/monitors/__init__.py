@@ -1,0 +1,1 @@
+"""Specifications in the middle of topics and services."""

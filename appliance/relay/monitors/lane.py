@@ -1,0 +1,233 @@
+"""One topic of one incarnation on its way through the monitors.
+
+The messages of a batch are taken many at a time where they need nothing but the common (`rosmop/batch.py`), one by
+one where there is something to tell; what nobody changed or dropped leaves in the buffer it came in.
+
+A message that comes alone costs little work and much fetching: at a thousand a second other programs have filled
+the caches since the last one. So while nothing happens that could matter (`Middle.sight` is the same), all that a
+batch has to be asked is prepared once (`_prepare`), and what it adds to the counters is added up here, until the
+second is over.
+"""
+
+import struct
+import time
+from typing import Protocol
+
+from appliance.relay.connections.frames import Batch
+from appliance.relay.counts import Counts
+from appliance.relay.monitors.observations import SHOWN
+from appliance.relay.monitors.passage import Passage
+from appliance.relay.monitors.places import HEAD, Place, Sighting
+from appliance.relay.monitors.telling import Telling
+from appliance.rosmop.batch import Prepared, Walker
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.runtime.context import BUDGET
+
+LONGEST = 2.0
+"""Seconds of processor time that monitors may take until the loop comes to its timers again."""
+
+TOO_LONG = "the monitors take too long for their messages"
+
+_unpack_length = struct.Struct("<I").unpack_from
+_LOOK_EVERY = 16  # messages
+_COSTLY = BUDGET - 50_000  # what is left of a budget after a message that took some milliseconds
+_MANY = 256  # messages
+_NEVER = 1 << 63
+
+
+class Monitors(Protocol):
+    """The monitors of the relay, as their lanes see them."""
+
+    monitors: MonitorSet | None
+    """The specifications in force."""
+
+    blocked: str
+    """Why everything is blocked, if it is."""
+
+    spent: float
+    """Seconds of processor time since the loop last came to its timers."""
+
+    sight: object
+    """Another one whenever something has happened that changes what may be prepared."""
+
+    telling: Telling
+    """What is told to control."""
+
+    def now(self) -> int:
+        """Nanoseconds."""
+
+    def look_again(self) -> None:
+        """Something has happened: there is another `sight`."""
+
+    def schedule(self) -> None:
+        """See that what is due next happens."""
+
+
+class Lane:
+    """Where the batches of one topic of one publisher go through."""
+
+    def __init__(self, middle: Monitors, place: Place) -> None:
+        self._middle = middle
+        self._place = place
+        self._sight: object = None
+        self._until = 0
+        self._walker: Walker | None = None
+        self._prepared: Prepared | None = None
+        self._counts: Counts | None = None
+        self._defect: Walker | None = None
+
+    def through(self, batch: Batch) -> Batch | None:
+        """The frames that go on, as the monitors leave them; None when none does."""
+        middle = self._middle
+        now = middle.now()
+        if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:
+            return self._through(batch, Passage(batch, now))
+        assert self._walker is not None  # noqa: S101  `_prepare` has found one
+        assert self._prepared is not None  # noqa: S101  and prepared it
+        assert self._counts is not None  # noqa: S101  and counts for it
+        pieces: list[memoryview | bytes | bytearray] = []
+        try:
+            walked = self._walker.walk(batch.view, 0, 0, pieces, batch.stride, now, self._prepared)
+        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
+            self._failed(error, self._walker, now)
+            return self._through(batch, Passage(batch, now))
+        if not self._counts.begun:
+            middle.telling.owe(self._counts)
+        gone = self._counts.add(walked, now)
+        if walked.position == len(batch.view) and not gone:
+            return batch
+        passage = Passage(batch, now)
+        passage.pieces = pieces
+        passage.walked(walked.position, walked.run, gone)
+        return self._through(batch, passage)
+
+    def _failed(self, error: Exception, walker: Walker, now: int) -> None:
+        """The loops of this topic are not right: tell it, and leave everything to the engine from now on."""
+        self._middle.telling.defect(error, self._place, now)
+        self._defect = walker
+        self._sight = None
+
+    def _through(self, batch: Batch, passage: Passage) -> Batch | None:
+        middle, monitors = self._middle, self._middle.monitors
+        if middle.blocked or monitors is None:
+            return self._block(batch, passage)
+        walker = monitors.walker(self._place[1])
+        while passage.position < passage.end:
+            if walker is None:
+                self._one_by_one(monitors, passage, batch.messages)
+            elif middle.spent > LONGEST or not self._walk(monitors, walker, passage):
+                self._one_by_one(monitors, passage, passage.turns())
+        middle.schedule()
+        return passage.result()
+
+    def _walk(self, monitors: MonitorSet, walker: Walker, passage: Passage) -> bool:
+        """Take the messages that need nothing but the common; False if the next one needs more."""
+        middle = self._middle
+        if walker is self._defect or not monitors.walks(walker, passage.time):
+            return False
+        prepared, counts = self._prepare(monitors, walker)
+        began = time.thread_time() if passage.messages > _MANY else None  # else too little to count
+        try:
+            walked = walker.walk(
+                passage.view,
+                passage.position,
+                passage.run,
+                passage.pieces,
+                passage.stride,
+                passage.time,
+                prepared,
+            )
+        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
+            self._failed(error, walker, passage.time)
+            return False
+        if began is not None:
+            middle.spent += time.thread_time() - began
+        if not counts.begun:
+            middle.telling.owe(counts)
+        passage.walked(walked.position, walked.run, counts.add(walked, passage.time))
+        return passage.position == passage.end
+
+    def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
+        """Ask once what holds for all batches until something happens."""
+        telling, place = self._middle.telling, self._place
+        prepared, counts = self._prepared, self._counts
+        if prepared is None or self._sight is not self._middle.sight or self._walker is not walker:
+            prepared = self._prepared = walker.prepare(
+                loud=walker.changes and telling.shows(place),
+                told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
+            )
+        if counts is None or counts.walker is not walker:
+            counts = self._counts = Counts(walker, place)
+        self._walker, self._sight = walker, self._middle.sight
+        self._until = _NEVER if monitors.next_due is None else monitors.next_due
+        return prepared, counts
+
+    def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:
+        """Give so many messages to the engine."""
+        middle, place, now, telling = self._middle, self._place, passage.time, self._middle.telling
+        view, position, end = passage.view, passage.position, passage.end
+        process, topic = monitors.process, place[1]
+        shows = telling.shows(place)
+        contexts = monitors.contexts(topic)
+        head = HEAD if monitors.stamped(topic) else 0
+        looked = 0
+        middle.look_again()
+        spent = middle.spent - time.thread_time()
+        while position < end and looked < count:
+            first = position + 4
+            following = first + _unpack_length(view, position)[0]
+            body = view[first:following]
+            before = bytes(body[:SHOWN]) if shows else b""
+            sighting = Sighting(passage, position, bytes(body[:head]))
+            try:
+                outcome = (
+                    process(topic, body, now) if middle.spent <= LONGEST else dropped(body, now, TOO_LONG)
+                )
+            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+                outcome = dropped(body, now, telling.defect(error, place, now, sighting))
+            if outcome.events or outcome.log or outcome.faults or outcome.before:
+                telling.told(outcome, place, sighting)
+            result = outcome.result
+            if result == "dropped":
+                if outcome.overwritten:
+                    outcome.restore(body)  # it is told as it was received
+                telling.dropped(outcome, place, body, sighting)
+                passage.cut(position, following)
+            elif result == "changed":
+                if shows:
+                    telling.changed(outcome, place, before, len(body), sighting)
+                    shows = telling.shows(place)
+                else:
+                    telling.changed_again(outcome, place)
+                if outcome.buffer is not body:
+                    passage.replace(position, following, outcome.buffer)
+            position = following
+            looked += 1
+            if not looked % _LOOK_EVERY or outcome.faults or outcome.before:
+                middle.spent = spent + time.thread_time()
+            for context in contexts:
+                if context.budget < _COSTLY:
+                    middle.spent = spent + time.thread_time()
+                    break
+        passage.position = position
+        middle.spent = spent + time.thread_time()
+
+    def _block(self, batch: Batch, passage: Passage) -> Batch | None:
+        if not self._middle.blocked:
+            return batch
+        position = 0
+        while position < passage.end:
+            following = position + 4 + _unpack_length(passage.view, position)[0]
+            body = passage.view[position + 4 : following]
+            outcome = dropped(body, passage.time, self._middle.blocked)
+            self._middle.telling.dropped(outcome, self._place, body, Sighting(passage, position, b""))
+            position = following
+        return None
+
+
+def dropped(body: memoryview, now: int, reason: str) -> Outcome:
+    """The outcome of a message that is dropped without having been judged."""
+    outcome = Outcome(body, now)
+    outcome.result, outcome.reason = "dropped", reason
+    return outcome

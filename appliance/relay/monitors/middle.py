@@ -1,0 +1,321 @@
+"""Monitors in the middle: the specifications in force, and what they do to messages, requests and replies.
+
+A topic without an enabled event never comes here (`stands` is asked when something changes, not per message). The
+messages of the others go through their lanes (`lane.py`).
+
+Invariants:
+- Whatever goes wrong with a monitor, a defect of this program included, ends the way of that message and of nothing
+  else: it is dropped and told.
+- Specifications that cannot be taken change nothing; a relay that has none yet blocks everything then.
+- One swap is between two messages. What monitors publish is not given to monitors.
+- The clock of monitors never goes back and makes no leap: it is the time of the day when the relay started, and
+  from there the monotonic clock. The messages of one batch have come at the same time.
+- The relay always answers its supervisor: when monitors have taken `lane.LONGEST` seconds of processor time since the
+  loop last came to its timers (they never do unless messages take them long), the messages until then are dropped.
+  Ticks that are late and take long are left out.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from appliance.channel.messages import (
+    MonitorRow,
+    SpecificationsRefused,
+    SpecificationsStated,
+    SpecificationsTaken,
+)
+from appliance.relay.loop import Loop, Timer
+from appliance.relay.monitors.compiling import Compiler, Result
+from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
+from appliance.relay.monitors.observations import SHOWN, Observations
+from appliance.relay.monitors.places import NOWHERE, Place
+from appliance.relay.monitors.telling import Telling, refusal
+from appliance.relay.report import Reporter
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.monitor import Monitor
+from appliance.rosmop.runtime.context import Published
+
+_AFTER_DEFECT = 1.0
+_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What becomes of a request or a reply: the body to pass on, or the reason why it is refused."""
+
+    body: bytes
+    refused: str | None = None
+
+
+class Middle:
+    """The monitors of one relay.
+
+    `publish(published)` sends what a monitor publishes; `changed(topics)` is called when other topics may be wanted,
+    with those whose messages may fare otherwise now (None: all).
+    """
+
+    def __init__(self, loop: Loop, reporter: Reporter) -> None:
+        self._loop = loop
+        self._reporter = reporter
+        self._offset = time.time_ns() - time.monotonic_ns()
+        self.monitors: MonitorSet | None = None
+        self._stated: SpecificationsStated | None = None
+        self._switches: dict[str, bool] = {}
+        self.blocked = ""
+        self._awaited: SpecificationsStated | None = None
+        self.spent = 0.0
+        self.sight = object()
+        self._timer: Timer | None = None
+        self._due: int | None = None
+        self._compiler = Compiler(loop, self._compiled)
+        self.observations = Observations(loop, reporter, self._rows)
+        self.publish: Callable[[Published], None] = lambda published: None  # noqa: ARG005 - set by the engine
+        self.changed: Callable[[frozenset[str] | None], None] = lambda topics: None  # noqa: ARG005 - set by the engine
+        self.telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
+
+    # --- what control states ---
+
+    def state(self, message: SpecificationsStated) -> None:
+        """Take these specifications, at once or when they are compiled; the same as before keep their state."""
+        self._switches = dict(message.enabled)
+        if not self._compiler.busy:
+            if self._stated is not None and not self.blocked and _same(message, self._stated):
+                self._taken(message, [], frozenset())
+                return
+            if not message.files and (self._stated is None or self.blocked):
+                self._compiler.now(message)
+                return
+        if message.ahead or (self._stated is None and not self.blocked):
+            self._awaited = message
+        self._compiler.later(message)
+
+    def _compiled(self, message: SpecificationsStated, result: Result) -> None:
+        if message is self._awaited:
+            self._awaited = None
+        self.look_again()
+        if isinstance(result, list):
+            self._refuse(message, result)
+            return
+        before, now, blocked = self.monitors, self.now(), self.blocked
+        outcome = (
+            result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
+        )
+        result.patience = _patience
+        self.monitors, self._stated, self.blocked = result, message, ""
+        began = list(result.began)
+        for monitor in result.monitors:
+            monitor.held = monitor.held or (
+                monitor.code.hold and monitor.name in message.moved and monitor.name in began
+            )
+        self.telling.keep([one.name for one in result.monitors], began, now)
+        self.telling.told(outcome, NOWHERE)
+        anew = None if before is None or blocked else _topics(_replaced(before, result))
+        self._taken(message, began, anew)
+
+    def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
+        self.look_again()
+        held: list[str] = []
+        if self.monitors is not None:
+            switches = {one.name: self._switches.get(one.name, True) for one in self.monitors.monitors}
+            switched = _topics(self.monitors.switch(switches, self.now()))
+            anew = None if anew is None else anew | switched
+            held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
+        self.schedule()
+        self.changed(anew)
+        self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
+
+    def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
+        self.look_again()
+        if self.monitors is None:
+            reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
+            self.blocked = reason
+        self.changed(None if self.monitors is None else frozenset())
+        self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
+
+    def switch(self, name: str, enabled: bool) -> None:
+        """Let the events of a monitor happen, or not; an unknown name is fine (it is gone)."""
+        self.look_again()
+        self._switches[name] = enabled
+        if self.monitors is not None:
+            switched = self.monitors.switch({name: enabled}, self.now())
+            if switched:
+                self.schedule()
+                self.changed(_topics(switched))
+
+    def resume(self, name: str) -> frozenset[str]:
+        """Let the topics of a monitor that holds them go on; they."""
+        self.look_again()
+        if self.monitors is None:
+            return frozenset()
+        held = [one for one in self.monitors.monitors if one.name == name and one.held]
+        for monitor in held:
+            self.monitors.resume(monitor.name)
+        return _topics(held)
+
+    # --- what is asked when something changes ---
+
+    @property
+    def preparing(self) -> bool:
+        """Whether specifications are compiled that must be in force before anything else is carried out."""
+        return self._awaited is not None
+
+    def stands(self, topic: str) -> bool:
+        """Whether messages of a topic go through here."""
+        return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
+
+    def wants(self, topic: str) -> bool:
+        """Whether a monitor wants a topic's messages even if nobody else does."""
+        return self.monitors is not None and self.monitors.wants(topic)
+
+    def objection(self, topic: str, header: Mapping[str, str]) -> str:
+        """Why a publisher's messages cannot be understood by the monitors of its topic; empty when they can."""
+        name = self.monitors.type_of(topic) if self.monitors is not None else None
+        if self.monitors is None or name is None:
+            return ""
+        return _other_definition(topic, name, self.monitors.md5sum(name), header)
+
+    def service_objection(self, service: str, header: Mapping[str, str]) -> str:
+        """The same of a service, by the header it answers with."""
+        name = self.monitors.service_type_of(service) if self.monitors is not None else None
+        if self.monitors is None or name is None:
+            return ""
+        return _other_definition(service, name, self.monitors.definitions.service_md5sum(name), header)
+
+    def header_of(self, topic: str) -> dict[str, str] | None:
+        """The connection header, without names, for what monitors publish on a topic; None if none does."""
+        if self.monitors is None or topic not in self.monitors.publications:
+            return None
+        name = self.monitors.publications[topic]
+        return {
+            "type": name,
+            "md5sum": self.monitors.md5sum(name),
+            "message_definition": self.monitors.definitions.full_text(name),
+            "latching": "0",
+        }
+
+    # --- messages ---
+
+    def lane(self, place: Place) -> Lane:
+        """Where the messages of this publication go through."""
+        return Lane(self, place)
+
+    def look_again(self) -> None:
+        """Something has happened that may change what lanes have prepared."""
+        self.sight = object()
+
+    def request(self, place: Place, body: bytes) -> Judged:
+        """What becomes of a client's request to a service."""
+        return self._service(place, "request", body)
+
+    def response(self, place: Place, body: bytes) -> Judged:
+        """What becomes of a service's reply to a request."""
+        return self._service(place, "response", body)
+
+    def tick(self) -> None:
+        """A second is over."""
+        self.look_again()
+        self.spent = 0.0
+        self.telling.tick(self.now())
+        self.observations.tick()
+
+    def close(self) -> None:
+        """The relay ends."""
+        self._compiler.close()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    # --- inside ---
+
+    def _rows(self) -> list[MonitorRow]:
+        return self.telling.rows(self.monitors.monitors, self.now()) if self.monitors is not None else []
+
+    def _service(self, place: Place, part: str, body: bytes) -> Judged:
+        service = place.resource
+        if self.blocked:
+            return Judged(b"", self.blocked)
+        if self.monitors is None or self.monitors.service_type_of(service) is None:
+            return Judged(body)
+        if self.spent > LONGEST:
+            return Judged(b"", TOO_LONG)
+        self.look_again()
+        now, began = self.now(), time.thread_time()
+        view = memoryview(body)
+        try:
+            outcome = self.monitors.process_service(service, part, bytearray(body), now)
+        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            outcome = dropped(view, now, self.telling.defect(error, place, now))
+        self.telling.told(outcome, place)
+        self.spent += time.thread_time() - began
+        self.schedule()
+        if outcome.result == "dropped":
+            self.telling.dropped(outcome, place, view)
+            return Judged(b"", refusal(outcome, part))
+        if outcome.result == "changed":
+            self.telling.changed(outcome, place, body[:SHOWN], len(body))
+            return Judged(bytes(outcome.buffer))
+        return Judged(body)
+
+    # --- time ---
+
+    def now(self) -> int:
+        """The time of monitors, in nanoseconds."""
+        return self._offset + time.monotonic_ns()
+
+    def schedule(self) -> None:
+        """See that `_advance` is called when the next tick or deadline is due, or earlier."""
+        due = self.monitors.next_due if self.monitors is not None else None
+        if due is None or (self._due is not None and self._due <= due):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._due = due
+        self._timer = self._loop.after(max(0, due - self.now()) / 1e9, self._advance)
+
+    def _advance(self) -> None:
+        self.look_again()
+        self._due = self._timer = None
+        if self.monitors is None:
+            return
+        began = time.thread_time()
+        try:
+            for outcome in self.monitors.advance(self.now()):
+                self.telling.told(outcome, NOWHERE)
+        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            now = self.now()
+            self.telling.defect(error, NOWHERE, now)
+            self._due = now + int(_AFTER_DEFECT * 1e9)
+            self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
+            return
+        self.spent += time.thread_time() - began
+        self.schedule()
+
+
+def _patience() -> Callable[[], bool]:
+    ends = time.thread_time() + _TICKS_SECONDS
+    return lambda: time.thread_time() > ends
+
+
+def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
+    return frozenset(step.event.topic for one in monitors for step in one.steps if step.event.topic)
+
+
+def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
+    """The monitors of both sets that do not go on as they were."""
+    kept = {monitor.name for monitor in after.monitors} - set(after.began)
+    return [one for each in (before, after) for one in each.monitors if one.name not in kept]
+
+
+def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
+    return (one.files, one.definitions, one.on_fault) == (other.files, other.definitions, other.on_fault)
+
+
+def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str, str]) -> str:
+    found = header.get("md5sum", "")
+    if found == md5sum:
+        return ""
+    theirs = header.get("type", "*")
+    return (
+        f"the specifications understand {resource} as [{name}/{md5sum}], its messages are [{theirs}/{found}];"
+        " give the specifications the definition of the robot (msg/ beside them)"
+    )

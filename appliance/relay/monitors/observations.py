@@ -1,0 +1,214 @@
+"""What the relay tells control about monitors: the first of each kind and second in full, the rest counted.
+
+Invariants:
+- Of each monitor, kind and distinction (the category of a verdict, the text of a log line) one event a second is
+  told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
+  happened is left out of the counts.
+- Each is told with who said the message: caller id and host, and which message of the publication it was.
+- Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
+- Counters follow the events that they count, and once a second those of which no event was told.
+- While there is no control, at most `_KEPT` events wait; how many more there were is said.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
+from appliance.relay.loop import Loop, Timer
+from appliance.relay.monitors.places import Place, Sighting
+from appliance.relay.report import Reporter
+
+SHOWN = 1024
+"""Bytes of a message that are told, before and after."""
+
+_TEXT = 4096
+_DISTINCT = 100
+_KEPT = 10_000
+_AT_ONCE = 200  # events in one message
+_FLUSH_SECONDS = 0.05
+_VALUES = 32
+_INTEGERS = range(-(1 << 63), 1 << 64)
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+_Key = tuple[str, str, str, str, str, str]
+"""Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are folded together."""
+
+
+class Observations:
+    """Collects events of monitors and sends them in batches; `rows()` gives the counters of all monitors."""
+
+    def __init__(self, loop: Loop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
+        self._loop = loop
+        self._reporter = reporter
+        self._rows = rows
+        self._told: dict[_Key, int] = {}
+        self._distinct: dict[tuple[str, str], int] = {}
+        self._callers: dict[_Key, str] = {}
+        self._last: dict[_Key, int] = {}
+        self._shared: dict[_Key, Mapping[str, Any]] = {}
+        self._waiting: deque[MonitorEvent] = deque()
+        self._lost = 0
+        self._timer: Timer | None = None
+        self._counted: list[MonitorRow] = []
+
+    def note(
+        self,
+        kind: str,
+        monitor: str,
+        place: Place,
+        time: int,
+        text: str,
+        *,
+        distinction: str = "",
+        shared: Mapping[str, Any] = _NOTHING,
+        detail: Mapping[str, Any] | None = None,
+        before: bytes = b"",
+        after: bytes = b"",
+        size: int = 0,
+        sighting: Sighting | None = None,
+    ) -> None:
+        """Something happened at `place`, to the message that was sighted.
+
+        `shared` is the detail of the count of all that have this distinction.
+        """
+        text = text[:_TEXT]
+        key = self._key(kind, monitor, place, distinction, shared)
+        self._said(key, place)
+        if key in self._told:
+            self._told[key] += 1
+            self._last[key] = time
+            return
+        self._told[key] = 0
+        plain = _plain({**(detail or {}), **(sighting.detail() if sighting is not None else {})})
+        self._add(
+            MonitorEvent(
+                kind,
+                monitor,
+                place.key,
+                place.resource,
+                time,
+                text,
+                plain,
+                before,
+                after,
+                size,
+                host=place.host,
+                caller_id=place.caller_id,
+            )
+        )
+
+    def add(
+        self,
+        kind: str,
+        monitor: str,
+        place: Place,
+        time: int,
+        count: int,
+        *,
+        distinction: str = "",
+        shared: Mapping[str, Any] = _NOTHING,
+    ) -> None:
+        """So many more happened at `place`, the last at this time; they are told as a count."""
+        key = self._key(kind, monitor, place, distinction, shared)
+        self._said(key, place)
+        self._told[key] = self._told.get(key, 0) + count
+        self._last[key] = max(time, self._last.get(key, 0))
+
+    def told(self, kind: str, monitor: str, place: Place) -> bool:
+        """Whether this has been told in this second, so that the next is only counted."""
+        return (kind, monitor, *place[:3], "") in self._told
+
+    def tick(self) -> None:
+        """A second is over: tell the counts, and the state of the monitors if it changed."""
+        for key, count in self._told.items():
+            if count:
+                self._add(self._count_of(key, count))
+        self._told.clear()
+        self._callers.clear()
+        self._last.clear()
+        self._shared.clear()
+        self._distinct.clear()
+        self._tell_counters()
+
+    def repeat(self) -> None:
+        """There is a new control: it is told everything that waits, and all counters."""
+        self._counted = []
+        self._flush()
+
+    def _count_of(self, key: _Key, count: int) -> MonitorEvent:
+        kind, monitor, owner, resource, host, distinction = key
+        return MonitorEvent(
+            kind,
+            monitor,
+            owner,
+            resource,
+            self._last[key],
+            distinction,
+            _plain(self._shared.get(key, _NOTHING)),
+            count=count,
+            host=host,
+            caller_id=self._callers[key],
+        )
+
+    def _said(self, key: _Key, place: Place) -> None:
+        """Who said it; of several clients of a host no one is named in the count."""
+        if self._callers.setdefault(key, place.caller_id) != place.caller_id:
+            self._callers[key] = ""
+
+    def _key(
+        self, kind: str, monitor: str, place: Place, distinction: str, shared: Mapping[str, Any]
+    ) -> _Key:
+        key = (kind, monitor, *place[:3], distinction[:_TEXT])
+        if key in self._told or not distinction:
+            return key
+        known = self._distinct.get((kind, monitor), 0)
+        if known >= _DISTINCT:
+            return (kind, monitor, *place[:3], "")
+        self._distinct[kind, monitor] = known + 1
+        if shared:
+            self._shared[key] = shared
+        return key
+
+    def _add(self, event: MonitorEvent) -> None:
+        if len(self._waiting) >= _KEPT:
+            self._lost += 1
+            return
+        self._waiting.append(event)
+        if self._timer is None:
+            self._timer = self._loop.after(_FLUSH_SECONDS, self._flush)
+
+    def _flush(self) -> None:
+        self._timer = None
+        while self._reporter.attached and self._waiting:
+            events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
+            self._reporter.send(MonitorsReported(events, self._lost))
+            self._lost = 0
+        self._tell_counters()  # who reads of a drop finds it counted
+
+    def _tell_counters(self) -> None:
+        if not self._reporter.attached:
+            return
+        rows = list(self._rows())
+        if rows != self._counted:
+            self._counted = rows
+            self._reporter.send(MonitorsCounted(rows))
+
+
+def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:
+    """The detail as values that a link carries, each bounded."""
+    return {str(name)[:200]: _value(value, 3) for name, value in list(detail.items())[:_VALUES]}
+
+
+def _value(value: Any, depth: int) -> Any:
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value in _INTEGERS):
+        return value
+    if isinstance(value, Mapping) and depth:
+        return {str(name)[:200]: _value(one, depth - 1) for name, one in list(value.items())[:_VALUES]}
+    if isinstance(value, list | tuple) and depth:
+        return [_value(one, depth - 1) for one in value[:_VALUES]]
+    if isinstance(value, bytes | bytearray):
+        value = value[:200].decode("utf-8", "backslashreplace")
+    return str(value)[:200]

@@ -1,0 +1,44 @@
+"""Where monitors see something: which publication or service, whose message, and which of its messages."""
+
+import struct
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from appliance.relay.monitors.passage import Passage
+
+HEAD = 12
+"""Bytes of `std_msgs/Header` that are told: seq and stamp."""
+
+_HEADER = struct.Struct("<III")
+
+
+class Place(NamedTuple):
+    """A topic or service of an incarnation, and who says what is seen there: publisher, client or server."""
+
+    key: str
+    resource: str
+    host: str = ""
+    caller_id: str = ""
+
+
+NOWHERE = Place("", "")
+"""What happens by time is about no message."""
+
+
+class Sighting:
+    """One message of a publication: where it is in its passage, and how it began when it came, if it has a header."""
+
+    __slots__ = ("_head", "_passage", "_position")
+
+    def __init__(self, passage: Passage, position: int, head: bytes) -> None:
+        self._passage = passage
+        self._position = position
+        self._head = head
+
+    def detail(self) -> Mapping[str, Any]:
+        """Its number among those of its publication that this relay received; seq and stamp if it has a header."""
+        detail: dict[str, Any] = {"number": self._passage.number_at(self._position)}
+        if len(self._head) == HEAD:
+            detail["seq"], seconds, nanoseconds = _HEADER.unpack(self._head)
+            detail["stamp"] = f"{seconds}.{nanoseconds:09}"
+        return detail

@@ -1,0 +1,102 @@
+"""Large bodies and answers: few at a time, host by host, so that memory and the event loop are there for others.
+
+A tree of parameters takes ten times its size while it is read from ROSMaster and written for a node. What one request
+needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, one of each host, and hosts take turns.
+"""
+
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from typing import Self
+
+from appliance.policy.model import Address
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.turns import Turns
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import LARGE_WRITES
+
+AT_ONCE = 2
+_BOUNDS = Bounds(whole=AT_ONCE, host=1, strangers=1, kept=1)
+_VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # about what XML-RPC writes around a value
+
+
+def bulk_turns(standing: Callable[[Address], Standing]) -> Turns:
+    """The turns that all requests share."""
+    return Turns(_BOUNDS, standing)
+
+
+class Bulk:
+    """The bulk of one request of a host: room for it is taken when it is needed, and given back at the end."""
+
+    def __init__(self, turns: Turns, host: Address) -> None:
+        self._turns = turns
+        self._host = host
+        self.taken = False
+        self.large = False  # whether the request itself is
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        self.give_back()
+
+    async def take(self) -> None:
+        """Wait for room, unless it is taken already."""
+        if not self.taken:
+            await self._turns.enter(self._host)
+            self.taken = True
+
+    def give_back(self) -> None:
+        """Make room for others."""
+        if self.taken:
+            self.taken = False
+            self._turns.leave(self._host)
+
+
+class LargeWrites:
+    """Large values on their way to ROSMaster: few at a time, one of each host.
+
+    ROSMaster is one Python process: what many of its threads read at once, all others wait for. Whoever has a turn
+    waits for nothing but ROSMaster.
+    """
+
+    def __init__(self, enough: int, standing: Callable[[Address], Standing]) -> None:
+        self._turns = Turns(LARGE_WRITES.bounds, standing)
+        self._enough = enough
+
+    @contextlib.asynccontextmanager
+    async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[None]:
+        """Carry out what brings these values to ROSMaster; small ones wait for nobody."""
+        if weigh(values, self._enough) < self._enough:
+            yield
+            return
+        await self._turns.enter(host)
+        try:
+            yield
+        finally:
+            self._turns.leave(host)
+
+
+def weigh(value: Value, enough: int) -> int:
+    """About how many bytes a value takes on the wire; counting ends when it is `enough`."""
+    total = 0
+    waiting: list[Value] = [value]
+    while waiting and total < enough:
+        one = waiting.pop()
+        kind = type(one)
+        if kind is int:
+            total += _VALUE
+        elif kind is str or kind is bytes:
+            total += _TEXT + len(one)  # type: ignore[arg-type]  # it is one of the two
+        elif kind is list:
+            total += _ARRAY
+            waiting += one  # type: ignore[arg-type]  # it is one
+        elif isinstance(one, dict):
+            total += _STRUCT
+            for name in one:
+                total += _MEMBER + len(name)
+                if total >= enough:
+                    return total
+            waiting += one.values()
+        else:
+            total += _VALUE
+    return total

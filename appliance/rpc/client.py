@@ -1,0 +1,236 @@
+"""XML-RPC calls that the appliance makes: to ROSMaster on kept-alive connections, to nodes on fresh ones.
+
+Every call has a time limit, every response a size limit; a peer that is slow, silent or lies costs his caller a
+`CallFailedError` and nobody else anything.
+"""
+
+import asyncio
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import httptools
+
+from appliance.ros.errors import PeerError
+from appliance.ros.uris import NodeUri, node_uri
+from appliance.ros.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
+from appliance.rpc.bulk import weigh
+
+
+class CallFailedError(Exception):
+    """The call got no usable answer; the text says what happened at which address."""
+
+
+class RefusedError(CallFailedError):
+    """The other side refuses connections or cannot be reached: nobody is there."""
+
+
+class UnreachedError(CallFailedError):
+    """The time was over before there was a connection: the other side's machine is away, or its answers are."""
+
+
+class UnansweredError(CallFailedError):
+    """There was a connection and the time was over before an answer: the other side hangs, or is very slow."""
+
+
+class BrokenOffError(CallFailedError):
+    """The connection broke before the answer was there: whether the call was carried out is not known."""
+
+
+class XmlRpcClient:
+    """Calls one XML-RPC server at `uri`; up to `pool` connections are kept open and reused.
+
+    `timeout` is seconds for one whole call, `pool` 0 means a fresh connection for each. `disconnected` hears when
+    the server closes a kept connection.
+    """
+
+    def __init__(
+        self,
+        uri: NodeUri,
+        *,
+        timeout: float,
+        pool: int = 0,
+        limits: Limits | None = None,
+        disconnected: Callable[[], None] | None = None,
+    ) -> None:
+        self.uri = uri
+        self._disconnected = disconnected
+        self._timeout = timeout
+        self._pool = pool
+        self._limits = limits or Limits()
+        self._idle: deque[_Connection] = deque()
+        host = f"[{uri.host}]" if ":" in uri.host else uri.host
+        self._head = (
+            f"POST {uri.path} HTTP/1.1\r\nHost: {host}:{uri.port}\r\nUser-Agent: rosrv\r\n"
+            "Content-Type: text/xml\r\nConnection: %s\r\nContent-Length: %%d\r\n\r\n"
+            % ("keep-alive" if pool else "close")
+        ).encode("ascii")
+
+    async def call(self, method: str, *params: Value) -> Value:
+        """Call `method` and return its value. Raises `CallFailedError` (or `RefusedError`)."""
+        body = await self._written(method, params)
+        request = self._head % len(body) + body
+        attempt = _Attempt()
+        try:
+            async with asyncio.timeout(self._timeout):
+                response = await self._exchange(request, attempt)
+        except TimeoutError:
+            if attempt.connected:
+                why = f"{self._where} did not answer {method} within {self._timeout:g} s"
+                raise UnansweredError(why) from None
+            why = f"{self._where} cannot be reached: no connection within {self._timeout:g} s"
+            raise UnreachedError(why) from None
+        except OSError as error:
+            raise _kind(error)(f"{self._where} could not be called: {error.strerror or error}") from error
+        try:
+            if len(response) > _OFFLOAD:
+                return await asyncio.to_thread(parse_response, response, self._limits)
+            return parse_response(response, self._limits)
+        except FaultReceived as fault:
+            raise CallFailedError(f"{self._where} answered {method} with a fault: {fault}") from fault
+        except PeerError as error:
+            raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
+
+    async def _written(self, method: str, params: tuple[Value, ...]) -> bytes:
+        if weigh(list(params), _OFFLOAD) < _OFFLOAD:
+            return build_call(method, params)
+        return await asyncio.to_thread(build_call, method, params)
+
+    @property
+    def _where(self) -> str:
+        return node_uri(self.uri.host, self.uri.port, self.uri.path)
+
+    async def _exchange(self, request: bytes, attempt: "_Attempt") -> bytes:
+        while self._idle:
+            connection = self._idle.pop()
+            if connection.alive:
+                attempt.connected = True
+                try:
+                    return await self._request(connection, request)
+                except ConnectionResetError:
+                    if connection.answering:
+                        raise
+                    continue  # kept-alive connections may be closed by the server at any time: ask on another
+        attempt.connected = False
+        loop = asyncio.get_running_loop()
+        _transport, connection = await loop.create_connection(
+            lambda: _Connection(self._limits.body, self._disconnected), self.uri.host, self.uri.port
+        )
+        attempt.connected = True
+        return await self._request(connection, request)
+
+    async def _request(self, connection: "_Connection", request: bytes) -> bytes:
+        kept = False
+        try:
+            response = await connection.request(request)
+            kept = connection.alive and len(self._idle) < self._pool
+            return response
+        finally:
+            if kept:
+                self._idle.append(connection)
+            else:
+                connection.close()
+
+    def close(self) -> None:
+        """Close the kept connections."""
+        while self._idle:
+            self._idle.pop().close()
+
+
+@dataclass(slots=True)
+class _Attempt:
+    """How far a call came."""
+
+    connected: bool = False
+
+
+class _Connection(asyncio.Protocol):
+    def __init__(self, body_limit: int, disconnected: Callable[[], None] | None) -> None:
+        self._body_limit = body_limit
+        self._disconnected = disconnected
+        self._answer: asyncio.Future[bytes] | None = None
+        self.alive = False
+        self.answering = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.alive = True
+
+    def request(self, data: bytes) -> "asyncio.Future[bytes]":
+        """Send one request; the future has the response's body."""
+        self._answer = asyncio.get_running_loop().create_future()
+        self._parser = httptools.HttpResponseParser(self)
+        self._pieces: list[bytes] = []
+        self._received = 0
+        self._until_end = True
+        self.answering = False
+        self._transport.write(data)
+        return self._answer
+
+    def close(self) -> None:
+        self.alive = False
+        self._transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        self.answering = True
+        if self._answer is None or self._answer.done():
+            self.close()
+            return
+        self._received += len(data)
+        if self._received > self._body_limit + _HEAD_LIMIT:
+            self._fail(ConnectionError(f"the answer is larger than {self._body_limit} bytes"))
+            return
+        try:
+            self._parser.feed_data(data)
+        except (httptools.HttpParserError, httptools.HttpParserUpgrade) as error:
+            self._fail(ConnectionError(f"not an HTTP response: {error}"))
+
+    def connection_lost(self, _error: Exception | None) -> None:
+        if self.alive and self._disconnected is not None:
+            self._disconnected()
+        self.alive = False
+        if self._answer is not None and not self._answer.done():
+            if self._pieces and self._until_end:
+                self._answer.set_result(b"".join(self._pieces))
+            else:
+                self._fail(ConnectionResetError("the connection was closed before the answer was whole"))
+
+    # --- httptools callbacks ---
+
+    def on_header(self, name: bytes, value: bytes) -> None:  # noqa: ARG002 - httptools' callback
+        if name.lower() in (b"content-length", b"transfer-encoding"):
+            self._until_end = False
+
+    def on_body(self, piece: bytes) -> None:
+        self._pieces.append(piece)
+
+    def on_message_complete(self) -> None:
+        status = self._parser.get_status_code()
+        if not self._parser.should_keep_alive():
+            self.alive = False
+        if self._answer is None or self._answer.done():
+            return
+        if status != 200:
+            self._fail(ConnectionError(f"HTTP status {status}"))
+        else:
+            self._answer.set_result(b"".join(self._pieces))
+
+    def _fail(self, error: ConnectionError) -> None:
+        self.alive = False
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(error)
+        self._transport.abort()
+
+
+def _kind(error: OSError) -> type[CallFailedError]:
+    if isinstance(error, ConnectionRefusedError) or error.errno in _UNREACHABLE:
+        return RefusedError
+    return BrokenOffError if isinstance(error, ConnectionResetError | BrokenPipeError) else CallFailedError
+
+
+_HEAD_LIMIT = 64 << 10
+_OFFLOAD = 256 << 10  # bytes of a call or an answer that are written or read on the event loop
+_UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH

@@ -1,0 +1,1 @@
+"""The specifications of monitors in force: checked, kept, given to the relays."""

@@ -1,0 +1,476 @@
+"""The specifications in force and the switches of their monitors: loading, revisions, what the relay is told.
+
+The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
+the store and survives a restart. New specifications are compiled before anything changes; bad ones change nothing
+and say everything that is wrong with them. The relay compiles them again and has the last word.
+
+Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
+with its monitor: another that is loaded later under the same name is as if nobody had switched it.
+
+Which files are the folder's is kept, too: a reload takes what the folder has in their place, and leaves what was loaded
+from elsewhere alone unless it is told to remove that.
+
+What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
+a change that is meant for another tag than the present one is refused.
+"""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.recorder import Recorder
+from appliance.specifications.allocation import Allocation
+from appliance.specifications.files import (
+    Checked,
+    Sources,
+    SpecificationsRefusedError,
+    check,
+)
+from appliance.specifications.folder import SpecificationFolder
+from appliance.specifications.observed import MonitorRecords
+from appliance.specifications.relays import Relays
+from appliance.specifications.stating import Revision, Stating
+from appliance.store.state import MonitorRevisionRow, StateStore
+
+_log = structlog.get_logger()
+_DISK = "disk"
+_SWITCHES = "monitor switches"
+_ACTS = "monitor acts"
+_FROM_FOLDER = "monitor files of the folder"
+ALLOCATION = "relays"
+_NO_FOLDER = (
+    "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
+    " --monitors DIR (monitors: DIR in appliance.yaml), or load files: rosrv monitor load FILE"
+)
+
+
+class UnknownMonitorError(Exception):
+    """There is no monitor, or file, of a name; the text says which there are."""
+
+
+class MonitorsChangedError(Exception):
+    """The monitors are not as they were when a change to them was thought of; `tag` is the present one."""
+
+    def __init__(self, expected: str, tag: str) -> None:
+        super().__init__(
+            f"the monitors were loaded, switched or resumed meanwhile (they are at {tag}, not at {expected}):"
+            " look at them first"
+        )
+        self.tag = tag
+
+
+@dataclass(frozen=True, slots=True)
+class Replaced:
+    """What a load did: the revision in force, the one before, files added, changed and removed, the lint.
+
+    `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
+    did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in
+    force although the folder does not have them: they were loaded from elsewhere.
+    """
+
+    revision: int
+    replaced: int
+    added: list[str]
+    changed: list[str]
+    removed: list[str]
+    warnings: list[str]
+    moved: list[str]
+    began: list[str]
+    kept: list[str]
+
+
+class Monitors:
+    """Keeps specifications and switches.
+
+    `published()` is called when monitors may publish other topics. Changes are made one at a time.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        enable: str,
+        store: StateStore,
+        recorder: Recorder,
+        *,
+        on_fault: Literal["drop", "pass"] = "drop",
+        allocation: Allocation | None = None,
+    ) -> None:
+        self.folder = folder
+        self._folder = SpecificationFolder(folder)
+        self._enable = enable
+        self._store = store
+        self._recorder = recorder
+        self.allocation = allocation or Allocation(1)
+        self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
+        self._switches: dict[str, bool] = {}
+        self._acts = 0  # switches and resumptions, ever
+        self._from_folder: frozenset[str] = frozenset()  # the files in force that were read from the folder
+        self._changing = asyncio.Lock()
+        self.revision = 0
+        self.sources = Sources()
+        self.checked = Checked()
+        self.who, self.note, self.loaded = _DISK, "", 0.0
+        self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data))  # noqa: PLW0108 - of whatever is in force then
+        self.published: Callable[[], None] = lambda: None
+
+    # --- start ---
+
+    def start(self, *, restarted: bool) -> None:
+        """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
+
+        As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
+        unless an operator's own revision was in force when it stopped.
+        """
+        settings = self._store.settings()
+        self._switches = json.loads(settings.get(_SWITCHES, "{}"))
+        self._acts = int(settings.get(_ACTS, "0"))
+        self._from_folder = frozenset(json.loads(settings.get(_FROM_FOLDER, "[]")))
+        last = self._store.monitor_revision()
+        if last is not None and (restarted or last.who != _DISK):
+            sources = Sources(**json.loads(last.sources))
+            self._enforce(sources, _check_kept(sources, last), last)
+            if _FROM_FOLDER not in settings and last.who == _DISK:  # of a version that did not keep it
+                self._note_folder(sources.files)
+        else:
+            sources = self._folder.read()
+            checked = check(sources)
+            if last is not None and Sources(**json.loads(last.sources)) == sources:
+                self._enforce(sources, checked, last)
+            elif sources.files or last is not None:
+                self._keep(sources, checked, who=_DISK, note="read at start")
+            self._note_folder(sources.files)
+        now = Revision(self.revision, self.sources, self.checked)
+        self._stating.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        unknown = sorted(self._named() - self.checked.monitors.keys())
+        if unknown and self.who == _DISK and not restarted:
+            raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
+        if unknown:  # it was removed while the robot ran
+            _log.warning("--enable names monitors that are not loaded", monitors=unknown)
+
+    def connect(self, relays: Relays) -> None:
+        """These are the relays."""
+        self._stating.relays = relays
+
+    # --- looking ---
+
+    @property
+    def tag(self) -> str:
+        """Names what a change is meant for: `expected` of the changes below."""
+        return f"{self.revision}.{self._acts}"
+
+    @property
+    def refused(self) -> list[str]:
+        """Why a relay does not take what is in force; empty when all do."""
+        return self._stating.refused
+
+    @property
+    def held(self) -> set[str]:
+        """The monitors that hold their topics."""
+        return self._stating.held
+
+    @property
+    def rows(self) -> Mapping[str, messages.MonitorRow]:
+        """State and counters of the monitors."""
+        return self._stating.rows
+
+    @property
+    def differs_from_folder(self) -> bool:
+        """Whether what is in force is something else than the folder has now; not where there is no folder."""
+        return self.folder is not None and self._folder.looked_at() != self.sources
+
+    def enabled(self, name: str) -> bool:
+        """Whether a monitor's events happen."""
+        default = self._enable == "all" or (self._enable != "none" and name in self._named())
+        return self._switches.get(name, default)
+
+    def names(self) -> list[str]:
+        """All monitors, in the order in which they see messages."""
+        return list(self.checked.monitors)
+
+    def file_of(self, name: str) -> str:
+        """The file of this name, or the file that this monitor stands in. Raises `UnknownMonitorError`."""
+        if name in self.sources.files:
+            return name
+        if name not in self.checked.monitors:
+            raise UnknownMonitorError(self._unknown([name]))
+        return self.checked.monitors[name]
+
+    def statement(self, relay: int = 0) -> messages.SpecificationsStated:
+        """What a relay is told before anything else."""
+        return self._stating.statement(relay)
+
+    # --- changing ---
+
+    async def load(
+        self,
+        files: dict[str, str],
+        definitions: dict[str, str],
+        *,
+        who: str,
+        note: str,
+        expected: str | None = None,
+    ) -> Replaced:
+        """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`."""
+        async with self._changing:
+            self._expect(expected)
+            sources = self.sources.with_files(files, definitions)
+            folders = self._from_folder - files.keys()
+            return await self._change(sources, who, who, note or "loaded", from_folder=folders)
+
+    async def reload(self, *, who: str, expected: str | None = None, prune: bool = False) -> Replaced:
+        """Take what the folder has now; what was loaded from elsewhere stays, unless `prune`.
+
+        Raises `SpecificationsRefusedError`, also when there is no folder.
+        """
+        async with self._changing:
+            self._expect(expected)
+            if self.folder is None:
+                raise SpecificationsRefusedError([_NO_FOLDER])
+            sources = await asyncio.to_thread(self._folder.read)
+            from_folder = frozenset(sources.files)
+            kept = [] if prune else sorted(self.sources.files.keys() - self._from_folder - from_folder)
+            if kept:
+                left = {name: self.sources.files[name] for name in kept}
+                definitions = self.sources.definitions | sources.definitions
+                sources = sources.with_files(left, definitions)
+            keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
+            return await self._change(
+                sources, keeper, who, "reloaded from disk", from_folder=from_folder, kept=kept
+            )
+
+    async def remove(self, names: list[str], *, who: str, expected: str | None = None) -> Replaced:
+        """Remove files, by their names or those of their monitors.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
+        other monitors as well.
+        """
+        async with self._changing:
+            self._expect(expected)
+            owners = self.checked.monitors
+            known = set(self.sources.files) | set(owners)
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                raise UnknownMonitorError(self._unknown(unknown))
+            files = {owners.get(name, name) for name in names}
+            left = sorted(
+                one for one, file in owners.items() if file in files and not {one, file} & set(names)
+            )
+            if left:
+                text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
+                raise SpecificationsRefusedError([text])
+            sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
+            return await self._change(sources, who, who, note, from_folder=self._from_folder - files)
+
+    async def switch(
+        self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
+    ) -> list[str]:
+        """Enable or disable monitors; those that were not so already. Raises `UnknownMonitorError`."""
+        async with self._changing:
+            self._expect(expected)
+            self._all_known(names)
+            changed = [name for name in dict.fromkeys(names) if self.enabled(name) is not enabled]
+            if changed:
+                await self._count()
+            for name in changed:
+                self._switches[name] = enabled
+                self._stating.tell(name, messages.MonitorSwitched(name, enabled))
+                word = "enabled" if enabled else "disabled"
+                self._recorder.happened(
+                    f"monitor {word}",
+                    f"{name} is {word}",
+                    severity=Severity.NOTICE,
+                    category="monitor",
+                    resource=name,
+                    who=who,
+                )
+            if changed:
+                self._store.save_setting(_SWITCHES, json.dumps(self._switches))
+                await self._store.settled()
+            return changed
+
+    async def resume(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
+        """Let the topics of held monitors go on; which were held.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for those whose relay process is away: the one
+        that comes will hold them.
+        """
+        async with self._changing:
+            self._expect(expected)
+            self._all_known(names)
+            held = [name for name in dict.fromkeys(names) if name in self.held]
+            if held:
+                await self._count()
+            away = []
+            for name in held:
+                if not self._stating.tell(name, messages.MonitorResumed(name)):
+                    away.append(name)
+                    continue
+                self._stating.resumed(name)
+                self._recorder.happened(
+                    "monitor resumed",
+                    f"the topics of {name} go on",
+                    severity=Severity.NOTICE,
+                    category="monitor",
+                    resource=name,
+                    who=who,
+                )
+            if away:
+                text = (
+                    f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
+                )
+                raise SpecificationsRefusedError([text])
+            return held
+
+    # --- what the relay says ---
+
+    def received(self, message: messages.Message, relay: int = 0) -> None:
+        """A message of a relay about monitors."""
+        if isinstance(message, messages.MonitorsReported):
+            self.records.reported(message.events, message.lost)
+        else:
+            self._stating.received(message, relay)
+
+    def relay_lost(self, relay: int) -> None:
+        """A relay is gone."""
+        self._stating.lost(relay)
+
+    # --- inside ---
+
+    def _named(self) -> set[str]:
+        return set() if self._enable in {"all", "none"} else {one.strip() for one in self._enable.split(",")}
+
+    def _unknown(self, names: list[str]) -> str:
+        known = ", ".join(self.checked.monitors) or "none is loaded"
+        return f"no monitor is named {', '.join(names)}; there are: {known}"
+
+    def _all_known(self, names: list[str]) -> None:
+        unknown = [name for name in names if name not in self.checked.monitors]
+        if unknown:
+            raise UnknownMonitorError(self._unknown(unknown))
+
+    def _expect(self, expected: str | None) -> None:
+        if expected is not None and expected != self.tag:
+            raise MonitorsChangedError(expected, self.tag)
+
+    async def _count(self) -> None:
+        """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
+        self._store.save_setting(_ACTS, str(self._acts + 1))
+        await self._store.settled()
+        self._acts += 1
+
+    def _note_folder(self, files: Iterable[str]) -> None:
+        self._from_folder = frozenset(files)
+        self._store.save_setting(_FROM_FOLDER, json.dumps(sorted(self._from_folder)))
+
+    async def _change(
+        self,
+        sources: Sources,
+        keeper: str,
+        who: str,
+        note: str,
+        *,
+        from_folder: Collection[str],
+        kept: Sequence[str] = (),
+    ) -> Replaced:
+        before, previous = self.revision, self.sources
+        try:
+            checked = await asyncio.to_thread(check, sources)
+            moved = await self._stating.take(Revision(before + 1, sources, checked))
+        except SpecificationsRefusedError as error:
+            self._recorder.happened(
+                "specifications refused",
+                f"revision {self.revision} stays in force: {error.findings[0]}",
+                severity=Severity.WARNING,
+                findings=error.findings[:100],
+                who=who,
+            )
+            raise
+        began = self._stating.began(checked.monitors)
+        self._note_folder(from_folder)
+        self._keep(sources, checked, who=keeper, note=note, by=who, before=previous, began=began)
+        await self._store.settled()
+        await self._stating.all_taken()
+        self.published()
+        added, changed, removed = sources.difference(previous)
+        began = self._stating.began(checked.monitors)  # by those that have it only now, too
+        warnings = list(checked.warnings)
+        return Replaced(self.revision, before, added, changed, removed, warnings, moved, began, list(kept))
+
+    def _keep(
+        self,
+        sources: Sources,
+        checked: Checked,
+        *,
+        who: str,
+        note: str,
+        by: str | None = None,
+        before: Sources | None = None,
+        began: Sequence[str] = (),
+    ) -> None:
+        text = json.dumps({"files": sources.files, "definitions": sources.definitions})
+        row = MonitorRevisionRow(self.revision + 1, text, time.time(), who, note)
+        last = self._store.monitor_revision()
+        if before is None and last is not None:
+            row = MonitorRevisionRow(last.revision + 1, text, time.time(), who, note)
+            before = Sources(**json.loads(last.sources))
+        self._store.save_monitor_revision(row)
+        self._enforce(sources, checked, row)
+        added, changed, removed = sources.difference(before or Sources())
+        self._recorder.happened(
+            "specifications loaded",
+            f"revision {row.revision} of the specifications is in force: {note}",
+            severity=Severity.NOTICE,
+            category="monitor",
+            resource="",
+            who=by or who,
+            revision_of_specifications=row.revision,
+            monitors=list(checked.monitors),
+            added=added,
+            changed=changed,
+            removed=removed,
+            began=list(began),
+            warnings=list(checked.warnings)[:100],
+        )
+
+    def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
+        self.sources, self.checked, self.revision = sources, checked, row.revision
+        self.who, self.note, self.loaded = row.who, row.note, row.loaded
+        left = {name: enabled for name, enabled in self._switches.items() if name in checked.monitors}
+        if left != self._switches:
+            self._switches = left
+            self._store.save_setting(_SWITCHES, json.dumps(left))
+
+
+def forget_revision(store: StateStore, now: float) -> int | None:
+    """Have the next start take the folder; the revision that is given up, None if it was the folder's already.
+
+    For an appliance that does not run.
+    """
+    last = store.monitor_revision()
+    if last is None or last.who == _DISK:
+        return None
+    nothing = json.dumps({"files": {}, "definitions": {}})
+    store.save_monitor_revision(
+        MonitorRevisionRow(last.revision + 1, nothing, now, _DISK, f"revision {last.revision} was given up")
+    )
+    return last.revision
+
+
+def _check_kept(sources: Sources, row: MonitorRevisionRow) -> Checked:
+    """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
+    try:
+        return check(sources)
+    except SpecificationsRefusedError as error:
+        way = (
+            f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."
+            " To give it up and start with the folder (--monitors): rosrv monitor reset --state DIR"
+        )
+        raise SpecificationsRefusedError([*error.findings, way]) from error

@@ -1,0 +1,90 @@
+"""What monitors did, as the relay reports it: audit records, and counts for the metrics."""
+
+import datetime
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from appliance.audit.record import Severity
+from appliance.channel.messages import MonitorEvent
+from appliance.recorder import Recorder
+
+_EVENTS = {
+    "verdict": ("monitor verdict", Severity.NOTICE),
+    "drop": ("message dropped", Severity.WARNING),
+    "change": ("message changed", Severity.NOTICE),
+    "fault": ("monitor fault", Severity.ALARM),
+    "log": ("monitor log", Severity.INFO),
+    "publish": ("monitor published", Severity.INFO),
+}
+KINDS = tuple(_EVENTS)
+_LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
+
+
+class MonitorRecords:
+    """Makes records of reports; `fields(topic, data)` reads a message.
+
+    `counts` has how often each kind happened, by monitor: a change that several made, for each of them. `at` has how
+    often messages of a topic were dropped or changed.
+    `told(event)` hears of every event.
+    """
+
+    def __init__(
+        self,
+        recorder: Recorder,
+        fields: Callable[[str, bytes], dict[str, Any] | None] = lambda _topic, _data: None,
+    ) -> None:
+        self._recorder = recorder
+        self._fields = fields
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.at: Counter[tuple[str, str]] = Counter()
+        self.told: Callable[[MonitorEvent], None] = lambda event: None  # noqa: ARG005 - set when wired
+
+    def reported(self, events: list[MonitorEvent], lost: int) -> None:
+        """A batch of the relay."""
+        for event in events:
+            for monitor in _monitors(event):
+                self.counts[event.kind, monitor] += event.count or 1
+            if event.kind in ("drop", "change"):
+                self.at[event.kind, event.resource] += event.count or 1
+            self._record(event)
+            self.told(event)
+        if lost:
+            text = f"{lost} reports of monitors were lost while the relay had no control"
+            self._recorder.happened("records lost", text, severity=Severity.ALARM, lost=lost)
+
+    def _record(self, event: MonitorEvent) -> None:
+        name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
+        detail: dict[str, Any] = {"monitor": event.monitor}
+        detail["happened"] = datetime.datetime.fromtimestamp(event.time / 1e9, datetime.UTC).isoformat()
+        if event.kind == "log":
+            severity = _LEVELS.get(str(event.detail.get("level")), severity)
+        for word, data in (("before", event.before), ("after", event.after)):
+            if data:
+                detail[word] = data.hex()
+                read = self._fields(event.resource, data)
+                if read is not None:
+                    detail[f"{word}_fields"] = read
+        if event.size:
+            detail["size"] = event.size
+        text = event.text
+        if event.count:
+            detail["count"] = event.count
+            text = f"{event.count} more in the same second" + (f": {text}" if text else "")
+        self._recorder.happened(
+            name,
+            text,
+            severity=severity,
+            host=event.host or None,
+            caller_id=event.caller_id or None,
+            category="monitor",
+            resource=event.resource,
+            more=event.detail,
+            **detail,
+        )
+
+
+def _monitors(event: MonitorEvent) -> set[str]:
+    """Whose doing it was."""
+    together = event.detail.get("changed_by", ())
+    return {event.monitor, *(str(one).partition(".")[0] for one in together)}

@@ -1,0 +1,314 @@
+"""Has the relays take the specifications: each those files that are its own, all of them or none.
+
+A load is tried first: every relay that gives nothing up is told what it is to have, before anything is carried
+elsewhere; so is one that comes meanwhile. When all have taken it, what moves is withdrawn where it was, the allocation
+changes, and it is placed where its monitors are now: no message goes past its monitors. Those that give something up
+are told then; a load is over when they have said so (`all_taken`). A monitor whose file moves begins in its initial
+state on the other relay (its variables are in the memory of the one it was on); one that is declared `hold` then holds
+its topics.
+"""
+
+import asyncio
+import itertools
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.recorder import Recorder
+from appliance.specifications.allocation import Allocation, Plan
+from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
+from appliance.specifications.relays import NoRelays, Relays
+
+_RELAY_SECONDS = 15.0
+_TRIES = 5  # while nodes that are affected register and go
+_SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """Specifications in force, or about to be."""
+
+    number: int = 0
+    sources: Sources = field(default_factory=Sources)
+    checked: Checked = field(default_factory=Checked)
+
+
+class Stating:
+    """What the relays were told and what they said; `enabled(name)` says whether a monitor's events happen.
+
+    `rows` has state and counters of the monitors, as far as their relays have told.
+    """
+
+    def __init__(
+        self,
+        allocation: Allocation,
+        recorder: Recorder,
+        on_fault: Literal["drop", "pass"],
+        enabled: Callable[[str], bool],
+    ) -> None:
+        self.allocation = allocation
+        self.relays: Relays = NoRelays()
+        self._recorder = recorder
+        self._on_fault: Literal["drop", "pass"] = on_fault
+        self._enabled = enabled
+        self._now = Revision()
+        self._known: set[int] = set()  # relays that had specifications before
+        self._fresh: set[int] = set()  # relays that have not answered since they are there
+        self._coming: tuple[Revision, Plan] | None = None  # being tried
+        self._answers: dict[int, asyncio.Future[list[str]]] = {}  # of those that gave something up
+        self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}  # by relay and statement
+        # Relays may outlive control: no number comes again.
+        self._numbers = itertools.count(time.monotonic_ns())
+        self._refusals: dict[int, list[str]] = {}
+        self._began: set[str] = set()  # by what is being changed
+        self._held: dict[int, set[str]] = {}
+        self._rows: dict[int, list[messages.MonitorRow]] = {}
+        self.rows: dict[str, messages.MonitorRow] = {}
+
+    @property
+    def refused(self) -> list[str]:
+        """Why a relay does not take what is in force; empty when all do."""
+        return [finding for findings in self._refusals.values() for finding in findings]
+
+    @property
+    def held(self) -> set[str]:
+        """The monitors that hold their topics."""
+        return {name for names in self._held.values() for name in names}
+
+    def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
+        """These are in force. After a crash of control (`restarted`) the relays go on with what they have."""
+        self._now = now
+        if restarted:
+            self._known = set(range(self.allocation.relays))
+        carried = self.allocation.resources if restarted and self.allocation.restore(kept) else ()
+        # what was kept may be of a change that control did not survive: then it is made to fit, as little as can be
+        self.allocation.adopt(self.allocation.plan(now.checked, carried))
+
+    def statement(self, relay: int) -> messages.SpecificationsStated:
+        """What a relay is told before anything else; one that follows another must hold what is to be held."""
+        restarted = relay in self._known
+        self._known.add(relay)
+        (self._fresh.add if restarted else self._fresh.discard)(relay)
+        if self._coming is not None and relay not in self._coming[1].losing:
+            coming, plan = self._coming
+            return self._statement(
+                coming, relay, _of(plan), plan.moved_files, restarted=restarted, ahead=True
+            )
+        return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted, ahead=True)
+
+    def relay_of(self, monitor: str) -> int:
+        """The relay that has a monitor."""
+        return self.allocation.of_file(self._now.checked.monitors[monitor])
+
+    def tell(self, monitor: str, message: messages.Message) -> bool:
+        """Tell the relay that has a monitor; False when it is not there."""
+        return self.relays.send(message, self.relay_of(monitor))
+
+    def resumed(self, monitor: str) -> None:
+        """A monitor holds its topics no longer."""
+        for names in self._held.values():
+            names.discard(monitor)
+
+    # --- a change ---
+
+    def began(self, names: Iterable[str]) -> list[str]:
+        """Those of these monitors that are in their initial state since the last change, moved ones among them."""
+        return [name for name in names if name in self._began]
+
+    async def take(self, coming: Revision) -> list[str]:
+        """Have every relay take these; the monitors that began anew because they moved.
+
+        Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
+        """
+        plan = self.allocation.plan(coming.checked, self.relays.carried_now())
+        self._began = set()
+        for _ in range(_TRIES):
+            await self._try(coming, plan)
+            tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
+            if plan == tried:
+                return self._settle(coming, plan)
+            for relay in plan.losing - tried.losing:
+                self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+        self._restate()
+        raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
+
+    async def all_taken(self) -> None:
+        """Wait until the relays that gave something up have what is in force, or one of them fails to (`refused`)."""
+        answers, self._answers = self._answers, {}
+        if answers:
+            await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
+        for relay, answer in answers.items():
+            if not answer.done():
+                self._refusals[relay] = [_SILENT]
+                self._stop_waiting(relay)
+
+    async def _try(self, coming: Revision, plan: Plan) -> None:
+        answers: dict[int, asyncio.Future[list[str]]] = {}
+        self._coming = (coming, plan)
+        for relay in range(self.allocation.relays):
+            if relay in plan.losing:
+                continue  # it goes on with what it has until its topics are withdrawn
+            statement = self._statement(coming, relay, _of(plan), plan.moved_files)
+            self._ask(relay, statement, answers)
+        try:
+            findings = await self._findings(list(answers.values()))
+        finally:
+            self._coming = None
+            for relay in answers:
+                self._stop_waiting(relay)
+        if findings:
+            self._restate()
+            raise SpecificationsRefusedError(findings)
+
+    def _ask(
+        self,
+        relay: int,
+        statement: messages.SpecificationsStated,
+        answers: dict[int, asyncio.Future[list[str]]],
+    ) -> None:
+        """Tell a relay, and have its answer among these if it is there."""
+        if self.relays.send(statement, relay):
+            answers[relay] = asyncio.get_running_loop().create_future()
+            self._waiting[relay, statement.statement] = answers[relay]
+
+    async def _findings(self, answers: list[asyncio.Future[list[str]]]) -> list[str]:
+        try:
+            said = await asyncio.wait_for(asyncio.gather(*answers), _RELAY_SECONDS)
+        except TimeoutError:
+            return [f"{_SILENT}; try again"]
+        return [finding for findings in said for finding in findings]
+
+    def _settle(self, coming: Revision, plan: Plan) -> list[str]:
+        """Between two messages of every relay's link: nothing is awaited here.
+
+        Those that have it already say so again.
+        """
+        self._now = coming
+        self.relays.withdraw(plan.moves)
+        self.allocation.adopt(plan)
+        for relay in range(self.allocation.relays):
+            statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
+            if relay in plan.losing:
+                self._ask(relay, statement, self._answers)
+            else:
+                self.relays.send(statement, relay)
+        self.relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
+        self._merge_rows()
+        moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
+        if plan.moves:
+            self._say_moved(plan, moved)
+        return moved
+
+    def _merge_rows(self) -> None:
+        """State and counters of the monitors, each as the relay tells it that has the monitor."""
+        self.rows = {
+            row.name: row
+            for relay, rows in self._rows.items()
+            for row in rows
+            if self.allocation.of_file(row.file) == relay
+        }
+
+    def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
+        names = [move.name for move in plan.moves]
+        anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
+        self._recorder.happened(
+            "topics moved",
+            f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} carried by another relay process{anew}",
+            severity=Severity.ALARM if monitors else Severity.NOTICE,
+            category="monitor",
+            resource="",
+            topics=names[:1000],
+            monitors=monitors,
+        )
+
+    def _restate(self) -> None:
+        for relay in range(self.allocation.relays):
+            self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+
+    def _statement(
+        self,
+        revision: Revision,
+        relay: int,
+        of_file: Callable[[str], int],
+        moved: frozenset[str] = frozenset(),
+        *,
+        restarted: bool = False,
+        ahead: bool = False,
+    ) -> messages.SpecificationsStated:
+        files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
+        mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
+        return messages.SpecificationsStated(
+            revision.number,
+            files,
+            revision.sources.definitions,
+            {name: self._enabled(name) for name in revision.checked.monitors if name in mine},
+            restarted,
+            self._on_fault,
+            tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
+            next(self._numbers),
+            ahead,
+        )
+
+    # --- what the relays say ---
+
+    def received(self, message: messages.Message, relay: int) -> None:
+        """A message of a relay about its monitors."""
+        match message:
+            case messages.SpecificationsTaken(_, began, held, statement):
+                self._taken(relay, statement, began, held)
+            case messages.SpecificationsRefused(number, findings, statement):
+                self._refused(relay, number, findings, statement)
+            case messages.MonitorsCounted(rows):
+                self._rows[relay] = rows
+                self._merge_rows()
+
+    def lost(self, relay: int) -> None:
+        """A relay is gone: what it has not answered is refused, since it may have died of it."""
+        for at, statement in [one for one in self._waiting if one[0] == relay]:
+            self._answer(at, statement, ["a relay process ended while it took them: try again"])
+
+    def _taken(self, relay: int, statement: int, began: list[str], held: list[str]) -> None:
+        self._refusals.pop(relay, None)
+        self._held[relay] = set(held)
+        if (relay, statement) in self._waiting:
+            self._began |= set(began)
+        if relay in self._fresh and began:
+            self._recorder.happened(
+                "monitors restarted",
+                f"a new relay process: {', '.join(began)} began in the initial state"
+                + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
+                severity=Severity.ALARM,
+                category="monitor",
+                resource="",
+                monitors=began,
+                held=held,
+            )
+        self._fresh.discard(relay)
+        self._answer(relay, statement, [])
+
+    def _refused(self, relay: int, number: int, findings: list[str], statement: int) -> None:
+        if number == self._now.number:
+            self._refusals[relay] = findings
+        self._recorder.happened(
+            "specifications refused",
+            f"the relay does not take revision {number}: {findings[0] if findings else ''}",
+            severity=Severity.ALARM,
+            findings=findings,
+        )
+        self._answer(relay, statement, findings or ["the relay gives no reason"])
+
+    def _stop_waiting(self, relay: int) -> None:
+        for one in [one for one in self._waiting if one[0] == relay]:
+            del self._waiting[one]
+
+    def _answer(self, relay: int, statement: int, findings: list[str]) -> None:
+        waiting = self._waiting.pop((relay, statement), None)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(findings)
+
+
+def _of(plan: Plan) -> Callable[[str], int]:
+    return lambda file: plan.files.get(file, 0)

@@ -1,0 +1,95 @@
+"""Tests of putting a backup back: where to, for whom, and what a torn restore leaves."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from appliance.backup import restoring as backup_restore
+from appliance.backup.contents import BackupError
+from appliance.backup.restoring import restore
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import refuse_half_restored
+from appliance.supervisor.state import foreign
+from tests.support.backups import LOG, archive, header
+from tests.support.requirements import need_root
+
+
+def test_more_than_there_is_room_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What unpacks to more than the disk has room for is not begun."""
+    file = archive(tmp_path / "bomb", header("api/x", 1 << 24), bytes(1 << 24))
+    assert file.stat().st_size < 1 << 16
+    monkeypatch.setattr(backup_restore, "_room_in", lambda _state: 1 << 23)
+    with pytest.raises(BackupError, match="more than the 8 MiB that there is room for"):
+        restore(file, tmp_path / "state")
+    assert not (tmp_path / "state").exists()
+
+
+def test_a_place_that_is_no_folder(tmp_path: Path) -> None:
+    """A file in the place of the new state directory, or on the way to it: an error that names it."""
+    (tmp_path / "file").touch()
+    for state in (tmp_path / "file", tmp_path / "file" / "state"):
+        with pytest.raises(BackupError, match=r"file.*: Not a directory"):
+            restore(archive(tmp_path / "backup"), state)
+
+
+def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed in the middle it leaves a mark, which `rosrv up` refuses; an error or Ctrl-C leaves nothing at all."""
+    file, state = archive(tmp_path / "backup", header("api/x")), tmp_path / "state"
+    seen: list[str] = []
+
+    def torn(*_: object) -> None:
+        seen.extend(one.name for one in state.iterdir())
+        with pytest.raises(StartError, match="was not put back to its end: remove it"):
+            refuse_half_restored(state)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(backup_restore, "_extract", torn)
+    with pytest.raises(KeyboardInterrupt):
+        restore(file, state)
+    assert sorted(seen) == ["lock", "restoring"]
+    assert not state.exists()
+    state.mkdir()
+    (state / "restoring").touch()
+    with pytest.raises(BackupError, match="is not empty"):
+        restore(file, state)
+    monkeypatch.undo()
+    (state / "restoring").unlink()
+    assert restore(file, state) == [LOG, "api/x"]
+    refuse_half_restored(state)
+    assert sorted(one.name for one in state.iterdir()) == ["api", "control", "lock"]
+
+
+def test_what_was_restored_is_an_appliances(tmp_path: Path) -> None:
+    """`rosrv up` takes it, in a container too, where root may not look into the parts: it has the lock."""
+    state = tmp_path / "state"
+    restore(archive(tmp_path / "backup"), state)
+    assert stat.S_IMODE((state / "lock").stat().st_mode) == 0o600
+    (state / "control").rename(tmp_path / "out of sight")
+    (state / "control").mkdir()
+    assert foreign(state) is None
+
+
+def test_a_folder_that_was_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an empty folder, such as a volume or a disk, a failed restore takes away only what it put there."""
+    file, state = archive(tmp_path / "backup"), tmp_path / "state"
+    (state / "lost+found").mkdir(parents=True)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(backup_restore, "_extract", full)
+    with pytest.raises(BackupError, match="No space left"):
+        restore(file, state)
+    assert [one.name for one in state.iterdir()] == ["lost+found"]
+
+
+def test_a_folder_is_given_away_after_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While `restore` hands a part over, its user cannot put a link in the place of what is still to be given away."""
+    need_root()
+    given: list[str] = []
+    monkeypatch.setattr(os, "chown", lambda path, *_ids, **_more: given.append(str(path)))
+    restore(archive(tmp_path / "backup", header("api/inner/file")), tmp_path / "other")
+    order = [given.index(str(tmp_path / "other" / name)) for name in ("api/inner/file", "api/inner", "api")]
+    assert order == sorted(order)

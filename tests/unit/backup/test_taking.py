@@ -1,0 +1,302 @@
+"""Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
+
+import os
+import shutil
+import sqlite3
+import stat
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.log import AuditLog
+from appliance.audit.verify import verify
+from appliance.backup import taking as backup
+from appliance.backup.contents import BackupError
+from appliance.backup.restoring import restore
+from appliance.backup.taking import back_up
+from appliance.ipsec.checkpoints import SignedCheckpoints
+from tests.support.audit import decision, settle
+from tests.support.requirements import need_root
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """A state directory with a log of some signed checkpoints, whose signer has signed one more since."""
+    state = tmp_path / "state"
+    for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
+        (state / part).mkdir(parents=True)
+    key = Ed25519PrivateKey.generate()
+    memory = SignedCheckpoints(state / "signer")
+
+    def sign(number: int, text: bytes) -> None:
+        memory.approve(text)
+        logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
+
+    logs: list[AuditLog] = []
+    logs.append(AuditLog(state / "control" / "audit.db", checkpoint_every=5, signer=sign))
+    for number in range(30):
+        logs[0].record(decision(logs[0], number))
+        assert settle(logs[0]) is None
+    logs[0].close()
+    (signed,) = (state / "signer").glob("*.signed")
+    with signed.open("ab") as file:
+        file.write(b"\x01" * 32)  # signed after the copy of the log was taken
+    with closing(sqlite3.connect(state / "control" / "state.db")) as connection:
+        connection.execute("CREATE TABLE thing (value TEXT)")
+        connection.execute("INSERT INTO thing VALUES ('kept')")
+        connection.commit()
+    for name, text in (("signer/audit.key", "secret"), ("run/config.json", "{}"), ("rosmaster/log/x.log", "x"),
+                       ("control/state.ahead", "x"), ("control/audit.db.lock", ""),
+                       ("ipsec/strongswan.conf", "")):  # fmt: skip
+        (state / name).write_text(text)
+    (state / "signer" / "audit.key").chmod(0o600)
+    return state
+
+
+def test_there_and_back(state: Path, tmp_path: Path) -> None:
+    """What must survive is put back as it was; what belongs to a running appliance is not; the log proves itself."""
+    file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
+    assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
+    names = back_up(state, file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert sorted(names) == sorted(restore(file, other))
+    assert {"control/audit.db", "control/audit.pub", "control/state.db", "signer/audit.key"} <= set(names)
+    assert not any(
+        name.startswith(("run/", "rosmaster/")) or name.endswith((".ahead", ".lock", ".conf"))
+        for name in names
+    )
+    assert stat.S_IMODE((other / "signer" / "audit.key").stat().st_mode) == 0o600
+    result = verify(other / "control" / "audit.db", signer=other / "signer")
+    assert result.ok, result.findings
+    assert result.signed_checkpoints >= 5
+    with closing(sqlite3.connect(other / "control" / "state.db")) as connection:
+        assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",)]
+    assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".rosrv-backup")] == []
+
+
+def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
+    """An existing file, and a state directory that has something in it, stay as they are."""
+    file = tmp_path / "backup.tar.gz"
+    file.write_text("mine")
+    with pytest.raises(BackupError, match="is there already"):
+        back_up(state, file)
+    assert file.read_text() == "mine"
+    file.unlink()
+    back_up(state, file)
+    with pytest.raises(BackupError, match="is not empty"):
+        restore(file, state)
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    """No state directory: an error that names it."""
+    with pytest.raises(BackupError, match="no state directory of an appliance"):
+        back_up(tmp_path, tmp_path / "x.tar.gz")
+
+
+def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
+    """A backup without the keys would be none: what cannot be looked into is an error, and no file is left."""
+    need_root()
+    file = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
+    file.chmod(0o777)
+    for path in (tmp_path, *tmp_path.parents):
+        if path.stat().st_uid == os.geteuid() and path != Path("/"):
+            path.chmod(path.stat().st_mode | 0o011)
+    for path in state.rglob("*"):
+        path.chmod(0o777)
+    (state / "signer").chmod(0o700)
+    program = (
+        "import os, sys; from pathlib import Path; from appliance.backup.taking import back_up;"
+        "os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534);"
+        "back_up(Path(sys.argv[1]), Path(sys.argv[2]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(state), str(file / "b.tar.gz")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "BackupError" in done.stderr
+    assert "signer" in done.stderr
+    assert list(file.iterdir()) == []
+    file.rmdir()
+
+
+def test_what_a_process_planted_is_not_taken_for_its_own(state: Path, tmp_path: Path) -> None:
+    """Links, pipes and folders that are links, put into a part by its user, lead a backup that root makes nowhere."""
+    secret = tmp_path / "shadow"
+    secret.write_text("root's")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "inner").write_text("root's")
+    (state / "api" / "link").symlink_to(secret)
+    (state / "api" / "link.db").symlink_to(state / "control" / "state.db")
+    (state / "api" / "folder").symlink_to(tmp_path / "outside")
+    os.mkfifo(state / "api" / "pipe")
+    (state / "api" / "garbage.db").write_text("no database")
+    back_up(state, tmp_path / "backup.tar.gz")
+    with tarfile.open(tmp_path / "backup.tar.gz") as archive:
+        assert [one for one in archive.getnames() if one.startswith("api/")] == ["api/garbage.db"]
+
+
+@pytest.mark.parametrize("name", ["api/key.pem", "api/folder/shadow"])
+def test_a_link_that_is_put_there_at_the_last_moment_is_not_followed(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A file, or a folder on the way to it, that becomes a link after it was seen gives nothing of its target away."""
+    (tmp_path / "shadow").write_text("root's")
+    (state / "api" / "key.pem").symlink_to(tmp_path / "shadow")
+    (state / "api" / "folder").symlink_to(tmp_path)
+    seen = {"control": ["control/audit.db"], "api": [name]}
+    monkeypatch.setattr(backup, "_names", lambda _state, part: seen.get(part, []))
+    file = tmp_path / "backup.tar.gz"
+    if name == "api/key.pem":
+        assert back_up(state, file) == ["control/audit.db"]
+    else:
+        with pytest.raises(BackupError, match="Not a directory"):
+            back_up(state, file)
+        assert not file.exists()
+
+
+def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
+    """A hard link that a process made to a file of somebody else is told, and no backup is left."""
+    need_root()
+    for path in (state / "api", *(state / "api").iterdir()):
+        os.chown(path, 61014, 61014)
+    (tmp_path / "shadow").write_text("root's")
+    os.link(tmp_path / "shadow", state / "api" / "mine")
+    with pytest.raises(BackupError, match="api/mine belongs to user id 0"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_a_file_without_end_is_refused(state: Path, tmp_path: Path) -> None:
+    """A process cannot fill the disk, or the memory, of whoever makes the backup with a file full of holes."""
+    with (state / "api" / "hole").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+@pytest.mark.parametrize("name", ["\x1b[2J", "x" * 97])
+def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: str) -> None:
+    """A backup that nobody could put back is not made: the file that is in the way is named."""
+    (state / "api" / name).touch()
+    with pytest.raises(BackupError, match="see who put it there"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who writes on while it is read cannot fill the disk with a backup, either."""
+    content = state / "api" / "growing"
+    content.write_bytes(bytes(1000))
+    opened = backup._opened
+
+    def grown(state: Path, name: str) -> int | None:
+        descriptor = opened(state, name)
+        if name == "api/growing":
+            monkeypatch.setattr(backup, "LARGEST", 999)
+        return descriptor
+
+    monkeypatch.setattr(backup, "_opened", grown)
+    with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: see who put it there"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_more_files_than_could_be_put_back(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that makes files without number is found when the backup is made, not when it is needed."""
+    monkeypatch.setattr(backup, "MOST_FILES", 5)
+    with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
+        for number in range(9):
+            (state / "api" / str(number)).touch()
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+def test_an_interrupted_backup_leaves_no_file(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in the middle: under the name that was asked for there is a whole backup or none."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(backup, "_copy_file", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert [one.name for one in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
+    """What a torn restore left is no appliance's state."""
+    (state / "restoring").touch()
+    with pytest.raises(BackupError, match="was not put back to its end"):
+        back_up(state, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+
+
+@pytest.fixture
+def owned(state: Path) -> Iterator[Path]:
+    """The state where its users can reach it, and `control` its user's own; root makes the backup."""
+    need_root()
+    place = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
+    place.chmod(0o711)
+    owned = Path(shutil.move(state, place / "state"))
+    owned.chmod(0o711)
+    for path in (*(owned / "control").iterdir(), owned / "control"):
+        os.chown(path, 61011, 61014)
+    yield owned
+    shutil.rmtree(place)
+
+
+def test_databases_in_use_are_copied_as_their_user(owned: Path, tmp_path: Path) -> None:
+    """What is still in the write-ahead log is in the backup, and no file of root's is left beside the database."""
+    with closing(sqlite3.connect(owned / "control" / "state.db")) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("INSERT INTO thing VALUES ('fresh')")
+        connection.commit()
+        for path in (owned / "control").iterdir():
+            os.chown(path, 61011, 61014)
+        before = (os.geteuid(), os.getegid(), os.getgroups())
+        back_up(owned, tmp_path / "backup.tar.gz")
+        assert (os.geteuid(), os.getegid(), os.getgroups()) == before
+        assert {path.stat().st_uid for path in (owned / "control").iterdir()} == {61011}
+    with tarfile.open(tmp_path / "backup.tar.gz") as archive:
+        archive.extract("control/state.db", tmp_path)
+    with closing(sqlite3.connect(tmp_path / "control" / "state.db")) as connection:
+        assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",), ("fresh",)]
+
+
+def test_a_database_that_becomes_a_link_gives_nothing_of_roots_away(
+    owned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put in its place after it was looked at, a link is followed with no more rights than its user has."""
+    secret = owned.parent / "secret.db"
+    with closing(sqlite3.connect(secret)) as connection:
+        connection.execute("CREATE TABLE secret (value TEXT)")
+        connection.commit()
+    secret.chmod(0o600)
+    opened = backup._opened
+
+    def swapped(state: Path, name: str) -> int | None:
+        descriptor = opened(state, name)
+        if name == "control/state.db":
+            (state / name).unlink()
+            (state / name).symlink_to(secret)
+        return descriptor
+
+    monkeypatch.setattr(backup, "_opened", swapped)
+    with pytest.raises(BackupError, match=r"control/state\.db cannot be read by user id 61011"):
+        back_up(owned, tmp_path / "backup.tar.gz")
+    assert not (tmp_path / "backup.tar.gz").exists()
+    assert os.geteuid() == 0

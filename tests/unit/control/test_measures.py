@@ -1,0 +1,57 @@
+"""Tests of what control measures: bounded, whatever names others choose."""
+
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel.messages import TopicTraffic
+from appliance.control.measures import by_resource, carried_of, from_zero
+from appliance.master.reach import carried
+from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried
+
+
+def test_sums_by_name() -> None:
+    """What several incarnations carried of one topic is one sum."""
+    rows = [("/a", (1, 10)), ("/b", (2, 20)), ("/a", (3, 30))]
+    assert by_resource(rows) == {"/a": [4, 40], "/b": [2, 20]}
+
+
+def test_counters_begin_at_zero() -> None:
+    """What did not happen yet is 0, so that its first time is an increase."""
+    counts = from_zero({("fault", "safe"): 2}, [("fault", "safe"), ("drop", "safe")])
+    assert counts == {("fault", "safe"): 2, ("drop", "safe"): 0}
+
+
+def test_names_without_end() -> None:
+    """Past the bound names are not told one by one, and nothing is lost from the sum."""
+    sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
+    assert len(sums) == MOST_RESOURCES + 1
+    assert sums[OTHERS] == [500]
+    assert sum(row[0] for row in sums.values()) == MOST_RESOURCES + 500
+
+
+def test_few_topics_have_a_histogram_of_their_own() -> None:
+    """Histograms have many series each, so fewer names are told one by one."""
+    sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
+    assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}
+
+
+def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that restarts is another incarnation: its topic counts on, bounded in names."""
+    monkeypatch.setattr(carried, "MOST_RESOURCES", 2)
+    counted = Carried(cast(Any, None), lambda _key: "/node", 1, is_own=lambda *_: False)
+    for number in range(4):
+        rows = [
+            TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
+            TopicTraffic(f"k{number}", f"/own{number}", 1, 1, 0, 1),
+        ]
+        counted.reported(rows)
+        before = carried_of(counted)
+        counted.forgotten(f"k{number}")
+        after = carried_of(counted)
+        assert (after["relayed"]["/a"], after["delayed"]) == (before["relayed"]["/a"], before["delayed"])
+    assert (counted.total.messages, counted.total.dropped) == (44, 4)
+    assert carried_of(counted) == {
+        "relayed": {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
+        "delayed": {"/a": [4, 8, 2.0]},
+    }

@@ -1,0 +1,54 @@
+"""What control does before it serves again."""
+
+import ipaddress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.control.process import _restore
+from appliance.master.graph.journal import StoreJournal
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.ros.uris import parse_node_uri
+from appliance.store.state import StateStore
+from tests.support.control_parts import Nothing
+
+pytestmark = pytest.mark.anyio
+URI = "http://10.0.0.5:4000/"
+
+
+def fail(reason: str) -> None:
+    """The store could not write."""
+    raise AssertionError(reason)
+
+
+class Ports(Nothing):
+    """Every port can be had again."""
+
+    async def reopen(self, _incarnation: Incarnation) -> None:
+        """As `Faces`."""
+
+
+async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path) -> None:
+    """The policy may have changed while the appliance was down: it is applied when all nodes are there again."""
+    store = StateStore(tmp_path, failed=fail)
+    before = Registry(StoreJournal(store))
+    host = ipaddress.ip_address("10.0.0.5")
+    node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
+    before.add(node)
+    before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
+    await store.settled()
+    registry = Registry(StoreJournal(store))
+    decided: list[tuple[object, list[str]]] = []
+
+    def changed(policy: object) -> int:
+        decided.append((policy, [resource.resource for _node, resource in registry.in_order()]))
+        return 1
+
+    policies = SimpleNamespace(current="the new policy", changed=changed)
+    master = SimpleNamespace(registry=registry, relay=Nothing(), faces=Ports())
+    base = SimpleNamespace(sockets={}, store=store, policies=policies)
+    await _restore(cast(Any, base), cast(Any, SimpleNamespace(master=master, places=Nothing())))
+    store.close()
+    assert decided == [("the new policy", ["/secret"])]

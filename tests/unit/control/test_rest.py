@@ -1,0 +1,319 @@
+"""Tests of `appliance.control.rest` over a real link, with stand-ins for what it administers."""
+
+import asyncio
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from appliance.channel import messages
+from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages import Asked, TokenKept
+from appliance.control.rest import RestLink
+from appliance.store.tokens import TokenRow, make_token
+from tests.support.heard import Heard
+
+VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=600)
+ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=600)
+
+
+def kept(row: TokenRow) -> TokenKept:
+    """What the api is told of a token."""
+    assert row.keys is not None
+    return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, row.keys.reading)
+
+
+def loading(number: int, text: str, shown: str = TOKEN) -> messages.RequestMade:
+    """A policy to load, as an honest api passes it on."""
+    asked = Asked("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
+    return messages.RequestMade(number, PolicyLoad(text), shown, asked)
+
+
+class Everything:
+    """Stands in for administration, tokens and recorder."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[AnyRequest, str]] = []
+        self.recorded: list[dict[str, Any]] = []
+        self.obstacle: str | None = None
+        self.changed: Callable[[], None] = lambda: None
+        self.ends: list[Channel] = []  # closed after the play
+        self.only_slow = False  # whether only others than the status wait for `go`
+        self.go = asyncio.Event()
+        self.go.set()
+
+    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer:
+        """Answer when told to."""
+        if not isinstance(request, StatusWanted) or not self.only_slow:
+            await self.go.wait()
+        self.asked.append((request, who))
+        if isinstance(request, PolicyLoad) and request.text == "defect":
+            raise RuntimeError("secret detail")
+        return AdminAnswer(True, {"number": len(self.asked)})
+
+    def usable(self) -> list[TokenKept]:
+        """Two tokens."""
+        return [kept(VIEWER), kept(ADMIN)]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """One of them."""
+        return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """Note a record."""
+        self.recorded.append({"event": event, "reason": reason, **fields})
+        return "id"
+
+
+class Api:
+    """The api's end of the link."""
+
+    def __init__(self, world: Everything, link: RestLink) -> None:
+        here, there = socket.socketpair()
+        self.raw = there
+        self.channel = Channel(there, messages.ApiLink)
+        control = Channel(here, messages.ApiLink)
+        world.ends += [self.channel, control]
+        self.closed = asyncio.Event()
+        link.attach(control)
+        self._ear = Heard(self.channel, self.closed.set)
+        self.heard = self._ear.messages
+
+    async def until(self, count: int) -> list[Any]:
+        """What was heard, once it is so much."""
+        return await self._ear.until(count)
+
+
+def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:
+    """Play one conversation."""
+
+    async def whole() -> None:
+        world = Everything()
+        link = RestLink(world, world, world, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
+        try:
+            await play(world, link)
+        finally:
+            for end in world.ends:
+                end.close()
+
+    asyncio.run(whole())
+
+
+def test_tokens_are_told_at_once_and_after_every_change() -> None:
+    """A new api knows them first of all; a change is told without being asked."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        assert await api.until(1) == [messages.TokensStated([kept(VIEWER), kept(ADMIN)])]
+        world.changed()
+        assert len(await api.until(2)) == 2
+
+    run(play)
+
+
+def test_enrolments_hold_nobody_up() -> None:
+    """Those that wait for charon are served beside the others, so many at most; then they are answered too."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.only_slow = True
+        world.go.clear()
+        api = Api(world, link)
+        for number in range(20):
+            api.channel.send(messages.RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
+        api.channel.send(messages.RequestMade(99, StatusWanted(), TOKEN))
+        heard = (await api.until(6))[1:]
+        assert [one.answer.trouble for one in heard if one.number != 99] == ["busy"] * 4
+        assert [one.answer.ok for one in heard if one.number == 99] == [True]
+        world.go.set()
+        assert sum(one.answer.ok for one in (await api.until(22))[1:]) == 17
+
+    run(play)
+
+
+def test_what_it_is_recognised_by_is_passed_on() -> None:
+    """The api says the pin of its key; anything but one ends the link."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        pins: list[str] = []
+        link.served = pins.append
+        api = Api(world, link)
+        pin = "sha256//" + "A" * 43 + "="
+        api.channel.send(messages.RestServed(pin))
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        await api.until(2)
+        assert pins == [pin]
+        api.channel.send(messages.RestServed("$(reboot)"))
+        async with asyncio.timeout(20):
+            await api.closed.wait()
+        assert pins == [pin]
+
+    run(play)
+
+
+def test_answers_bear_their_numbers_in_order() -> None:
+    """Requests are carried out one after the other, each on behalf of its token."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        for number in (7, 3, 9):
+            api.channel.send(
+                messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN)
+            )
+        heard = await api.until(4)
+        assert [one.number for one in heard[1:]] == [7, 3, 9]
+        assert [one.answer.body["number"] for one in heard[1:]] == [1, 2, 3]
+        assert [who for _request, who in world.asked] == ["w", "alice", "w"]
+
+    run(play)
+
+
+def test_more_than_may_wait_are_told_so_at_once() -> None:
+    """A flood of requests is bounded: what is too much is answered busy while the others are served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.go.clear()
+        api = Api(world, link)
+        for number in range(200):
+            api.channel.send(messages.RequestMade(number, StatusWanted(), TOKEN))
+        heard = await api.until(1 + 200 - 65)
+        assert {one.answer.trouble for one in heard[1:]} == {"busy"}
+        world.go.set()
+        heard = await api.until(201)
+        assert sum(one.answer.ok for one in heard[1:]) == len(world.asked) <= 65
+
+    run(play)
+
+
+def test_a_defect_is_one_answer() -> None:
+    """What fails inside tells nothing of itself, and the next request is served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        api.channel.send(loading(1, "defect"))
+        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
+        _tokens, failed, served = await api.until(3)
+        assert (failed.answer.ok, failed.answer.trouble) == (False, "failed")
+        assert "secret" not in failed.answer.error
+        assert served.answer.ok
+
+    run(play)
+
+
+def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
+    """With on_audit_failure deny a change is refused with the reason; looking is still possible."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.obstacle = "the audit log cannot be written: disk full"
+        api = Api(world, link)
+        api.channel.send(loading(1, "[Nodes]"))
+        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
+        _tokens, refused, served = await api.until(3)
+        assert (refused.answer.trouble, refused.answer.error) == ("failed", world.obstacle)
+        assert served.answer.ok
+        assert [request for request, _who in world.asked] == [StatusWanted()]
+
+    run(play)
+
+
+def test_a_change_in_a_name_that_may_not_is_refused() -> None:
+    """An api that says a name of its own, or of a token with another role, changes nothing; looking goes on."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
+            api.channel.send(loading(number, "[Nodes]", shown))
+        api.channel.send(messages.RequestMade(8, StatusWanted(), VIEWER_TOKEN))
+        api.channel.send(loading(9, "[Nodes]"))
+        answers = (await api.until(7))[1:]
+        assert [one.answer.trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
+        assert [who for _request, who in world.asked] == ["alice", "w"]
+
+    run(play)
+
+
+def test_what_is_not_of_the_link_ends_it() -> None:
+    """A request that makes a token, a message of another link and nonsense close it; another api is served."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
+        for body in (
+            msgspec.msgpack.encode(token),
+            msgspec.msgpack.encode(messages.Stop()),
+            b"\xc1nonsense",
+            msgspec.msgpack.encode(messages.TokensStated([])),
+        ):
+            api = Api(world, link)
+            await api.until(1)
+            api.raw.sendall(len(body).to_bytes(4, "big") + body)
+            async with asyncio.timeout(20):
+                await api.closed.wait()
+        assert world.asked == []
+        api = Api(world, link)
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        assert (await api.until(2))[1].answer.ok
+
+    run(play)
+
+
+def test_the_next_api_does_not_wait_for_the_last_ones_request() -> None:
+    """An api that dies amid a request leaves none of its own behind, and its successor is served at once."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.go.clear()
+        first = Api(world, link)
+        for number in range(3):
+            first.channel.send(messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN))
+        await first.until(1)
+        first.channel.close()
+        second = Api(world, link)
+        second.channel.send(messages.RequestMade(9, StatusWanted(), TOKEN))
+        await second.until(1)
+        world.go.set()
+        assert (await second.until(2))[1].number == 9
+        assert [who for _request, who in world.asked].count("alice") <= 1
+
+    run(play)
+
+
+def test_an_api_that_does_not_read_loses_its_link() -> None:
+    """Answers that nobody takes are bounded."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        here, there = socket.socketpair()
+        control = Channel(here, messages.ApiLink, limit=100_000)
+        link.attach(control)
+        for _ in range(5000):
+            world.changed()
+        peer = Channel(there, messages.ApiLink)
+        world.ends += [control, peer]
+        heard = 0
+        async with asyncio.timeout(20):
+            while True:
+                try:
+                    heard += len(peer.receive())
+                except ChannelClosedError:
+                    break
+                await asyncio.sleep(0)
+        assert 0 < heard < 5000
+
+    run(play)
+
+
+def test_calls_are_recorded_with_their_outcome() -> None:
+    """Who was refused is a denial and a warning; who is nobody has no name; long texts are cut."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        api = Api(world, link)
+        api.channel.send(messages.RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
+        api.channel.send(messages.RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
+        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        await api.until(2)
+        served, refused = world.recorded
+        assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
+        assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
+        assert len(refused["resource"]) <= 300
+
+    run(play)

@@ -1,0 +1,193 @@
+"""Tests of `appliance.control.rest_meaning` beside the api: routes, gate, the order of each request."""
+
+import asyncio
+import functools
+import time
+from typing import Any, get_args
+
+import httpx
+import msgspec
+import pytest
+
+from appliance.api.access import Bearer, Doorkeeper
+from appliance.api.app import build_app
+from appliance.api.control import ControlLink, _made
+from appliance.api.gate import Gate
+from appliance.api.history import History
+from appliance.api.journal import Journal
+from appliance.api.services import Services
+from appliance.channel import admin, messages
+from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.messages import Asked
+from appliance.config import Settings
+from appliance.control.rest_meaning import NoOrderError, meant
+from appliance.store.tokens import make_token
+
+POLICY = {
+    "revision": 7, "text": "[Nodes]\n", "file": "f", "hosts": {}, "robot": [], "cases_file": "c", "cases": None,
+    "cases_error": None,
+}  # fmt: skip
+LOOKS: dict[type, dict[str, Any]] = {
+    admin.PolicyWanted: POLICY,
+    admin.RegistrationsWanted: {"registrations": []},
+    admin.HostEndpoint: {"endpoint": "10.0.0.9", "reason": "the route"},
+}
+FILES = {"a.rv": "text"}
+REQUESTS: list[tuple[str, str, Any]] = [
+    ("POST", "/v1/policy", "[Nodes]\n"),
+    ("POST", "/v1/policy?confirm_within=2.5", {"text": "[Nodes]\n", "note": "ticket"}),
+    ("POST", "/v1/policy/rollback", {"revision": 3}),
+    ("POST", "/v1/policy/rollback", {}),
+    ("POST", "/v1/policy/reload", None),
+    ("POST", "/v1/policy/reload?confirm_within=300", None),
+    ("POST", "/v1/policy/confirm", None),
+    ("POST", "/v1/monitors", {"files": FILES}),
+    ("POST", "/v1/monitors?dry_run=0", {"files": FILES, "definitions": {"a/B.msg": "int8 x"}, "note": "n"}),
+    ("POST", "/v1/monitors/reload", None),
+    ("POST", "/v1/monitors/reload?prune=1", None),
+    ("PUT", "/v1/monitors/safeZone", "text"),
+    ("PUT", "/v1/monitors/safeZone", {"text": "text", "definitions": {"a/B.msg": "int8 x"}, "note": "n"}),
+    ("DELETE", "/v1/monitors/safeZone", None),
+    ("DELETE", "/v1/monitors?name=a&name=b", None),
+    ("PATCH", "/v1/monitors/safeZone", {"enabled": False}),
+    ("PATCH", "/v1/monitors/safeZone", {"held": False}),
+    ("PATCH", "/v1/monitors", {"names": ["a", "b"], "enabled": True}),
+    ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
+    ("DELETE", "/v1/tokens/two%20words", None),
+    ("POST", "/v1/hosts", {"name": "laptop"}),
+    ("POST", "/v1/hosts", {"name": "laptop", "how": "token", "endpoint": "robot.local", "ports": "40000-40100",
+                           "open": ["tcp/22", "udp/53"], "days": 30, "token_seconds": 600, "address": "10.111.7.7"}),
+    ("POST", "/v1/hosts", {"name": "laptop", "how": "kit"}),
+    ("POST", "/v1/hosts", {"name": "laptop", "how": "kit", "request": "PEM", "days": 3.5, "endpoint": "10.0.0.9"}),
+    ("POST", "/v1/hosts/laptop/token", {}),
+    ("POST", "/v1/hosts/laptop/token", {"days": 3, "token_seconds": 90, "endpoint": None}),
+    ("POST", "/v1/hosts/laptop/kit", {}),
+    ("POST", "/v1/hosts/laptop/kit", {"request": "PEM", "days": 7}),
+    ("POST", "/v1/hosts/reload", None),
+    ("DELETE", "/v1/hosts/laptop", None),
+    ("PUT", "/v1/hosts/laptop/ports", {"state": "closed"}),
+    ("PUT", "/v1/hosts/10.0.0.7/ports", {"state": "open", "open": [11311], "checked": 1.5}),
+]  # fmt: skip
+IDS = [f"{method} {path} {number}" for number, (method, path, _body) in enumerate(REQUESTS)]
+
+
+class Listening(ControlLink):
+    """Control, as far as the api can tell: answers what only looks, notes the orders and refuses them."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda _tokens: None)
+        self.orders: list[messages.RequestMade] = []
+
+    async def ask(
+        self, request: AdminRequest, bearer: Bearer | None, seconds: float = 1.0
+    ) -> AdminAnswer:  # fmt: skip
+        """What control answers."""
+        if isinstance(request, admin.RestChange):
+            self.orders.append(_made(0, request, bearer))
+            return AdminAnswer(False, {"tag": "0"}, error="noted", trouble="busy")
+        return AdminAnswer(True, LOOKS[type(request)])
+
+
+@functools.cache
+def api() -> tuple[Gate, Listening, str]:
+    """The api with a token of an admin."""
+    row, token = make_token("alice", "admin", now=time.time(), seconds=6000)
+    door, control, journal = Doorkeeper(10), Listening(), Journal(lambda _call: None)
+    door.state([messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)])
+    settings = Settings()
+
+    async def nothing() -> dict[str, Any]:
+        return {}
+
+    services = Services(settings, control, door, journal, asyncio.Event(), History(nothing))
+    limits = settings.api_limits.model_copy(update={"burst": 100_000})
+    gate = Gate(build_app(services), limits=limits, doorkeeper=door, journal=journal, names=["api"])
+    return gate, control, token
+
+
+def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[messages.RequestMade]:
+    """What an honest api asks of control for a request of an admin."""
+    gate, control, token = api()
+    control.orders.clear()
+    headers = {"Authorization": f"Bearer {token}", "If-Match": tag}
+    given = {"content": body} if isinstance(body, str) else {"json": body}
+    if isinstance(body, str):
+        headers["Content-Type"] = "text/plain"
+
+    async def play() -> str:
+        transport = httpx.ASGITransport(gate, client=("10.0.0.1", 4))
+        async with httpx.AsyncClient(transport=transport, base_url="http://api") as client:
+            return (await client.request(method, target, headers=headers, **given)).text
+
+    assert "noted" in asyncio.run(play())
+    return list(control.orders)
+
+
+@pytest.mark.parametrize("tag", ["*", '"7"'])
+@pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
+def test_the_api_and_control_understand_the_same(method: str, target: str, body: Any, tag: str) -> None:
+    """For every way to give an order, control derives the very order that the api made."""
+    [made] = ordered(method, target, body, tag)
+    assert made.asked is not None
+    assert (made.asked.method, made.asked.target) == (method, target)
+    assert meant(made.asked, made.request) == made.request
+
+
+def test_every_order_has_its_way() -> None:
+    """No order that the api may give is missing above."""
+    found = {
+        type(ordered(method, target, body)[0].request) for method, target, body in REQUESTS
+    }  # fmt: skip
+    assert found == set(get_args(admin.RestChange))
+
+
+@pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
+def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any) -> None:
+    """Whatever field a fallen api changes, the order is not what was asked, but for what the appliance fills in."""
+    [made] = ordered(method, target, body, '"7"')
+    assert made.asked is not None
+    body = body if isinstance(body, dict) else {}
+    for field in msgspec.structs.fields(made.request):
+        other = msgspec.structs.replace(
+            made.request, **{field.name: _other(getattr(made.request, field.name))}
+        )
+        filled = (field.name == "request" and body.get("request") is None) or (
+            field.name == "kit" and body.get("endpoint") is None
+        )
+        assert (meant(made.asked, other) == other) is filled, field.name
+
+
+def _other(value: Any) -> Any:
+    """Another value of the same kind, or of one that the field may have."""
+    match value:
+        case bool():
+            return not value
+        case str():
+            return f"{value}x"
+        case dict():
+            return {**value, next(iter(value), "k"): "other"}
+        case list():
+            return [*value, "x"]
+        case None:
+            return 1.0
+        case _:
+            return value + 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"target": "/v1/policy?dry_run=1"}, {"target": "/v1/policy?dry_run=yes"}, {"target": "/v1/policy/"},
+        {"method": "GET"}, {"method": "PUT"}, {"target": "/v1/status"}, {"if_match": ""}, {"if_match": '"x"'},
+        {"body": b"\xff"}, {"content_type": "application/json"}, {"target": "/v1/policy?confirm_within=x"},
+        {"body": b"[" * 100_000, "content_type": "application/json"},
+        {"body": b"[]", "content_type": "application/json"}, {"target": ""},
+    ],
+)  # fmt: skip
+def test_what_orders_nothing_is_refused(change: dict[str, Any]) -> None:
+    """A dry run, a look, another route or a body that makes no sense is no order, and no defect."""
+    good = Asked("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", b"[Nodes]\n")
+    order = admin.PolicyLoad("[Nodes]\n")
+    assert meant(good, order) == order
+    with pytest.raises(NoOrderError):
+        meant(msgspec.structs.replace(good, **change), order)

@@ -1,0 +1,88 @@
+"""Tests of `appliance.control.tokens`: the first token reaches whoever started the appliance, whatever dies before."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.control.tokens import Tokens
+from appliance.recorder import Recorder
+from appliance.store.state import StateStore
+from appliance.store.tokens import is_secret, parse_token
+
+pytestmark = pytest.mark.anyio
+
+
+class Lives:
+    """The lives of control on one state."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.log = AuditLog(home / "audit.db")
+        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.store: StateStore | None = None
+
+    def next(self) -> Tokens:
+        """A control starts, after the one before died."""
+        if self.store is not None:
+            self.store.close()
+        self.store = StateStore(self.home, failed=pytest.fail)
+        return Tokens(self.store, self.recorder)
+
+
+@pytest.fixture
+def lives(tmp_path: Path) -> Iterator[Lives]:
+    """A state directory."""
+    lives = Lives(tmp_path)
+    yield lives
+    assert lives.store is not None
+    lives.store.close()
+    lives.log.close()
+
+
+def opens(tokens: Tokens, text: str | None) -> bool:
+    """Whether a token's text is that of one that may be used."""
+    assert text is not None
+    parsed = parse_token(text)
+    assert parsed is not None
+    return any(one.id == parsed[0] and is_secret(parsed[1], one.salt, one.hash) for one in tokens.usable())
+
+
+async def test_a_token_that_nobody_was_told_is_replaced(lives: Lives) -> None:
+    """Control dies before it could say what the first token is: the next one makes another, the lost one ends."""
+    lost = await lives.next().first()
+    tokens = lives.next()
+    assert opens(tokens, lost)
+    text = await tokens.first()
+    assert opens(tokens, text)
+    assert not opens(tokens, lost)
+    assert [one.name for one in tokens.usable()] == ["first"]
+
+
+async def test_a_token_that_was_told_stays(lives: Lives) -> None:
+    """Once it is told, no later control makes another, be it before or after it learns so."""
+    tokens = lives.next()
+    text = await tokens.first()
+    tokens.told()
+    assert lives.store is not None
+    await lives.store.settled()
+    later = lives.next()
+    assert await later.first() is None
+    assert opens(later, text)
+
+
+async def test_a_control_that_learns_late_that_it_was_told_keeps_it(lives: Lives) -> None:
+    """The supervisor announced it, control died before it heard so: the next one is told first, and makes no other."""
+    text = await lives.next().first()
+    tokens = lives.next()
+    tokens.told()
+    assert await tokens.first() is None
+    assert opens(tokens, text)
+
+
+async def test_a_state_from_before_has_no_first_token_made(lives: Lives) -> None:
+    """Tokens that were made without this being noted are taken as told."""
+    tokens = lives.next()
+    await tokens.add("alice", "admin", 60)
+    assert await lives.next().first() is None

@@ -1,0 +1,91 @@
+"""Tests of reading `ipsec/hosts.yaml`."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.hosts.declared import Declared, DeclaredHost, DeclaredHostsError, read_declared
+
+
+def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:
+    """Each host is there by its name, with the address kept for it."""
+    path = tmp_path / "hosts.yaml"
+    path.write_text("hosts:\n  - name: ocu-1\n    address: 10.113.11.20\n  - name: laptop\n")
+    assert read_declared(path) == {
+        "ocu-1": DeclaredHost("ocu-1", "10.113.11.20"),
+        "laptop": DeclaredHost("laptop", None),
+    }
+
+
+def test_no_file_and_an_empty_one_declare_nobody(tmp_path: Path) -> None:
+    """The baseline may be missing."""
+    assert read_declared(tmp_path / "none.yaml") == {}
+    (tmp_path / "empty.yaml").write_text("# nobody yet\n")
+    assert read_declared(tmp_path / "empty.yaml") == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("hosts: [", "cannot be read"),
+        ("hosts:\n  - name: 'a b'\n", "hosts.0.name"),
+        ("hosts:\n  - name: a\n    address: 10.0.0\n", "hosts.0.address"),
+        ("hosts:\n  - name: a\n    group: b\n", "hosts.0.group"),
+        ("hosts:\n  - name: a\n  - name: a\n", "declared twice"),
+        ("- a\n", "the file"),
+        ("hosts:\n  - name: a\n    groups: ['b c']\n", "hosts.0.groups.0"),
+        ("hosts:\n  - name: a\n    tunnel: perhaps\n", "hosts.0.tunnel"),
+        (
+            "hosts:\n  - {name: a, address: 10.113.11.5}\n  - {name: b, address: 10.113.11.5}\n",
+            "b and a have the same address",
+        ),
+        ("x" * (1 << 20 | 1), "longer than"),
+        ("[" * 5000, "cannot be read"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, text: str, said: str) -> None:
+    """The message says which file and where in it."""
+    path = tmp_path / "hosts.yaml"
+    path.write_text(text)
+    with pytest.raises(DeclaredHostsError, match=r"hosts\.yaml") as error:
+        read_declared(path)
+    assert said in str(error.value)
+
+
+def test_groups_and_tunnels_that_are_not_wanted(tmp_path: Path) -> None:
+    """A host of no other word is wanted; groups are in their order, each once."""
+    path = tmp_path / "hosts.yaml"
+    path.write_text("hosts:\n  - {name: a, groups: [x, y, x], tunnel: false}\n  - name: b\n")
+    declared = Declared(path)
+    assert declared.hosts["a"].groups == ("x", "y")
+    assert [declared.wants(name) for name in ("a", "b", "nobody")] == [False, True, True]
+
+
+def test_a_file_that_went_bad_changes_nothing(tmp_path: Path) -> None:
+    """What was read before holds, and why it was not taken is kept until it is mended."""
+    path = tmp_path / "hosts.yaml"
+    path.write_text("hosts:\n  - name: a\n")
+    declared = Declared(path)
+    path.write_text("hosts: 5\n")
+    with pytest.raises(DeclaredHostsError):
+        declared.reload()
+    assert list(declared.hosts) == ["a"]
+    assert "hosts.yaml: hosts" in declared.error
+    path.write_text("hosts: []\n")
+    declared.reload()
+    assert (declared.hosts, declared.error) == ({}, "")
+
+
+def test_the_file_that_comes_with_the_product_is_read() -> None:
+    """ipsec/hosts.yaml declares nobody, and its example is one."""
+    path = Path(__file__).parents[3] / "ipsec" / "hosts.yaml"
+    assert read_declared(path) == {}
+
+
+def test_the_example_in_the_file_is_right(tmp_path: Path) -> None:
+    """What it shows in comments can be taken as it is."""
+    shipped = (Path(__file__).parents[3] / "ipsec" / "hosts.yaml").read_text()
+    example = [line[2:] for line in shipped.splitlines() if line.startswith(("# hosts:", "#   "))]
+    path = tmp_path / "hosts.yaml"
+    path.write_text("\n".join(example))
+    assert read_declared(path)["ocu-1"].groups == ("operators",)

@@ -1,0 +1,42 @@
+"""Tests of `appliance.hosts.endpoint`."""
+
+import asyncio
+
+import pytest
+
+from appliance.channel.messages import EndpointFound
+from appliance.hosts.endpoint import find_endpoint
+from appliance.hosts.table import HostRefusedError
+
+
+async def _found() -> EndpointFound:
+    return EndpointFound("10.0.0.5", "the only address here")
+
+
+async def _several() -> EndpointFound:
+    return EndpointFound(None, "there are several addresses here (10.0.0.5, 10.0.1.5)")
+
+
+def test_what_is_configured_comes_first() -> None:
+    """Nobody looks then, so that it also helps where nothing can be found."""
+    assert asyncio.run(find_endpoint("robot.example.org", _several)) == {
+        "endpoint": "robot.example.org",
+        "reason": "ipsec.endpoint of the configuration",
+    }
+
+
+def test_what_the_supervisor_sees_is_taken_with_its_reason() -> None:
+    """So that a person can judge it."""
+    assert asyncio.run(find_endpoint(None, _found)) == {
+        "endpoint": "10.0.0.5",
+        "reason": "the only address here",
+    }
+
+
+def test_what_cannot_be_told_is_refused_with_what_to_give() -> None:
+    """Flag, field of REST and key of the configuration; it is no defect of the appliance (not `ours`)."""
+    with pytest.raises(HostRefusedError) as caught:
+        asyncio.run(find_endpoint(None, _several))
+    for words in ("10.0.0.5, 10.0.1.5", "--appliance ADDRESS", "ipsec: {endpoint: ADDRESS}", "`endpoint`"):
+        assert words in str(caught.value), words
+    assert not caught.value.ours

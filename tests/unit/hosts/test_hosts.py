@@ -1,0 +1,713 @@
+"""Tests of enrolment in control: names, addresses, what happens first when a host is revoked."""
+
+import asyncio
+import ipaddress
+import itertools
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from appliance.audit.log import AuditLog
+from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
+from appliance.hosts.authority import Authority, AuthorityError
+from appliance.hosts.certification import Certification
+from appliance.hosts.declared import Declared
+from appliance.hosts.hosts import Hosts
+from appliance.hosts.rest_place import RestPlace
+from appliance.hosts.table import (
+    HostForbiddenError,
+    HostRefusedError,
+    HostsChangedError,
+    HostTable,
+)
+from appliance.hosts.tunnels import Tunnels
+from appliance.ipsec import authority as ipsec
+from appliance.ipsec.proof import RequestRefusedError
+from appliance.ipsec.requests import make_key, signing_request
+from appliance.policy.model import Address
+from appliance.recorder import Recorder
+from appliance.store.state import StateStore
+
+
+class NearAuthority(Authority):
+    """The real authority, asked without a link."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__()
+        self._near = ipsec.Authority(directory)
+        self.meanwhile: Callable[[], object] = lambda: None
+        self.lists = 0
+
+    async def certificate(self) -> bytes:
+        """Its certificate."""
+        return self._near.certificate
+
+    async def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """A certificate, or the refusal as it comes over the link; `meanwhile` happens before."""
+        self.meanwhile()
+        await asyncio.sleep(0)
+        try:
+            issued = self._near.issue(request, name, days, proof=proof, former=former)
+        except RequestRefusedError as error:
+            raise AuthorityError(str(error), refused=True) from error
+        return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
+
+    async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
+        """The list; how often it was signed is counted."""
+        self.lists += 1
+        await asyncio.sleep(0)
+        return self._near.revocations(revoked)
+
+
+class Bench:
+    """Hosts with a store and a log of their own, and a supervisor that answers `answer`."""
+
+    def __init__(self, directory: Path, *, listen: str = "0.0.0.0", pool: str = "10.113.11.0/29") -> None:
+        self.answer = TunnelsEnclosed("kernel")
+        self.asked: list[Message] = []
+        self.order: list[str] = []
+        self.store = StateStore(directory, failed=pytest.fail)
+        self.log = AuditLog(directory / "audit.db")
+        self.declared = directory / "hosts.yaml"
+        self.authority = NearAuthority(directory)
+        recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.records: list[tuple[str, str]] = []
+        happened = recorder.happened
+
+        def noted(event: str, reason: str, **fields: Any) -> str:
+            self.records.append((event, reason))
+            return str(happened(event, reason, **fields))
+
+        recorder.happened = noted  # type: ignore[method-assign]  # beside what it does
+        self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
+        self.tunnels = Tunnels(self.table, recorder, self.authority, listen=(listen, 11311), say=self._said)
+        certification = Certification(
+            self.store,
+            recorder,
+            self.authority,
+            self.table,
+            self.tunnels,
+            master_port=11311,
+            rest=RestPlace(8443, "", 8443),
+        )
+        certification.served_by("sha256//pin")
+        self.hosts = Hosts(certification, self._endpoint)
+        self.hosts.changed = self._changed
+        self.hosts.expel = self._expel
+
+    def close(self) -> None:
+        """End the threads."""
+        self.store.close()
+        self.log.close()
+
+    def _said(self, message: Message) -> None:
+        self.asked.append(message)
+        self.tunnels.answered(self.answer)
+
+    async def _endpoint(self) -> dict[str, Any]:
+        return {"endpoint": "10.0.0.1", "reason": "it is"}
+
+    def _changed(self) -> int:
+        self.order.append(f"policy {sorted(self.hosts.addresses)}")
+        return 1
+
+    def _expel(self, address: Address, reason: str) -> int:
+        self.order.append(f"expel {address}")
+        return 2
+
+
+def sign(key: bytes, request: str) -> bytes:
+    """The proof of a renewal, as `openssl pkeyutl` makes it."""
+    private = load_pem_private_key(key, None)
+    assert isinstance(private, ec.EllipticCurvePrivateKey)
+    return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
+
+
+def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, dict[str, Any]]:
+    """Enrol a host with a key of its own."""
+    return bench.hosts.add(
+        name, signing_request(make_key(), name).decode(), days=90, address=address, who="tester"
+    )
+
+
+@pytest.fixture(autouse=True)
+def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is none here: its answer is not awaited."""
+    monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 0.0)
+
+
+def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: str) -> None:
+    """Run a test's work on a bench."""
+
+    async def inside() -> None:
+        bench = Bench(directory, **options)
+        try:
+            await work(bench)
+        finally:
+            bench.close()
+
+    asyncio.run(inside())
+
+
+def test_addresses_are_given_in_order_and_kept(tmp_path: Path) -> None:
+    """The first is the appliance's; declared ones are kept free; a revoked host's is given to no other."""
+
+    async def work(bench: Bench) -> None:
+        bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
+        await bench.hosts.reload("tester")
+        assert (await add(bench, "a"))["address"] == "10.113.11.2"
+        assert (await add(bench, "b"))["address"] == "10.113.11.4"
+        assert (await add(bench, "laptop"))["address"] == "10.113.11.3"
+        await bench.hosts.revoke("a", "tester")
+        assert (await add(bench, "c"))["address"] == "10.113.11.5"
+        assert (await add(bench, "a"))["address"] == "10.113.11.2"
+        assert (await add(bench, "d"))["address"] == "10.113.11.6"
+        with pytest.raises(HostRefusedError, match=r"take a larger ipsec\.pool"):
+            await add(bench, "e")
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("address", ["10.113.11.1", "10.113.12.2", "10.113.11", "::1", "10.113.11.2"])
+def test_an_address_that_cannot_be_had_is_refused(tmp_path: Path, address: str) -> None:
+    """The appliance's own, one outside the pool, nonsense, and one that is taken."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        with pytest.raises(HostRefusedError, match="address"):
+            await add(bench, "b", address)
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("name", ["", "rosrv-appliance", "a b", "../a", "x" * 64, "a\n"])
+def test_a_name_that_cannot_be_had_is_refused(tmp_path: Path, name: str) -> None:
+    """Above all not the appliance's own: a host with it could stand for the appliance."""
+
+    async def work(bench: Bench) -> None:
+        with pytest.raises(HostRefusedError, match="no name for a host"):
+            await bench.hosts.add(name, "", days=90, who="tester")
+
+    run(tmp_path, work)
+
+
+def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> None:
+    """The supervisor cannot keep clear text out: nobody is enrolled, and hosts of an earlier life are nobody."""
+
+    async def enrol(bench: Bench) -> None:
+        await add(bench, "a")
+        assert list(bench.hosts.addresses) == ["a"]
+
+    async def again(bench: Bench) -> None:
+        bench.answer = TunnelsEnclosed(None, "no firewall here")
+        await bench.hosts.start()
+        assert isinstance(bench.asked[0], TunnelsWanted)
+        assert bench.hosts.addresses == {}
+        assert "no firewall here" in bench.hosts.status()["troubles"][0]
+        with pytest.raises(HostRefusedError, match="no firewall here"):
+            await add(bench, "b")
+
+    run(tmp_path, enrol)
+    run(tmp_path, again)
+
+
+def test_a_master_that_cannot_be_reached_in_the_tunnel_is_said(tmp_path: Path) -> None:
+    """An appliance that listens on one address of the network is not there for hosts in tunnels."""
+
+    async def work(bench: Bench) -> None:
+        with pytest.raises(HostRefusedError, match=r"listen: 0\.0\.0\.0:11311"):
+            await add(bench, "a")
+
+    run(tmp_path, work, listen="192.168.1.20")
+
+
+def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path) -> None:
+    """The policy first, then what the host has; and its certificate is on the list for good."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        bench.order.clear()
+        body = await bench.hosts.revoke("a", "tester")
+        assert bench.order == ["policy []", "expel 10.113.11.2"]
+        assert body["taken_back"] == 3
+        assert [row.serial for row in bench.store.hosts.revoked()] == [body["serial"]]
+        with pytest.raises(HostRefusedError, match="enrolled are: none"):
+            await bench.hosts.revoke("a", "tester")
+
+    run(tmp_path, work)
+
+
+def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
+    """The address stays; there is no second enrolment of a name that is enrolled."""
+
+    async def work(bench: Bench) -> None:
+        first = await add(bench, "a")
+        with pytest.raises(HostRefusedError, match="rosrv host kit a"):
+            await add(bench, "a")
+        second = await bench.hosts.renew(
+            "a", signing_request(make_key(), "a").decode(), days=90, who="tester"
+        )
+        assert second["address"] == first["address"]
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
+
+    run(tmp_path, work)
+
+
+def test_a_bad_request_enrols_nobody(tmp_path: Path) -> None:
+    """What the authority refuses is refused whole."""
+
+    async def work(bench: Bench) -> None:
+        with pytest.raises(HostRefusedError, match="not a signing request"):
+            await bench.hosts.add("a", "rubbish", days=90, who="tester")
+        assert bench.hosts.rows() == []
+
+    run(tmp_path, work)
+
+
+def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
+    """The list has both kinds of divergence from the baseline."""
+
+    async def work(bench: Bench) -> None:
+        bench.declared.write_text("hosts:\n  - name: laptop\n")
+        await bench.hosts.reload("tester")
+        await add(bench, "a")
+        rows = {row["name"]: (row["state"], row["declared"]) for row in bench.hosts.rows()}
+        assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
+        bench.declared.write_text("hosts: [")
+        with pytest.raises(HostRefusedError, match="what was declared before holds"):
+            await bench.hosts.reload("tester")
+        assert [row["name"] for row in bench.hosts.rows()] == ["a", "laptop"]
+        assert any("hosts.yaml" in trouble for trouble in bench.hosts.status()["troubles"])
+
+    run(tmp_path, work)
+
+
+def request_of(name: str) -> str:
+    """A signing request for a new key."""
+    return signing_request(make_key(), name).decode()
+
+
+def token(
+    bench: Bench, name: str, *, seconds: float = 60, new: bool = True
+) -> Coroutine[Any, Any, dict[str, Any]]:
+    """A one-time token."""
+    kit = {"endpoint": "10.0.0.1", "ports": "32768-60999", "open": ""}
+    return bench.hosts.token(name, kit=kit, seconds=seconds, days=90, address=None, new=new, who="tester")
+
+
+def recorded(bench: Bench, event: str) -> list[str]:
+    """The reasons of all records of an event."""
+    return [reason for name, reason in bench.records if name == event]
+
+
+def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
+    """Used again, or after a newer one of the name, it opens nothing; it is nowhere in the state."""
+
+    async def work(bench: Bench) -> None:
+        first = await token(bench, "a")
+        second = await token(bench, "a")
+        for text in (first["token"], "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
+            with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
+                await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
+        assert bench.hosts.rows()[0]["state"] == "awaited"
+        body = await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
+        assert body["address"] == second["address"]
+        assert body["kit"]["endpoint"] == "10.0.0.1"
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
+        secret = second["token"].rpartition("_")[2].encode()
+        for file in tmp_path.rglob("*"):
+            if file.is_file():
+                assert secret not in file.read_bytes(), file
+
+    run(tmp_path, work)
+
+
+def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> None:
+    """It is used up before the authority is asked."""
+
+    async def work(bench: Bench) -> None:
+        text = (await token(bench, "a"))["token"]
+        both = await asyncio.gather(
+            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.8"),
+            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9"),
+            return_exceptions=True,
+        )
+        assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
+
+    run(tmp_path, work)
+
+
+def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
+    """The host may come again with a right one; an ended or revoked token is good for nothing."""
+
+    async def work(bench: Bench) -> None:
+        text = (await token(bench, "a"))["token"]
+        with pytest.raises(HostRefusedError, match="not a signing request"):
+            await bench.hosts.itself.enrol(text, "rubbish", "10.9.9.9")
+        await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
+        short = (await token(bench, "b", seconds=0.05))["token"]
+        await asyncio.sleep(0.06)
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.enrol(short, request_of("b"), "10.9.9.9")
+        taken_back = (await token(bench, "c"))["token"]
+        assert (await bench.hosts.revoke("c", "tester"))["serial"] == ""
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.enrol(taken_back, request_of("c"), "10.9.9.9")
+
+    run(tmp_path, work)
+
+
+def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
+    """Whoever is awaited is awaited after a crash too."""
+    texts: list[str] = []
+
+    async def before(bench: Bench) -> None:
+        texts.append((await token(bench, "a"))["token"])
+
+    async def after(bench: Bench) -> None:
+        assert (await bench.hosts.itself.enrol(texts[0], request_of("a"), "10.9.9.9"))["name"] == "a"
+
+    run(tmp_path, before)
+    run(tmp_path, after)
+
+
+@pytest.mark.parametrize("how", ["kit", "token", "itself"])
+def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
+    """What is under way for a revoked host comes to nothing, however it comes; it stays revoked."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        text = (await token(bench, "a", new=False))["token"]
+        tasks: list[asyncio.Task[Any]] = []
+
+        def revoke() -> None:
+            bench.authority.meanwhile = lambda: None
+            tasks.append(asyncio.get_running_loop().create_task(bench.hosts.revoke("a", "tester")))
+
+        bench.authority.meanwhile = revoke
+        request = request_of("a")
+        with pytest.raises(HostForbiddenError, match="revoked meanwhile"):
+            if how == "kit":
+                await bench.hosts.renew("a", request, days=90, who="tester")
+            elif how == "token":
+                await bench.hosts.itself.enrol(text, request, "10.9.9.9")
+            else:
+                await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+        await asyncio.gather(*tasks)
+        assert bench.hosts.rows()[0]["state"] == "revoked"
+        assert bench.hosts.addresses == {}
+
+    run(tmp_path, work)
+
+
+def test_a_host_renews_itself(tmp_path: Path) -> None:
+    """In its tunnel and with its key: both certificates are good until it says that the new one is in place."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        request = request_of("a")
+        made = await bench.hosts.itself.renew("a", request, sign(key, request), "::ffff:10.113.11.2")
+        assert made["serial"] != first["serial"]
+        assert bench.hosts.rows()[0]["renewing"]
+        assert bench.store.hosts.revoked() == []
+        await bench.hosts.itself.renewed("a", "10.113.11.2")
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
+        assert bench.hosts.rows()[0]["serial"] == made["serial"]
+        with pytest.raises(HostRefusedError, match="renew first"):
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
+        with pytest.raises(HostRefusedError, match="again in"):
+            await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+
+    run(tmp_path, work)
+
+
+def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
+    """A twentieth of the certificate's life, whether control was started anew meanwhile or not; a kit needs no wait."""
+    keys = [make_key(), make_key(), make_key()]
+
+    async def first(bench: Bench) -> None:
+        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=90, who="tester")
+        request = signing_request(keys[1], "a").decode()
+        await bench.hosts.itself.renew("a", request, sign(keys[0], request), "10.113.11.2")
+        await bench.hosts.itself.renewed("a", "10.113.11.2")
+
+    async def second(bench: Bench) -> None:
+        await bench.hosts.start()
+        request = signing_request(keys[2], "a").decode()
+        with pytest.raises(HostRefusedError, match="again in 4 days"):
+            await bench.hosts.itself.renew("a", request, sign(keys[1], request), "10.113.11.2")
+        await bench.hosts.renew("a", request, days=90, who="tester")
+
+    run(tmp_path, first)
+    run(tmp_path, second)
+
+
+def test_a_short_life_needs_a_short_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is renewed often ends soon, and is on the list of revoked certificates for as short a time."""
+
+    async def work(bench: Bench) -> None:
+        keys = [make_key(), make_key(), make_key()]
+        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=100 / 86_400, who="tester")
+        for former, key in itertools.pairwise(keys):
+            request = signing_request(key, "a").decode()
+            await bench.hosts.itself.renew("a", request, sign(former, request), "10.113.11.2")
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
+            now = time.time()
+            monkeypatch.setattr(time, "time", lambda now=now: now + 6)
+
+    run(tmp_path, work)
+
+
+def test_nobody_renews_for_another(tmp_path: Path) -> None:
+    """Another address, another host's tunnel, another key, another name, no tunnels at all: refused and recorded."""
+
+    async def work(bench: Bench) -> None:
+        key, other = make_key(), make_key()
+        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        await bench.hosts.add("b", signing_request(other, "b").decode(), days=90, who="tester")
+        request = request_of("a")
+        good = sign(key, request)
+        for name, peer in (
+            ("a", "192.168.1.5"),
+            ("a", "10.113.11.3"),
+            ("zz", "10.113.11.2"),
+            ("b", "10.113.11.2"),
+        ):
+            with pytest.raises(HostForbiddenError):
+                await bench.hosts.itself.renew(name, request, good, peer)
+            with pytest.raises(HostForbiddenError):
+                await bench.hosts.itself.renewed(name, peer)
+        with pytest.raises(HostRefusedError, match="not signed by the key"):
+            await bench.hosts.itself.renew("a", request, sign(other, request), "10.113.11.2")
+        assert len(recorded(bench, "renewal refused")) == 8
+        bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.renew("a", request, good, "10.113.11.2")
+
+    run(tmp_path, work)
+
+
+def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> None:
+    """The one that was to follow is as dead as the present one, over a restart too."""
+
+    async def work(bench: Bench) -> None:
+        key = make_key()
+        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        request = request_of("a")
+        made = await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+        await bench.hosts.revoke("a", "tester")
+        assert {row.serial for row in bench.store.hosts.revoked()} == {
+            first["serial"],
+            made["serial"],
+        }
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.renewed("a", "10.113.11.2")
+        again = await add(bench, "a")
+        assert again["address"] == first["address"]
+        assert again["serial"] not in {first["serial"], made["serial"]}
+
+    run(tmp_path, work)
+
+
+def test_the_list_is_signed_once_however_often_it_is_asked_for(tmp_path: Path) -> None:
+    """Whoever asks without a token costs no signature, and for the certificate never; who is revoked is on at once."""
+
+    async def work(bench: Bench) -> None:
+        first = await add(bench, "a")
+        assert "BEGIN CERTIFICATE" in (await bench.hosts.authority())["authority"]
+        assert bench.authority.lists == 0
+        answers = await asyncio.gather(*(bench.hosts.revocations() for _ in range(20)))
+        assert bench.authority.lists == 1
+        assert len({one["revocations"] for one in answers}) == 1
+        await bench.hosts.revoke("a", "tester")
+        after = x509.load_pem_x509_crl((await bench.hosts.revocations())["revocations"].encode())
+        assert [f"{one.serial_number:x}" for one in after] == [first["serial"]]
+        assert bench.authority.lists == 2
+
+    run(tmp_path, work)
+
+
+def test_a_full_list_replaces_no_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused with the day when there is room; a host that is new needs none, and revoking one makes some."""
+    monkeypatch.setattr("appliance.hosts.revoked_certificates.ENTRIES_BYTES", 120)
+
+    async def work(bench: Bench) -> None:
+        for name in ("a", "b"):
+            await add(bench, name)
+        for _ in range(2):
+            await bench.hosts.renew("a", request_of("a"), days=90, who="tester")
+        key_before = bench.hosts.rows()[1]["serial"]
+        with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
+            await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+        assert bench.hosts.rows()[1]["serial"] == key_before
+        await add(bench, "c")
+        await bench.hosts.revoke("a", "tester")
+        await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+        assert bench.hosts.status()["troubles"] == []
+
+    run(tmp_path, work)
+
+
+def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
+    """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
+
+    async def work(bench: Bench) -> None:
+        seen = bench.hosts.overview()["revision"]
+        await add(bench, "a")
+        for late in (
+            bench.hosts.revoke("a", "tester", seen),
+            bench.hosts.renew("a", request_of("a"), days=90, who="tester", expected=seen),
+            bench.hosts.ports.tell("a", "closed", [], checked=1.0, who="tester", expected=seen),
+            bench.hosts.reload("tester", seen),
+        ):
+            with pytest.raises(HostsChangedError):
+                await late
+        await bench.hosts.revoke("a", "tester", bench.hosts.overview()["revision"])
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("name", ["Laptop", "LAPTOP", "ROSRV-Appliance"])
+def test_names_that_ike_does_not_tell_apart(tmp_path: Path, name: str) -> None:
+    """IKE compares names without regard to case: no second host may answer to the first one's."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "laptop")
+        with pytest.raises(HostRefusedError, match=r"large and small letters|no name"):
+            await add(bench, name)
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("name", ["a.b-c_d", "0", "x" * 63, "con.fig", "host-a"])
+def test_odd_names_that_are_names(tmp_path: Path, name: str) -> None:
+    """Everything the form allows can be enrolled, listed and revoked."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, name)
+        assert bench.hosts.rows()[0]["name"] == name
+        await bench.hosts.revoke(name, "tester")
+
+    run(tmp_path, work)
+
+
+def test_two_hundred_hosts(tmp_path: Path) -> None:
+    """Each has an address of its own, and all of them are there after a restart."""
+
+    async def work(bench: Bench) -> None:
+        request = request_of("x")
+        for number in range(200):
+            await bench.hosts.add(f"h{number}", request, days=1, who="tester")
+        assert len({row["address"] for row in bench.hosts.rows()}) == 200
+
+    async def again(bench: Bench) -> None:
+        assert len(bench.hosts.rows()) == 200
+        assert len(bench.table.admitted()) == 200
+
+    run(tmp_path, work, pool="10.113.0.0/16")
+    run(tmp_path, again, pool="10.113.0.0/16")
+
+
+def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
+    """On reload a host goes out of the policy and loses what it has; wanted again it is back; none is lost."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        await add(bench, "b")
+        bench.order.clear()
+        bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
+        body = await bench.hosts.reload("tester")
+        assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
+        assert (body["closed"], body["opened"]) == (["a"], [])
+        assert body["divergence"] == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
+        rows = {row["name"]: row for row in bench.hosts.rows()}
+        assert (rows["a"]["state"], rows["a"]["groups"], rows["b"]["state"]) == (
+            "not wanted",
+            ["ocu"],
+            "down",
+        )
+        bench.declared.unlink()
+        assert (await bench.hosts.reload("tester"))["opened"] == ["a"]
+        assert sorted(bench.hosts.addresses) == ["a", "b"]
+
+    run(tmp_path, work)
+
+
+def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) -> None:
+    """What `host:NAME` means is told when clear text is kept out, which a reload may be the first to ask for."""
+
+    async def enrol(bench: Bench) -> None:
+        await add(bench, "a")
+
+    async def again(bench: Bench) -> None:
+        await bench.hosts.start()
+        assert not bench.asked
+        bench.declared.unlink()
+        body = await bench.hosts.reload("tester")
+        assert body["opened"] == ["a"]
+        assert list(bench.hosts.addresses) == ["a"]
+        assert bench.order[-1] == "policy ['a']"
+        bench.order.clear()
+        await bench.hosts.reload("tester")
+        assert not bench.order
+
+    run(tmp_path, enrol)
+    (tmp_path / "hosts.yaml").write_text("hosts:\n  - {name: a, tunnel: false}\n")
+    run(tmp_path, again)
+
+
+def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
+    """In the log once, in the status as long as it is so; a short life warns in its last third."""
+
+    async def work(bench: Bench) -> None:
+        await bench.hosts.add("short", request_of("a"), days=10, who="tester")
+        assert bench.hosts.status()["troubles"] == []
+        await bench.hosts.renew("short", request_of("a"), days=1e-5, who="tester")
+        await asyncio.sleep(0.7)
+        bench.tunnels.each_hour()
+        bench.tunnels.each_hour()
+        ended = recorded(bench, "certificate ends soon") + recorded(bench, "certificate ended")
+        assert len(ended) == 1
+        assert "short" in bench.hosts.status()["troubles"][0]
+
+    run(tmp_path, work)
+
+
+def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
+    """By a host's name, its address, or a machine's in clear text; a name nobody has is refused."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        bench.hosts.ports.machines = lambda: {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
+        assert (await bench.hosts.ports.tell("10.113.11.2", "open", [40001], checked=5.0, who="eve"))[
+            "name"
+        ] == "a"
+        await bench.hosts.ports.tell("10.0.0.7", "closed", [], checked=6.0, who="eve")
+        with pytest.raises(HostRefusedError, match="enrolled are: a"):
+            await bench.hosts.ports.tell("nobody", "open", [], checked=5.0, who="eve")
+        with pytest.raises(HostRefusedError, match="a day ahead"):
+            await bench.hosts.ports.tell("a", "closed", [], checked=4e9, who="eve")
+        overview = bench.hosts.overview()
+        assert overview["hosts"][0]["ports"] == {
+            "state": "open",
+            "checked": 5.0,
+            "open": [40001],
+            "who": "eve",
+        }
+        assert [(one["address"], one["nodes"], one["ports"]["state"]) for one in overview["machines"]] == [
+            ("10.0.0.7", 3, "closed")
+        ]
+
+    run(tmp_path, work)

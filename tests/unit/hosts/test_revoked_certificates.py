@@ -1,0 +1,114 @@
+"""Tests of the revoked certificates: which are on the list, and that the list is never too long for charon."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.ipsec.authority import Authority
+from appliance.store.state import StateStore
+
+DAY = 86_400.0
+LONGEST = 65_535  # bytes of a value of vici
+_NUMBERS = itertools.count(1 << 70)
+
+
+def serials(count: int) -> list[str]:
+    """Serial numbers as the authority makes them."""
+    return [f"{next(_NUMBERS):x}" for _ in range(count)]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[StateStore]:
+    """A state."""
+    one = StateStore(tmp_path, failed=pytest.fail)
+    yield one
+    one.close()
+
+
+def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: Path) -> int:
+    """How long the list becomes that charon is given."""
+    directory.mkdir()
+    rows = [(row.serial, row.moment) for row in revoked.listed(enrolled)]
+    signed = x509.load_pem_x509_crl(Authority(directory).revocations(rows))
+    assert len(signed) == len(rows)
+    return len(signed.public_bytes(Encoding.DER))
+
+
+def test_a_certificate_is_on_the_list_until_it_has_ended(store: StateStore) -> None:
+    """And a day longer, for clocks differ."""
+    revoked = RevokedCertificates(store.hosts)
+    now = time.time()
+    for serial, expires in (("a1", now + DAY), ("a2", now - DAY / 2), ("a3", now - 2 * DAY)):
+        revoked.add("a", serial, expires)
+    assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
+    revoked.forget_ended()
+    assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
+
+
+def test_what_is_revoked_is_kept_over_restarts(tmp_path: Path) -> None:
+    """And what has ended is in the state no more; one whose end was not noted counts as long as there may be one."""
+    now = time.time()
+    first = StateStore(tmp_path, failed=pytest.fail)
+    revoked = RevokedCertificates(first.hosts)
+    revoked.add("a", "a1", now + DAY)
+    revoked.add("a", "a2", now - 2 * DAY)
+    database = first.hosts._database  # what a version before has written
+    for serial, moment in (("b1", now - 10 * DAY), ("b2", now - 400 * DAY)):
+        database.submit("INSERT INTO revoked_certificate VALUES (?, ?)", (serial, moment))
+    first.close()
+    second = StateStore(tmp_path, failed=pytest.fail)
+    assert [row.serial for row in RevokedCertificates(second.hosts).listed({"a"})] == ["a1", "b1"]
+    second.close()
+    third = StateStore(tmp_path, failed=pytest.fail)
+    assert {row.serial for row in third.hosts.revoked()} == {"a1", "b1"}
+    third.close()
+
+
+def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_path: Path) -> None:
+    """Certificates of names that are not enrolled give way first; all that charon could let in are on it."""
+    revoked = RevokedCertificates(store.hosts)
+    expires = time.time() + 90 * DAY
+    for serial in serials(2_000):
+        revoked.add("enrolled", serial, expires)
+    assert len(revoked.listed({"enrolled"})) == 2_000
+    for serial in serials(2_000):
+        revoked.add("gone", serial, expires)
+    assert {row.name for row in revoked.listed({"enrolled"})} == {"enrolled"}
+    assert len(revoked.listed({"enrolled"})) == 2_000
+    assert revoked.missing({"enrolled"}) == 0
+    assert bytes_of_list(revoked, {"enrolled"}, tmp_path / "ca") <= LONGEST
+
+
+def test_there_is_room_or_a_day_when_there_is(store: StateStore, tmp_path: Path) -> None:
+    """Certificates are replaced until the list is full and not longer; whatever is left out then is counted."""
+    revoked = RevokedCertificates(store.hosts)
+    expires = time.time() + 90 * DAY
+    count = 0
+    while not (until := revoked.wait_for_room({"a"})):
+        for serial in serials(2):
+            revoked.add("a", serial, expires + count)
+            count += 1
+        assert count < 10_000
+    assert count > 2_000
+    assert until == pytest.approx(expires + DAY)
+    assert revoked.missing({"a"}) == 0
+    assert revoked.wait_for_room(set()) == 0.0
+    for serial in serials(100):
+        revoked.add("a", serial, expires)
+    assert 0 < revoked.missing({"a"}) <= 100
+    assert bytes_of_list(revoked, {"a"}, tmp_path / "ca") <= LONGEST
+
+
+def test_numbers_of_another_length_fit_too(store: StateStore, tmp_path: Path) -> None:
+    """Serial numbers of 160 bits, as certificates had before, are fewer on the list."""
+    revoked = RevokedCertificates(store.hosts)
+    for number in range(3_000):
+        revoked.add("", f"{(1 << 158) + number:x}", time.time() + DAY)
+    assert bytes_of_list(revoked, set(), tmp_path / "ca") <= LONGEST
+    assert revoked.missing(set()) > 1_000

@@ -1,0 +1,240 @@
+"""What the gate decides on parameters (the key, what is below it, what a write replaces) and on names that are held."""
+
+import ipaddress
+from typing import Any
+
+import pytest
+
+from appliance.master.calls.arguments import ApiUri
+from appliance.master.calls.call import Caller
+from appliance.master.calls.gate import Contest, Gate, HostLimits, Presence, Probe, contested
+from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.node_calls import NODE_CALLS
+from appliance.policy import compile_policy
+from appliance.policy.model import Decision
+from appliance.ros.parameter_tree import Tree
+from appliance.ros.uris import parse_node_uri
+from appliance.rpc.server import Peer
+
+ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
+BASE = """
+[Groups]
+ocu = 10.0.0.5
+adm = 10.0.0.9
+[Nodes]
+default = *
+[Commands]
+default = *
+[Parameters]
+"""
+LIMITED = """
+read default   = *
+write default  = adm
+write /arm/**  = adm ocu
+write /arm/max = adm
+"""
+EXACT = """
+read /arm      = ocu
+read default   = adm
+write /arm     = ocu
+write default  = adm
+"""
+
+
+class NobodyIsKept:
+    """A journal that keeps nothing."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_: None
+
+
+def gate(rules: str) -> Gate:
+    """The gate under a policy with these rules for parameters, and nobody registered."""
+    policy = compile_policy(BASE + rules, file="test.ini")
+    return Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+
+
+def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -> Decision:
+    """The decision on a call, while ROSMaster has the parameters `tree`."""
+    peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
+    decision = gate(rules).decide(Caller(peer, "/me", 0), MASTER_CALLS[method], arguments, tree or {})
+    assert not isinstance(decision, Contest)
+    return decision
+
+
+@pytest.mark.parametrize("key", ["/arm/max/x", "/arm/max/x/y"])
+def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) -> None:
+    """ROSMaster makes a namespace of a value when something below it is set: that is a write of the value."""
+    tree = {"arm": {"max": 5, "speed": 1}}
+    denied = ask(LIMITED, OPERATOR, "setParam", key, 0, tree=tree)
+    assert not denied.allowed
+    assert denied.rule is not None
+    assert denied.rule.key == "write /arm/max"
+    assert "/arm/max" in denied.reason
+    assert ask(LIMITED, ADMIN, "setParam", key, 0, tree=tree).allowed
+    assert ask(LIMITED, OPERATOR, "setParam", "/arm/speed/x", 0, tree=tree).allowed
+
+
+def test_what_is_no_value_is_in_nobodys_way() -> None:
+    """Below a namespace, or where nothing is, the key itself decides."""
+    trees: list[Tree] = [{}, {"arm": {}}, {"arm": {"max": {"y": 1}}}]
+    for tree in trees:
+        assert ask(LIMITED, OPERATOR, "setParam", "/arm/max/x", 0, tree=tree).allowed
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("getParam", ("/arm",)),
+        ("hasParam", ("/arm",)),
+        ("setParam", ("/arm", 0)),
+        ("deleteParam", ("/arm",)),
+    ],
+)
+def test_an_exact_key_is_no_right_to_a_namespace(method: str, arguments: tuple[Any, ...]) -> None:
+    """While /arm is a value, `/arm = ocu` is for it; what is in a namespace /arm is decided by `default`."""
+    assert ask(EXACT, OPERATOR, method, *arguments, tree={"arm": 7}).allowed
+    assert ask(EXACT, OPERATOR, method, *arguments, tree={}).allowed
+    denied = ask(EXACT, OPERATOR, method, *arguments, tree={"arm": {"speed": 7}})
+    assert not denied.allowed
+    assert denied.rule is not None
+    assert denied.rule.key.endswith(" default")
+
+
+def test_a_dictionary_is_a_namespace_before_it_is_there() -> None:
+    """Who sets a dictionary sets all that is in it, and needs the right to all of it."""
+    assert not ask(EXACT, OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
+    assert ask(EXACT + "write /arm/** = ocu\n", OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
+    assert ask(EXACT, OPERATOR, "setParam", "/arm", [{"speed": 1}]).allowed
+
+
+def test_without_the_section_everything_is_as_it_was() -> None:
+    """A policy that has no [Parameters] decides by [Commands] alone."""
+    rules = "[Clients]\ndefault = *\n"
+    tree: Tree = {"arm": {"max": 5}}
+    text = BASE.replace("[Parameters]\n", "") + rules
+    policy = compile_policy(text, file="test.ini")
+    peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
+    here = Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+    decision = here.decide(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0), tree)
+    assert isinstance(decision, Decision)
+    assert decision.allowed
+
+
+API = "http://127.0.0.1:4000/"
+
+
+def held(name: str, host: str, *, own: bool) -> Registry:
+    """A registry in which a node of this host, or one of the appliance's, holds a name."""
+    registry = Registry(NobodyIsKept())
+    address, uri = ipaddress.ip_address(host), parse_node_uri(API)
+    node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)
+    registry.add(node)
+    registry.register(node, Kind.PUBLICATION, "/rosout_agg", "rosgraph_msgs/Log")
+    return registry
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "does"),
+    [
+        ("registerPublisher", ("/rosout_agg", "rosgraph_msgs/Log", API), True),
+        ("unregisterPublisher", ("/rosout_agg", API), True),
+        ("setParam", ("/key", 1), False),
+    ],
+)
+def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
+    method: str, arguments: tuple[Any, ...], does: bool
+) -> None:
+    """Without isolation the robot's nodes and the appliance's come from one address: the listener tells them apart.
+
+    At that listener the policy is not asked: what the appliance's node does is known (`does`).
+    """
+    policy = compile_policy(
+        "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Commands]\ndefault = *\n", file="test.ini"
+    )
+    loopback = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
+    call = MASTER_CALLS[method]
+    given = tuple(ApiUri(API, parse_node_uri(API)) if one == API else one for one in arguments)
+    for own in (True, False):
+        registry = held("/rosout", "127.0.0.1", own=own)
+        here = Gate(lambda: policy, registry, HostLimits())
+        decision = here.decide(Caller(loopback, "/rosout", 0), call, given, {})
+        assert isinstance(decision, Decision)
+        assert decision.allowed is not own
+        itself = here.decide(Caller(loopback, "/rosout", 0, own=True), call, given, {})
+        assert isinstance(itself, Decision)
+        assert itself.allowed is does
+
+
+def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
+    """The rosout aggregator subscribes at other nodes' outer faces, whatever the policy says of this machine.
+
+    From another machine nobody does in its name; and on this one nobody asks in its name for anything else.
+    """
+    policy = compile_policy(
+        f"[Nodes]\ndefault = {OPERATOR}\n[Subscribers]\ndefault = {OPERATOR}\n", file="p.ini"
+    )
+    registry = held("/rosout", "127.0.0.1", own=True)
+    aggregator = registry.holder("/rosout")
+    assert aggregator is not None
+    registry.register(aggregator, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
+    here = Gate(lambda: policy, registry, HostLimits())
+    uri = parse_node_uri(API)
+    other = Incarnation("other", "/voice", ipaddress.ip_address(OPERATOR), uri, API, OPERATOR, 19003, 19004)
+    for host, local, topic, allowed in (
+        ("127.0.0.1", "127.0.0.1", "/rosout", True),
+        ("10.0.0.1", "10.0.0.1", "/rosout", True),
+        ("127.0.0.1", "127.0.0.1", "/chatter", False),
+        (OPERATOR, "10.0.0.1", "/rosout", False),
+    ):
+        caller = Caller(Peer(ipaddress.ip_address(host), host, local), "/rosout", 0, target=other)
+        decision = here.decide(caller, NODE_CALLS["requestTopic"], (topic, [["TCPROS"]]), {})
+        assert isinstance(decision, Decision)
+        assert decision.allowed is allowed
+
+
+@pytest.mark.parametrize(
+    ("presence", "words"),
+    [
+        (Presence.GONE, None),
+        (
+            Presence.SILENT,
+            "does not answer (it hangs, or was stopped); unless it answers it is unregistered in 8 s",
+        ),
+        (Presence.ANSWERS, "is held by a running node on 10.0.0.9"),
+    ],
+)
+def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words: str | None) -> None:
+    """Gone: the name is given over. Silent: the refusal says when to ask again. Of another holder nothing is known."""
+    holder, other = (next(iter(held(name, "10.0.0.9", own=False).live())) for name in ("/voice", "/other"))
+    contest = Contest(holder, Decision(True, None, "granted"))
+    decision = contested(contest, Probe(holder, presence, 7.2))
+    assert (decision.allowed, words is None or words in decision.reason) == (words is None, True)
+    assert not contested(contest, Probe(other, presence, 7.2)).allowed
+    assert not contested(contest, None).allowed
+
+
+def test_a_host_has_as_many_registrations_as_are_left() -> None:
+    """Three times as many: however many hosts register all they can, the next finds room."""
+    policy = compile_policy(BASE + LIMITED + "[Publishers]\ndefault = *\n", file="test.ini")
+    registry = Registry(NobodyIsKept())
+    limits = HostLimits(nodes=500, registrations=60, registrations_in_all=100)
+    gate = Gate(lambda: policy, registry, limits)
+    counts = []
+    for number in range(4):
+        host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000/"
+        caller = Caller(Peer(ipaddress.ip_address(host), host, "10.0.0.1"), f"/n{number}", 0)
+        api = ApiUri(uri, parse_node_uri(uri))
+        node = Incarnation(f"k{number}", f"/n{number}", caller.peer.host, api.uri, uri, "", 1, 2)
+        registry.add(node)
+        for turn in range(100):
+            call = MASTER_CALLS["registerPublisher"]
+            decision = gate.decide(caller, call, (f"/t{turn}", "std_msgs/String", api), {})
+            assert isinstance(decision, Decision)
+            if not decision.allowed:
+                assert "registrations" in decision.reason
+                break
+            registry.register(node, Kind.PUBLICATION, f"/t{turn}", "std_msgs/String")
+        counts.append(registry.registrations_of(caller.peer.host))
+    assert counts == [60, 30, 8, 2]

@@ -1,0 +1,111 @@
+"""searchParam: what may be read is found as ROSMaster finds it; of the rest the answer tells nothing."""
+
+import asyncio
+import ipaddress
+from typing import Any
+
+import pytest
+
+from appliance.master.calls.call import Answer, Caller
+from appliance.master.calls.parameter_search import search_param
+from appliance.policy import compile_policy
+from appliance.policy.model import Decision
+from appliance.ros.parameter_tree import standing_at
+from appliance.rpc.server import Peer
+from tests.support.parameters import mirror
+
+HOST = "10.0.0.5"
+RULES = "[Parameters]\nread default = 10.0.0.5\nread /secret/** = 10.0.0.9\nread /arm/key = 10.0.0.9\n"
+
+
+class Site:
+    """ROSMaster with these parameters, and what was recorded: (name, decision)."""
+
+    def __init__(self, tree: Any, rules: str = RULES) -> None:
+        policy = compile_policy(rules, file="test.ini")
+        self.policy = lambda: policy
+        self.parameters = mirror(tree)
+        self.rosmaster = self.recorder = self
+        self.asked: list[str] = []
+        self.records: list[tuple[str, Decision]] = []
+
+    def decided(self, _caller: Any, method: str, _category: str, resource: str, decision: Decision) -> str:
+        """As `Recorder`."""
+        assert method == "searchParam"
+        self.records.append((resource, decision))
+        return f"id{len(self.records)}"
+
+    async def call(self, _method: str, caller_id: Any, key: Any) -> Answer:
+        """ROSMaster's search."""
+        self.asked.append(key)
+        first = key.strip("/").split("/")[0]
+        namespace = [] if key.startswith("/") else caller_id.strip("/").split("/")
+        for depth in range(len(namespace), -1, -1):
+            base = "".join(f"/{part}" for part in namespace[:depth])
+            if standing_at(self.parameters.tree, f"{base}/{first}")[0] is not None:
+                name = f"{base}/{key.strip('/')}"
+                return [1, f"Found [{name}]", name]
+        return [-1, f"Cannot find parameter [{key}] in an upwards search", ""]
+
+    def search(self, caller_id: str, key: str, *, own: bool = False) -> Answer:
+        """One search."""
+        peer = Peer(ipaddress.ip_address(HOST), HOST, "10.0.0.1")
+        caller = Caller(peer, caller_id, 0, own=own)
+        return asyncio.run(search_param(self, caller, (key,)))  # type: ignore[arg-type]  # stands for the master
+
+
+@pytest.mark.parametrize(
+    ("caller_id", "key"),
+    [
+        ("/secret/inside", "key"),
+        ("/me", "/secret/key"),
+        ("/me", "//secret//key/"),
+        ("/secret/a/b", "key/below"),
+        ("/secret", "key"),
+    ],
+)
+def test_whether_it_is_there_makes_no_difference(caller_id: str, key: str) -> None:
+    """What may not be read is answered alike whether or not it exists: with the rule, and the id of the record."""
+    answers = [Site(tree).search(caller_id, key) for tree in ({"secret": {"key": 1}, "open": 1}, {"open": 1})]
+    assert answers[0] == answers[1]
+    assert answers[0][0] != 1
+    assert "[Parameters] read /secret/**" in str(answers[0][1])
+    assert str(answers[0][1]).endswith("[id1]")
+
+
+def test_a_denial_is_recorded_with_its_name() -> None:
+    """A global key is decided before anybody looks for it; a search upwards is recorded by its first hidden place."""
+    site = Site({"secret": {"key": 1}})
+    site.search("/me", "/secret/key")
+    assert not site.asked
+    site.search("/secret/inside", "key")
+    assert [(name, decision.allowed) for name, decision in site.records] == [
+        ("/secret/key", False),
+        ("/secret/inside/key", False),
+    ]
+
+
+def test_a_hidden_name_is_in_nobodys_way() -> None:
+    """The search goes on above a place that may not be read, as if nothing were there."""
+    for tree in ({"arm": {"key": 1}, "key": 2}, {"arm": {}, "key": 2}):
+        site = Site(tree)
+        assert site.search("/arm/node", "key")[::2] == [1, "/key"]
+        assert site.search("/arm/node", "key/sub")[::2] == [1, "/arm/key/sub" if tree["arm"] else "/key/sub"]
+        assert not site.records
+
+
+def test_what_may_be_read_is_found_as_ever() -> None:
+    """ROSMaster's own answer, also that there is none, where the policy hides nothing."""
+    site = Site({"arm": {"gain": 1}, "top": 2})
+    assert site.search("/arm/node", "gain") == [1, "Found [/arm/gain]", "/arm/gain"]
+    assert site.search("/arm/node", "/top") == [1, "Found [/top]", "/top"]
+    assert site.search("/arm/node", "none") == [-1, "Cannot find parameter [none] in an upwards search", ""]
+    assert site.search("/secret/x", "key", own=True)[0] == -1
+    assert not site.records
+
+
+def test_audit_only_records_what_it_lets_pass() -> None:
+    """In audit-only mode the name is found, and the record says that it would have been denied."""
+    site = Site({"secret": {"key": 1}}, RULES + "[Options]\naudit-only = parameters\n")
+    assert site.search("/secret/inside", "key")[2] == "/secret/key"
+    assert [(name, decision.would_deny) for name, decision in site.records] == [("/secret/key", True)]

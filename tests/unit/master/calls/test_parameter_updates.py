@@ -1,0 +1,150 @@
+"""Who is told of a parameter: as rosmaster's own code computes it, and never of a key that was not decided."""
+
+import asyncio
+import copy
+import json
+import subprocess
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.master.calls.parameter_updates import settled, updates_of
+from appliance.master.graph.registry import Kind
+from appliance.ros.names import is_relative_member
+from appliance.ros.xmlrpc import Value
+from tests.support.control_parts import ControlParts
+from tests.support.nodes import PYTHON
+
+ORACLE = """
+import json, sys
+from rosmaster.paramserver import compute_param_updates
+from rosmaster.registrations import Registrations
+for line in sys.stdin:
+    subscribed, key, value, caller = json.loads(line)
+    registrations = Registrations(Registrations.PARAM_SUBSCRIPTIONS)
+    for name, one in subscribed:
+        registrations.register(one if one == "/" else one + "/", name, "http://" + name)
+    told = compute_param_updates(registrations, key, value, caller)
+    print(json.dumps([[api[0], at, what] for apis, at, what in told for api in apis]), flush=True)
+"""
+PART = st.sampled_from(["a", "b", "ab", "c"])
+KEY = st.lists(PART, max_size=3).map(lambda parts: "/" + "/".join(parts))
+NAMESPACE: st.SearchStrategy[Any] = st.recursive(
+    st.dictionaries(PART, st.one_of(st.integers(0, 3), st.just([{"a": 1}]), st.just({})), max_size=3),
+    lambda inner: st.dictionaries(PART, inner, max_size=3),
+    max_leaves=8,
+)
+CALLER = st.sampled_from(["/n1", "/n2", "/n3"])
+SUBSCRIBED = st.lists(st.tuples(CALLER, KEY), max_size=8, unique=True)
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Any:
+    """rosmaster's `compute_param_updates`, run by the interpreter it is installed for."""
+    with subprocess.Popen(
+        [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+def in_order(told: list[Any]) -> list[str]:
+    """Updates without the order of those of one call, which says nothing."""
+    return sorted(json.dumps(one, sort_keys=True) for one in told)
+
+
+@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    SUBSCRIBED,
+    KEY,
+    st.one_of(st.integers(0, 3), st.just([{"a": 1}]), NAMESPACE),
+    st.one_of(CALLER, st.none()),
+)
+def test_the_same_nodes_hear_the_same_as_on_a_plain_master(
+    oracle: Any, subscribed: list[tuple[str, str]], key: str, value: Any, caller: str | None
+) -> None:
+    """Whatever is subscribed and whatever is set or deleted: who is told, of which keys, with which values."""
+    value = {} if caller is None else value  # deleted
+    oracle.stdin.write(json.dumps([subscribed, key, value, caller]) + "\n")
+    oracle.stdin.flush()
+    below = sorted({one for _, one in subscribed if one != key and one.startswith(key.rstrip("/") + "/")})
+    told = [
+        [name, f"{update.key.rstrip('/')}/", update.value]
+        for update in updates_of(key, value, below)
+        for name, one in subscribed
+        if one == update.subscribed and not (update.key == key and name == caller)
+    ]
+    assert in_order(told) == in_order(json.loads(oracle.stdout.readline()))
+
+
+@given(
+    KEY,
+    st.recursive(
+        st.integers(0, 3),
+        lambda inner: st.dictionaries(st.text("/~ab", max_size=3), inner, max_size=3),
+        max_leaves=8,
+    ),
+    st.lists(KEY, max_size=5),
+)
+def test_nobody_is_told_of_a_key_that_was_not_decided(key: str, value: Any, others: list[str]) -> None:
+    """Whatever the names in a value: told is the key, or a subscribed key below it."""
+    below = [one for one in others if one != key and one.startswith(key.rstrip("/") + "/")]
+    for update in updates_of(key, value, below):
+        assert update.key in {key, *below}
+
+
+def test_what_is_told_is_what_was_set() -> None:
+    """A value that waits to be told is not changed by a later call that sets something in it."""
+    tree: dict[str, Value] = {"a": {"b": 1}, "c": [1]}
+    kept = settled(tree)
+    before = copy.deepcopy(kept)
+    namespace = tree["a"]
+    assert isinstance(namespace, dict)
+    namespace["b"] = 2
+    assert kept == before
+
+
+@pytest.mark.parametrize("name", ["/limits/speed", "~own", "a//b", "", "a/", "/"])
+@pytest.mark.parametrize("depth", range(3))
+@pytest.mark.anyio
+async def test_a_member_that_is_no_relative_name_is_refused(name: str, depth: int) -> None:
+    """At every depth, alone and in a multicall: nothing is set, nobody is told, and the text names the member."""
+    world = await ControlParts.begun()
+    node = world.node("/robot")
+    await world.register(node, Kind.PARAMETER, "/limits/speed", "")
+    value: Value = {name: 1, "fine": 666}
+    for level in range(depth):
+        value = {f"level{level}": value}
+    params: list[Value] = ["/guest", "/guest", value]
+    alone: Any = await world.ask("setParam", *params)
+    part: Value = {"methodName": "setParam", "params": params}
+    together: Any = await world.ask("system.multicall", [part, part])
+    for answer in (alone, together[0][0], together[1][0]):
+        assert answer[0] == -1
+        assert "no relative name" in answer[1]
+        assert ascii(name) in answer[1]
+    assert not [call for call in world.hidden.calls if call[0] == "setParam" and call[2] == "/guest"]
+    assert not world.parameters.tree.get("guest")
+    assert not [one for one in world.deliveries.told if one[1] == "paramUpdate"]
+    assert not is_relative_member(name)
+
+
+@pytest.mark.anyio
+async def test_a_subscription_meets_no_write_that_is_under_way() -> None:
+    """Who subscribes while the parameter is set has the new value: by the answer, or because it is told."""
+    for first in ("subscribeParam", "setParam"):
+        world = await ControlParts.begun()
+        calls = {
+            "setParam": world.ask("setParam", "/me", "/arm", 2),
+            "subscribeParam": world.ask("subscribeParam", "/robot", "http://10.0.0.5:4001/", "/arm"),
+        }
+        order = sorted(calls, key=lambda name: name != first)
+        await asyncio.gather(*(calls[name] for name in order))
+        await world.settle()
+        made = [call[0] for call in world.hidden.calls if call[0] in calls]
+        told = [one for one in world.deliveries.told if one[1] == "paramUpdate"]
+        assert made == order
+        assert told == ([("/robot", "paramUpdate", ("/arm/", 2))] if first == "subscribeParam" else [])

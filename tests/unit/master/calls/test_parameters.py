@@ -1,0 +1,268 @@
+"""The mirror of the parameters is ROSMaster's tree, step by step: compared with rosmaster's own code."""
+
+import asyncio
+import copy
+import ipaddress
+import json
+import subprocess
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.master.calls.call import Caller, LimitReachedError
+from appliance.master.calls.parameter_charges import measure
+from appliance.master.calls.parameters import ParameterMirror, in_order, set_param
+from appliance.ros.errors import EncodingError, ProtocolError
+from appliance.rpc.client import CallFailedError
+from appliance.rpc.server import Peer
+from tests.support.nodes import PYTHON
+from tests.support.parameters import mirror, put
+
+HOST = ipaddress.ip_address("10.0.0.1")
+ORACLE = """
+import json, sys
+from rosmaster.paramserver import ParamDictionary
+for line in sys.stdin:
+    tree = ParamDictionary(None)
+    for do, key, value in json.loads(line):
+        try:
+            tree.set_param(key, value) if do == "set" else tree.delete_param(key)
+        except (KeyError, TypeError):
+            pass
+    print(json.dumps(tree.parameters), flush=True)
+"""
+WHOLE = """
+import json, sys
+from rosmaster.master_api import ROSMasterHandler
+master = ROSMasterHandler()
+master.subscribeParam("/node", "http://127.0.0.1:9/", "/q/b/c")
+answers = [master.setParam("/me", key, value)[0] for key, value in json.loads(sys.argv[1])]
+print(json.dumps([answers, master.getParam("/me", "/")[2]]), flush=True)
+master._shutdown()
+"""
+PART = st.sampled_from(["a", "b", "c"])
+KEY = st.lists(PART, min_size=1, max_size=4).map(lambda parts: "/" + "/".join(parts))
+VALUE = st.recursive(
+    st.one_of(st.integers(0, 9), st.text("xy", max_size=3), st.booleans()),
+    lambda inner: st.one_of(st.lists(inner, max_size=2), st.dictionaries(PART, inner, max_size=3)),
+    max_leaves=6,
+)
+STEP = st.one_of(st.tuples(st.just("set"), KEY, VALUE), st.tuples(st.just("delete"), KEY, st.none()))
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Any:
+    """rosmaster's ParamDictionary, run by the interpreter it is installed for."""
+    with subprocess.Popen(
+        [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+@settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(STEP, max_size=12))
+def test_the_mirror_is_what_rosmaster_has(oracle: Any, steps: list[Any]) -> None:
+    """After any sequence of settings and deletions both trees are equal, and the weight is that of the tree."""
+    oracle.stdin.write(json.dumps(steps) + "\n")
+    oracle.stdin.flush()
+    there = mirror()
+    for do, key, value in json.loads(json.dumps(steps)):
+        if do == "set":
+            put(there, key, value, HOST)
+        else:
+            there.delete(key)
+    assert there.tree == json.loads(oracle.stdout.readline())
+    assert there.weight == measure(there.tree)[0]
+
+
+def test_what_would_be_too_much_is_refused_before_it_is_set() -> None:
+    """All parameters together are bounded; what is deleted makes room."""
+    there = mirror(whole=1000)
+    put(there, "/a", "x" * 500, HOST)
+    with pytest.raises(LimitReachedError, match="the share of one host is 1000"):
+        put(there, "/b", "x" * 500, HOST)
+    there.delete("/a")
+    put(there, "/b", "x" * 500, HOST)
+
+
+def test_key_and_value_together_are_bounded_in_depth() -> None:
+    """ROSMaster answers recursively: what it could not tell any more never gets there."""
+    there = mirror(depth_limit=5)
+    there.check("/a/b/c", measure({"d": [1]})[1])
+    with pytest.raises(ProtocolError, match="nest deeper"):
+        there.check("/a/b/c", measure({"d": [[1]]})[1])
+    with pytest.raises(ProtocolError, match="nil"):
+        measure({"b": [None]})
+
+
+class OrderedServer:
+    """ROSMaster's parameters, and how the calls reached it."""
+
+    def __init__(self, there: ParameterMirror) -> None:
+        self.tree = mirror()
+        self.requests: list[list[str]] = []
+        self.parameters = there
+        self.rosmaster = self.graph = self
+        self.broken: Exception | None = None
+        self.told: list[tuple[str, str | None]] = []
+
+    def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
+        """As `Graph`."""
+        self.told.append((key, caller_id))
+
+    def parameter_deleted(self, key: str) -> None:
+        """As `Graph`."""
+        self.told.append((key, None))
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """One call by itself."""
+        return (await self.call_in_order([(method, params)]))[0]
+
+    async def call_in_order(self, calls: Any) -> list[Any]:
+        """Several as one."""
+        if any(value == "unwritable" for _method, params in calls for value in params[2:]):
+            raise EncodingError("cannot be written")
+        self.requests.append([f"{method} {params[1]}" for method, params in calls])
+        if self.broken is not None:
+            raise self.broken
+        answers: list[Any] = []
+        for method, (_caller, key, *value) in calls:
+            if method == "setParam":
+                put(self.tree, key, copy.deepcopy(value[0]), HOST)
+            elif method == "deleteParam":
+                self.tree.delete(key)
+            elif key == "/fault":
+                answers.append(CallFailedError("a fault"))
+                continue
+            answers.append([1, method, key])
+        return answers
+
+
+def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
+    """Carry them out in order."""
+    peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
+    caller = Caller(peer, "/me", 0)
+    wanted = [(caller, method, tuple(arguments)) for method, *arguments in calls]
+    return asyncio.run(in_order(server, wanted))  # type: ignore[arg-type]  # stands for the master
+
+
+def test_a_run_is_one_request_in_its_order() -> None:
+    """Calls of one run travel as one, in their order, and the mirror has what ROSMaster has."""
+    server = OrderedServer(mirror())
+    answers = ordered(
+        server,
+        ("setParam", "/a", {"b": 1}),
+        ("deleteParam", "/a/b"),
+        ("hasParam", "/a/b"),
+        ("setParam", "/c", 2),
+    )
+    assert server.requests == [["setParam /a", "deleteParam /a/b", "hasParam /a/b", "setParam /c"]]
+    assert [one[1] for one in answers] == ["setParam", "deleteParam", "hasParam", "setParam"]
+    assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
+    assert server.told == [("/a", "/me"), ("/a/b", None), ("/c", "/me")]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(STEP, max_size=12))
+def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]]) -> None:
+    """Whatever the calls, together they leave the tree that they leave one by one."""
+    calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
+    together, single = (OrderedServer(mirror()) for _ in range(2))
+    ordered(together, *copy.deepcopy(calls))
+    for call in copy.deepcopy(calls):
+        ordered(single, call)
+    assert together.parameters.tree == single.parameters.tree == together.tree.tree
+    assert together.parameters.weight == single.parameters.weight
+
+
+def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
+    """The one that no request can carry fails by itself; those before and after it are carried out in order."""
+    server = OrderedServer(mirror())
+    answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
+    assert isinstance(answers[1], EncodingError)
+    assert server.parameters.tree == {"a": 1, "c": 3}
+    assert server.requests == [["setParam /a"], ["setParam /c"]]
+
+
+def test_a_value_that_is_too_much() -> None:
+    """The limit holds for the sum of a run; what takes the place of something else is no addition."""
+    server = OrderedServer(mirror(whole=1100))
+    big = "x" * 400
+    answers = ordered(
+        server,
+        ("setParam", "/a", big),
+        ("setParam", "/b", big),
+        ("setParam", "/c", big),
+        ("setParam", "/d", 1),
+    )
+    assert [type(one) for one in answers] == [list, list, LimitReachedError, list]
+    assert set(server.parameters.tree) == {"a", "b", "d"}
+    assert server.parameters.weight <= 1100
+
+
+def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
+    """A fault of one part is that part's; without an answer each part has the failure, and the mirror stays."""
+    server = OrderedServer(mirror())
+    answers = ordered(server, ("hasParam", "/fault"), ("setParam", "/a", 1))
+    assert isinstance(answers[0], CallFailedError)
+    assert answers[1][0] == 1
+    server.broken = CallFailedError("gone")
+    answers = ordered(server, ("setParam", "/b", 1), ("deleteParam", "/a"))
+    assert [type(one) for one in answers] == [CallFailedError, CallFailedError]
+    assert server.parameters.tree == {"a": 1}
+    assert server.told == [("/a", "/me")]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(STEP, max_size=14), st.data())
+def test_changes_made_once_more_leave_the_same_tree(
+    steps: list[tuple[str, str, Any]], data: st.DataObject
+) -> None:
+    """A tree kept at any moment, with the changes from then or from any moment before it on, is the last tree."""
+    noted: list[tuple[str, Any]] = []
+    there = mirror(note=lambda key, value: noted.append((key, copy.deepcopy(value))))
+    kept = []
+    for do, key, value in [("", "", None), *steps]:
+        if do == "set":
+            put(there, key, copy.deepcopy(value), HOST)
+        elif do == "delete":
+            there.delete(key)
+        kept.append((len(noted), copy.deepcopy(there.tree)))
+    count, tree = data.draw(st.sampled_from(kept))
+    first = data.draw(st.integers(0, count))
+    again = mirror(tree, since=noted[first:])
+    assert again.tree == there.tree
+    assert again.weight == there.weight
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
+def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
+    """ROSMaster keeps a value before it finds that it cannot tell those who subscribed: the mirror has it, too."""
+    steps: list[Any] = [["/q", {"b": 1, "b/c": 2}], ["/", 7], ["/r", 3]]
+    answered = subprocess.run(
+        [PYTHON, "-c", WHOLE, json.dumps(steps)], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    codes, tree = json.loads(answered.splitlines()[-1])
+    assert codes[:2] == [-1, -1]
+
+    class Failing(OrderedServer):
+        """ROSMaster with the answers that the real one gave."""
+
+        async def call_in_order(self, calls: Any) -> list[Any]:
+            keys = [key for key, _ in steps]
+            return [[codes[keys.index(params[1])], method, 0] for method, params in calls]
+
+    server = Failing(mirror())
+    calls = [("setParam", key, copy.deepcopy(value)) for key, value in steps]
+    if together:
+        ordered(server, *calls)
+    else:
+        peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
+        for _method, *arguments in calls:
+            asyncio.run(set_param(server, Caller(peer, "/me", 0), tuple(arguments)))  # type: ignore[arg-type]  # same
+    assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
+    assert server.parameters.weight == measure(server.parameters.tree)[0]

@@ -1,0 +1,342 @@
+"""The way of a request through the pipeline, with stand-ins for ROSMaster and the audit log."""
+
+import asyncio
+import copy
+import ipaddress
+import threading
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from appliance.master.calls.gate import Gate, HostLimits
+from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls import pipeline
+from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.registry import Registry
+from appliance.policy import compile_policy
+from appliance.policy.model import Decision
+from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
+from appliance.rpc.server import HttpRequest, Peer
+from appliance.shares.pool import Standing
+from tests.support.parameters import mirror, put
+
+HOST = ipaddress.ip_address("10.0.0.9")
+
+ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
+THIRD = "10.0.0.7"
+OFFLOAD = 256 << 10
+POLICY = """
+[Groups]
+ocu = 10.0.0.5
+adm = 10.0.0.9
+[Nodes]
+default = *
+[Commands]
+default = *
+[Parameters]
+"""
+LIMITED = """
+read default   = *
+write default  = adm
+write /arm/**  = adm ocu
+write /arm/max = adm
+"""
+
+
+class Anything:
+    """Takes every call; an awaited one is done at once."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given, **_named: None
+
+
+class Records:
+    """The recorder: decisions as (call, resource, decision), events by name."""
+
+    def __init__(self) -> None:
+        self.strict = False
+        self.obstacle: str | None = None
+        self.debt = ""
+        self.meter = Anything()
+        self.decisions: list[tuple[str, str, Decision]] = []
+        self.events: list[str] = []
+
+    def shut_out(self, _host: str) -> str:
+        """As `Recorder`."""
+        return ""
+
+    def owing(self, _host: str) -> str:
+        """As `Recorder`."""
+        return self.debt
+
+    def decided(
+        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **_more: Any
+    ) -> str:
+        """As `Recorder`."""
+        self.decisions.append((method, resource, decision))
+        return "id"
+
+    def happened(self, event: str, _reason: str, **_more: Any) -> str:
+        """As `Recorder`."""
+        self.events.append(event)
+        return "id"
+
+
+class Site:
+    """A pipeline that serves, the ROSMaster behind it (whose calls wait for `go`), and what is recorded."""
+
+    def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
+        self.policy_text = POLICY + rules
+        policy = compile_policy(self.policy_text, file="test.ini")
+        self.policy = lambda: policy
+        self.gate = Gate(self.policy, Registry(Anything()), HostLimits())
+        self.recorder = Records()
+        self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
+        self.there = mirror(copy.deepcopy(tree or {}))
+        self.rosmaster = self
+        self.graph = Anything()
+        self.addresses = self
+        self.arrived: list[str] = []
+        self.go = asyncio.Event()
+        self.go.set()
+        served = Pipeline(self, limits=Limits(), offload=OFFLOAD, standing=lambda _host: Standing.REGISTERED)  # type: ignore[arg-type]  # stands for the master
+        self.serve = served.handler(MASTER_CALLS)
+
+    async def learn(self, _peer: Peer) -> None:
+        """As `Addresses`."""
+
+    @property
+    def reachable(self) -> bool:
+        """ROSMaster is not: a test's calls get to it, or wait for it."""
+        return False
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """ROSMaster: one call."""
+        return (await self.call_in_order([(method, params)]))[0]
+
+    async def call_in_order(self, calls: Any) -> list[Any]:
+        """ROSMaster: several calls as one."""
+        self.arrived += [f"{method} {params[1]}" for method, params in calls]
+        await self.go.wait()
+        return [self._done(method, *params[1:]) for method, params in calls]
+
+    def _done(self, method: str, key: str, *value: Any) -> Any:
+        if method == "setParam":
+            put(self.there, key, copy.deepcopy(value[0]), HOST)
+            return [1, "set", 0]
+        if method == "deleteParam":
+            self.there.delete(key)
+            return [1, "deleted", 0]
+        node: Any = self.there.tree
+        for part in key.split("/"):
+            node = node.get(part) if part and isinstance(node, dict) else node
+        return [1, "there", copy.deepcopy(node)]
+
+    async def ask(self, host: str, method: str, *params: Value) -> Any:
+        """One call of a host, as it is answered."""
+        peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
+        return parse_response(await self.serve(HttpRequest(peer, "/", build_call(method, params), 0)))
+
+
+def part(method: str, *params: Value) -> Value:
+    """A part of a multicall."""
+    return {"methodName": method, "params": ["/me", *params]}
+
+
+def play(scene: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a scene, which may not take for ever."""
+    asyncio.run(asyncio.wait_for(scene(), 20))
+
+
+async def others() -> None:
+    """Let all others go as far as they can."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
+def test_a_value_that_is_being_set_is_not_replaced_from_below(together: bool) -> None:
+    """Who writes below a key that is on its way to ROSMaster is decided when it is there."""
+
+    async def scene() -> None:
+        site = Site()
+        site.go.clear()
+        setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
+        await others()
+        wanted: list[Value] = [part("hasParam", "/arm/max"), part("setParam", "/arm/max/x", 0)]
+        below = asyncio.create_task(
+            site.ask(OPERATOR, "system.multicall", wanted)
+            if together
+            else site.ask(OPERATOR, "setParam", "/me", "/arm/max/x", 0)
+        )
+        elsewhere = asyncio.create_task(site.ask(OPERATOR, "setParam", "/me", "/arm/min", 1))
+        await others()
+        assert site.arrived == ["setParam /arm/max", "setParam /arm/min"]
+        site.go.set()
+        answer = await below
+        assert (answer[1][0] if together else answer)[0] == 0
+        assert (await setting)[0] == (await elsewhere)[0] == 1
+        assert site.there.tree == site.parameters.tree == {"arm": {"max": 5, "min": 1}}
+        assert [one.allowed for _, _, one in site.recorder.decisions].count(False) == 1
+
+    play(scene)
+
+
+def test_what_is_denied_anyway_waits_for_nobody() -> None:
+    """A write that its host may not make is answered at once, and holds up no other write."""
+
+    async def scene() -> None:
+        site = Site()
+        site.go.clear()
+        setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
+        await others()
+        assert (await site.ask(OPERATOR, "deleteParam", "/me", "/"))[0] == 0
+        [answer] = await site.ask(OPERATOR, "system.multicall", [part("setParam", "/", {"a": 1})])
+        assert answer[0][0] == 0
+        assert len(site.recorder.decisions) == 3
+        site.go.set()
+        assert (await setting)[0] == 1
+
+    play(scene)
+
+
+def test_parts_are_decided_and_answered_in_their_places() -> None:
+    """Of a run of parameter calls each part has its answer, whether it was carried out, denied or not understood."""
+
+    async def scene() -> None:
+        site = Site()
+        answers = await site.ask(
+            OPERATOR,
+            "system.multicall",
+            [
+                part("setParam", "/arm/a", 1),
+                part("setParam", "/leg", 1),
+                part("setParam", "bad key!?", 1),
+                part("hasParam", "/arm/a"),
+                part("deleteParam", "/arm/a"),
+            ],
+        )
+        assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
+        assert "[Parameters] write default" in answers[1][0][1]
+        assert site.there.tree == site.parameters.tree == {"arm": {}}
+        assert [resource.allowed for _, _, resource in site.recorder.decisions] == [False, True, True, True]
+
+    play(scene)
+
+
+def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
+    """ROSMaster answers with what it has by then: a namespace is told only to who may read all of it."""
+
+    async def scene() -> None:
+        site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
+        put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not know yet
+        answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
+        assert answer[0] == 0
+        assert "4711" not in str(answer)
+        assert answer[1].endswith("[id]")
+        assert site.recorder.decisions[-1][1:2] == ("/arm",)
+        assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
+
+    play(scene)
+
+
+def test_answers_to_a_multicall_are_bounded_together() -> None:
+    """A small request cannot have the appliance hold many large answers: the rest is refused, and recorded once."""
+
+    async def scene() -> None:
+        site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
+        wanted: list[Value] = [part("getParam", "/arm/model")] * 100
+        answers = await site.ask(OPERATOR, "system.multicall", wanted)
+        assert len(answers) == 100
+        assert [one[0][0] for one in answers[:10]] == [1] * 10
+        assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
+        assert len(site.arrived) == 10
+        assert site.recorder.events == ["limit exceeded"]
+        usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
+        assert [one[0][0] for one in usual] == [1] * 100
+
+    play(scene)
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
+def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
+    """However often a host asks for all parameters, it is one large answer at a time; others are not held up by it."""
+
+    async def scene() -> None:
+        site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
+
+        async def dump(host: str) -> None:
+            if together:
+                [answer] = await site.ask(host, "system.multicall", [part("getParam", "/arm")])
+            else:
+                answer = [await site.ask(host, "getParam", "/me", "arm/")]
+            assert answer[0][0] == 1
+
+        site.go.clear()
+        dumps = [asyncio.create_task(dump(host)) for host in [OPERATOR] * 5 + [ADMIN, THIRD]]
+        small = asyncio.create_task(site.ask(OPERATOR, "getParam", "/me", "/leg"))
+        await others()
+        assert site.arrived == ["getParam /arm", "getParam /arm", "getParam /leg"]
+        site.go.set()
+        assert (await small)[2] == 1
+        await asyncio.gather(*dumps)
+        assert site.arrived.count("getParam /arm") == 7
+
+    play(scene)
+
+
+def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The event loop goes on meanwhile; what is small is not worth a thread."""
+    threads: list[tuple[str, bool]] = []
+
+    def observed(name: str) -> None:
+        real = getattr(pipeline, name)
+
+        def observe(*arguments: Any) -> Any:
+            threads.append((name, threading.current_thread() is threading.main_thread()))
+            return real(*arguments)
+
+        monkeypatch.setattr(pipeline, name, observe)
+
+    async def scene() -> None:
+        observed("parse_call")
+        observed("build_response")
+        site = Site(tree={"arm": {"gains": list(range(20_000))}})
+        await site.ask(OPERATOR, "getParam", "/me", "/arm")
+        assert threads == [("parse_call", True), ("build_response", False)]
+        threads.clear()
+        await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
+        assert threads == [("parse_call", False), ("build_response", True)]
+
+    play(scene)
+
+
+@pytest.mark.parametrize(
+    ("tell", "told"),
+    [
+        (
+            "",
+            "10.0.0.5 is not among the hosts that may write the parameter /arm/max, by [Parameters] write /arm/max",
+        ),
+        (
+            "full",
+            "10.0.0.5 is not among the hosts that may write the parameter /arm/max: only adm (10.0.0.9) may, by",
+        ),
+        ("id", "refused [id]"),
+    ],
+)
+def test_a_denied_host_is_told_as_much_as_the_policy_says(tell: str, told: str) -> None:
+    """The answer has what `[Options] tell` lets be told, and the record; the record has the whole reason each time."""
+
+    async def scene() -> None:
+        site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
+        answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
+        assert answer[0] == 0
+        assert answer[1].startswith(told), answer
+        assert answer[1].endswith("[id]")
+        assert "only adm (10.0.0.9) may" in site.recorder.decisions[-1][2].reason
+
+    play(scene)

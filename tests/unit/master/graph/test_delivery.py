@@ -1,0 +1,145 @@
+"""The queues of calls to nodes: their bounds, and what becomes of a call that does not arrive."""
+
+import asyncio
+import ipaddress
+from typing import Any, cast
+
+import pytest
+
+from appliance.master.graph.delivery import Delivery, NodeCall
+from appliance.master.graph.registry import Incarnation
+from appliance.ros.xmlrpc import FaultReceived, Limits, Value
+from appliance.rpc.client import CallFailedError
+from appliance.shares.pool import Bounds, Standing
+from appliance.shares.table import NODE_CALLS_UNDER_WAY
+from tests.support.control_parts import ControlParts
+
+pytestmark = pytest.mark.anyio
+LONG = [f"http://10.0.0.1:{19001 + number}/" for number in range(500)]
+
+
+class Node:
+    """The node that is called: it answers once `answers` is set, and fails while `fails`."""
+
+    def __init__(self) -> None:
+        self.answers = asyncio.Event()
+        self.fails = False
+        self.fault: Exception | None = None
+        self.heard: list[Value] = []
+
+    async def call(self, _method: str, _caller: str, *parameters: Value) -> None:
+        """As `XmlRpcClient`."""
+        await self.answers.wait()
+        if self.fails:
+            raise CallFailedError("it does not answer") from self.fault
+        self.heard.append(parameters[0])
+
+
+class Post:
+    """A delivery to one node, and what could not be delivered."""
+
+    def __init__(self, **bounds: Any) -> None:
+        self.node, self.lost = Node(), list[tuple[str, Value]]()
+        self.delivery = Delivery(
+            timeout=1.0,
+            limits=Limits(),
+            troubled=self._troubled,
+            standing=lambda _host: Standing.REGISTERED,
+            **bounds,
+        )
+        cast(Any, self.delivery).client = lambda _incarnation: self.node
+        self.world = ControlParts()
+        self.incarnation = self.world.node("/n")
+
+    def _troubled(self, incarnation: Incarnation, call: NodeCall, _why: str) -> None:
+        self.lost.append((incarnation.name, call.parameters[0]))
+
+    def node_on(self, host: str, name: str) -> Incarnation:
+        """A node of another host."""
+        node = self.world.node(name)
+        node.host = ipaddress.ip_address(host)
+        return node
+
+    def push(self, *topics: str, publishers: list[str]) -> None:
+        """A list of publishers for each of these topics."""
+        for topic in topics:
+            self.delivery.push(self.incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
+
+
+async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
+    """What waits for a node that stands still has a bound, whatever it is made of; it is told what was dropped."""
+    post = Post(queued=Bounds(100_000, 100_000, 0, 0))
+    post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
+    assert post.delivery.waiting < 8
+    assert len(post.lost) == 50 - post.delivery.waiting
+    post.node.answers.set()
+    await post.world.settle()
+    assert len(post.node.heard) < 8
+    assert post.node.heard[-1] == "/t49"
+    assert post.delivery.weight == 0
+
+
+async def test_a_queue_that_is_dropped_frees_its_room() -> None:
+    """The node is gone: nothing of its queue counts any more."""
+    post = Post()
+    post.push("/a", "/b", publishers=LONG)
+    assert post.delivery.weight > 20_000
+    post.delivery.drop(post.incarnation)
+    assert (post.delivery.weight, post.delivery.waiting) == (0, 0)
+    post.node.answers.set()
+    await post.world.settle()
+
+
+async def test_a_call_that_stays_undelivered_is_reported() -> None:
+    """After the last try whoever looks after the node hears which call is lost."""
+    post = Post(tries=2)
+    post.node.fails = True
+    post.node.answers.set()
+    post.push("/a", publishers=[])
+    await post.world.settle()
+    assert post.lost == [("/n", "/a")]
+
+
+async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
+    """It is not told the same for ever: saying it again later would get the same answer."""
+    post = Post(tries=2)
+    post.node.fails, post.node.fault = True, FaultReceived(1, "not for me")
+    post.node.answers.set()
+    post.push("/a", publishers=[])
+    await post.world.settle()
+    assert post.lost == []
+
+
+async def test_a_host_loses_only_calls_of_its_own() -> None:
+    """Many queues of a guest fill the whole: none of the robot's calls goes, though its queue is the longest of all."""
+    post = Post(queued=Bounds(400_000, 400_000, 0, 0))
+    post.push("/a", "/b", publishers=LONG)
+    for number in range(200):
+        guest = post.node_on("10.0.0.66", f"/guest_{number}")
+        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", list[Value](LONG[:100]))))
+    assert post.delivery.weight <= 400_000
+    assert post.lost
+    assert {name.partition("_")[0] for name, _topic in post.lost} == {"/guest"}
+    post.node.answers.set()
+    await post.world.settle()
+    assert {"/a", "/b"} <= set(post.node.heard)
+
+
+async def test_silent_nodes_of_a_host_delay_no_call_to_anothers() -> None:
+    """All that a guest may have under way waits for its nodes; the robot's node hears what it is told at once."""
+    post = Post()
+    robot = Node()
+    robot.answers.set()
+    cast(Any, post.delivery).client = lambda incarnation: robot if incarnation.name == "/robot" else post.node
+    for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
+        guest = post.node_on("10.0.0.66", f"/guest_{number}")
+        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", [])))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    post.delivery.push(post.node_on("10.0.0.5", "/robot"), NodeCall("publisherUpdate", ("/t", [])))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert robot.heard == ["/t"]
+    assert not post.node.heard
+    post.node.answers.set()
+    await post.world.settle()

@@ -1,0 +1,146 @@
+"""The registry's invariants under any sequence of changes, beside what can be counted naively."""
+
+import ipaddress
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
+from appliance.ros.uris import parse_node_uri
+
+HOSTS = [ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")]
+STEP = st.tuples(
+    st.sampled_from(["register", "register", "unregister", "replace", "overshadow", "revive", "forget"]),
+    st.integers(0, 5),
+    st.sampled_from(list(Kind)),
+    st.sampled_from(["/x", "/y"]),
+)
+
+
+class Journal:
+    """Nothing is kept."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_arguments: None
+
+
+def incarnation(number: int) -> Incarnation:
+    """One of two of a name."""
+    api = f"http://h:{40000 + number}/"
+    return Incarnation(
+        new_key(), f"/n{number % 3}", HOSTS[number % 2], parse_node_uri(api), api, "10.0.0.9", 1, 2
+    )
+
+
+@settings(deadline=None, max_examples=300)
+@given(steps=st.lists(STEP, max_size=40))
+def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
+    """One live incarnation a name; shadows count for nobody; the indexes are what a look at everything finds."""
+    registry = Registry(Journal())
+    known = [incarnation(number) for number in range(6)]
+    for one in known:
+        registry.add(one)
+    for do, number, kind, resource in steps:
+        one = known[number]
+        if registry.by_key(one.key) is None or one.life is Life.REPLACED:
+            continue
+        match do:
+            case "register":
+                holder = registry.holder(one.name)
+                if holder is not None and holder is not one:  # as `Graph.registered` does
+                    registry.replace(holder, 1.0)
+                registry.register(one, kind, resource, "t")
+            case "unregister":
+                registry.unregister(one, kind, resource)
+            case "replace" if one.life is Life.LIVE:
+                registry.replace(one, 1.0)
+            case "overshadow" if one.life is Life.LIVE and one.registrations:
+                registry.overshadow(one, 1.0)
+            case "revive" if one.life is Life.SHADOW and registry.holder(one.name) is None:
+                registry.revive(one, 2.0)
+            case "forget":
+                registry.forget(one)
+        check(registry, known)
+
+
+def check(registry: Registry, known: list[Incarnation]) -> None:
+    """Compare every question the registry answers with a look at all incarnations."""
+    there = [one for one in known if registry.by_key(one.key) is one]
+    assert registry.all() == there
+    holding = [one for one in there if one.life is Life.LIVE and one.registrations]
+    assert len({one.name for one in holding}) == len(holding)
+    for one in holding:
+        assert registry.holder(one.name) is one
+    for kind in Kind:
+        for resource in ("/x", "/y"):
+            expected = {one.key for one in holding if (kind, resource) in one.registrations}
+            assert {one.key for one in registry.registered(kind, resource)} == expected
+    for host in HOSTS:
+        mine = [one for one in there if one.host == host]
+        assert registry.nodes_of(host) == len(mine)
+        assert registry.registrations_of(host) == sum(len(one.registrations) for one in mine)
+    pairs: list[tuple[Incarnation, Registration]] = list(registry.in_order())
+    orders = [registration.order for _, registration in pairs]
+    assert orders == sorted(set(orders))
+    assert {one.key for one, _ in pairs} == {one.key for one in holding}
+
+
+def test_the_one_that_was_lost_first_makes_room() -> None:
+    """Of a host's nodes that are gone, the one that went first is dropped first; a live one never is."""
+    registry = Registry(Journal())
+    known = [incarnation(number) for number in (0, 2, 4)]
+    for one in known:
+        registry.add(one)
+        registry.register(one, Kind.PUBLICATION, "/x", "t")
+    assert registry.spare_of(HOSTS[0]) is None
+    registry.overshadow(known[2], 5.0)
+    registry.overshadow(known[1], 7.0)
+    assert registry.spare_of(HOSTS[0]) is known[2]
+    assert registry.spare_of(HOSTS[1]) is None
+
+
+def test_who_has_nothing_makes_room_first() -> None:
+    """A node that gave up all it had goes before one that is lost, and for other hosts, too; not one that asks now."""
+    registry = Registry(Journal())
+    lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
+    for one in (lost, idle, busy):
+        registry.add(one)
+        registry.register(one, Kind.PUBLICATION, "/x", "t")
+    registry.overshadow(lost, 5.0)
+    assert registry.spare(HOSTS[1]) is None
+    for one in (idle, busy):
+        registry.unregister(one, Kind.PUBLICATION, "/x")
+    busy.calls = 1
+    assert registry.spare_of(HOSTS[0]) is idle
+    assert registry.spare(HOSTS[1]) is idle
+    registry.forget(idle)
+    assert registry.spare(HOSTS[1]) is None
+    assert registry.spare(HOSTS[0]) is lost
+    busy.calls = 0
+    assert registry.spare(HOSTS[1]) is busy
+
+
+def test_forgetting_one_life_leaves_the_next_findable() -> None:
+    """Two incarnations of one identity (name, host and URI again): the later one is found when the first is dropped."""
+    registry = Registry(Journal())
+    first, second = incarnation(0), incarnation(0)
+    registry.add(first)
+    registry.replace(first, 1.0)
+    registry.add(second)
+    registry.forget(first)
+    assert registry.find(second.name, second.host, second.api_text) is second
+    registry.forget(second)
+    assert registry.find(second.name, second.host, second.api_text) is None
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_name_is_restored_to_the_one_that_has_something(order: tuple[int, int]) -> None:
+    """An idle life of a node, kept as live beside the one that has its name, does not take it at a restart."""
+    known = [incarnation(0), incarnation(3)]
+    known[1].registrations[Kind.PUBLICATION, "/x"] = Registration(Kind.PUBLICATION, "/x", "t", 1)
+    registry = Registry(Journal())
+    for number in order:
+        registry.restore(known[number])
+    assert registry.holder("/n0") is known[1]

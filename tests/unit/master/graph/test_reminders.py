@@ -1,0 +1,76 @@
+"""Subscribers that do not come back to a new relay are told again."""
+
+import asyncio
+import ipaddress
+from typing import Any, cast
+
+import pytest
+
+from appliance.master.graph import reminders
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.reminders import Reminders
+from appliance.ros.uris import parse_node_uri
+from appliance.store.state import PermissionRow
+
+HOST = ipaddress.ip_address("10.0.0.5")
+
+
+class NoJournal:
+    """Nothing is written down."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given: None
+
+
+class Told:
+    """Counts the reminders; the relay's side says who is absent for how many looks."""
+
+    def __init__(self, row: PermissionRow, absent_for: int) -> None:
+        self.row, self.absent_for = row, absent_for
+        self.reminded: list[tuple[str, str]] = []
+        self.renewed: list[tuple[str, str, list[str]]] = []
+
+    def unconnected(self) -> list[PermissionRow]:
+        """As `RelayControl`."""
+        self.absent_for -= 1
+        return [self.row] if self.absent_for >= 0 else []
+
+    def remind(self, subscriber: Incarnation, topic: str) -> None:
+        """As `Graph`."""
+        self.reminded.append((subscriber.name, topic))
+
+    def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
+        """As `Graph`."""
+        self.renewed.append((subscriber.name, topic, [one.key for one in absent]))
+
+
+def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
+    """A live subscriber or publisher of /chatter."""
+    uri = "http://10.0.0.5:4000/"
+    node = Incarnation(f"key of {name}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
+    registry.add(node)
+    registry.register(node, kind, "/chatter", "std_msgs/String")
+    return node
+
+
+@pytest.mark.parametrize(("absent_for", "reminded", "renewed"), [(0, 0, 0), (2, 2, 0), (99, 2, 6)])
+def test_reminded_until_back(
+    monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
+) -> None:
+    """Nobody is told who is back; who stays away is told to take the publisher anew, and nobody for ever."""
+    monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
+    registry = Registry(NoJournal())
+    node(registry, "/ear", Kind.SUBSCRIPTION)
+    node(registry, "/other", Kind.SUBSCRIPTION)
+    node(registry, "/mouth", Kind.PUBLICATION)
+    told = Told(PermissionRow("key of /mouth", "topic", "/chatter", str(HOST), "/ear"), absent_for)
+
+    async def run() -> None:
+        looks = Reminders(registry, cast(Any, told), cast(Any, told))
+        looks.begin()
+        assert looks._round is not None
+        await looks._round
+
+    asyncio.run(run())
+    assert told.reminded == [("/ear", "/chatter")] * reminded
+    assert told.renewed == [("/ear", "/chatter", ["key of /mouth"])] * renewed

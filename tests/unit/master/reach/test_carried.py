@@ -1,0 +1,48 @@
+"""What becomes of a relay's reports of refused connections."""
+
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit.record import Severity
+from appliance.channel.messages import ConnectionRefused
+from appliance.master.reach.carried import Carried
+
+
+class Kept:
+    """A recorder that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.records: list[dict[str, Any]] = []
+
+    def happened(self, event: str, reason: str, **fields: Any) -> None:
+        """As the recorder has it."""
+        self.records.append({"event": event, "reason": reason, **fields})
+
+
+@pytest.mark.parametrize(
+    ("host", "topic", "attack"),
+    [("10.0.0.2", "/rosout", False), ("10.0.0.2", "/camera", True), ("10.0.0.66", "/rosout", True)],
+)
+def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, attack: bool) -> None:
+    """rosout connects to a node that has gone meanwhile: no denial. Others in its name are denied."""
+    kept = Kept()
+    told = Carried(
+        cast(Any, kept),
+        lambda _key: "/talker",
+        1,
+        is_own=lambda *asked: asked == ("10.0.0.2", "/rosout", "/rosout"),
+    )
+    told.refused(ConnectionRefused("k", "topic", topic, host, "/rosout", "[/talker] is not a publisher", 1))
+    (record,) = kept.records
+    assert record["decision"] == ("deny" if attack else None)
+    assert record["severity"] is (Severity.WARNING if attack else Severity.INFO)
+    assert (record["category"], record["resource"], record["node"]) == ("topic", topic, "/talker")
+
+
+def test_a_refusal_without_a_name_has_no_category() -> None:
+    """Who says nothing before he is refused has asked for neither a topic nor a service."""
+    kept = Kept()
+    told = Carried(cast(Any, kept), lambda _key: None, 1, is_own=lambda *_: False)
+    told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))
+    assert (kept.records[0]["category"], kept.records[0]["count"]) == (None, 2)

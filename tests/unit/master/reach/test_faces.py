@@ -1,0 +1,36 @@
+"""The faces of incarnations."""
+
+import ipaddress
+from typing import Any, cast
+
+from appliance.master.graph.registry import Incarnation
+from appliance.master.reach.faces import Faces
+from appliance.ros.uris import parse_node_uri
+
+
+class Told:
+    """Stands for whatever a face uses; remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, Any]] = []
+
+    def close(self, *given: Any) -> None:
+        """As a server's, and as the places'."""
+        self.calls.append(("close", given))
+
+
+def test_ports_are_closed_once() -> None:
+    """A replaced node is closed when it is replaced and again when it is forgotten: its ports only the first time.
+
+    In between the ports may have become another node's.
+    """
+    places, server = Told(), Told()
+    faces = cast(Any, Faces.__new__(Faces))
+    faces._places, faces._servers = places, {"key": server}
+    uri = "http://10.0.0.5:4000/"
+    host = ipaddress.ip_address("10.0.0.5")
+    node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
+    faces.close(node)
+    faces.close(node)
+    assert places.calls == [("close", (node,))]
+    assert server.calls == [("close", ())]

@@ -1,0 +1,187 @@
+"""The ports of incarnations: kept over a restart, and not given to another while somebody may knock there."""
+
+import ipaddress
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.master.graph.registry import Incarnation
+from appliance.master.reach.places import NoPortError, Places
+from appliance.policy import compile_policy
+from appliance.policy.model import Address
+from appliance.ros.uris import parse_node_uri
+
+
+@pytest.fixture
+def first() -> Iterator[int]:
+    """The first of eight ports that are free at this moment."""
+    for port in range(40_000, 60_000, 8):
+        probes = [socket.socket() for _ in range(8)]
+        try:
+            for offset, probe in enumerate(probes):
+                probe.bind(("127.0.0.1", port + offset))
+        except OSError:
+            continue
+        finally:
+            for probe in probes:
+                probe.close()
+        yield port
+        return
+    pytest.fail("no eight free ports in a row")
+
+
+def places(first: int, relays: int = 1) -> Places:
+    """Nobody keeps the sockets."""
+    ports = range(first, first + 8)
+    return Places(
+        "127.0.0.1", ports, keep=lambda *_: None, drop=lambda _: None, named_as=NAMING.named_as, relays=relays
+    )
+
+
+class Listening:
+    """Stands for a listening socket: 800 real ones would be others' ports."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def getsockname(self) -> tuple[str, int]:
+        """Where it listens."""
+        return "127.0.0.1", self.port
+
+    def close(self) -> None:
+        """It has no descriptor."""
+
+
+NAMING = compile_policy("[Nodes]\n/** = 10.0.0.1 10.1.0.0/24\n", file="a.ini")
+HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 9)]
+
+
+def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation:
+    """Somebody with these ports."""
+    uri = "http://127.0.0.1:4000/"
+    outer, relay, *more = ports
+    api = parse_node_uri(uri)
+    return Incarnation(
+        "key", "/node", host, api, uri, "127.0.0.1", outer, relay, more_relay_ports=tuple(more)
+    )
+
+
+def test_closed_ports_come_last(first: int) -> None:
+    """Ports that were given back are given out again only after all others."""
+    here = places(first)
+    closed = here.open(HOSTS[0])
+    here.close(incarnation(closed))
+    others = [here.open(host) for host in HOSTS[1:4]]
+    assert closed not in others
+    assert here.open(HOSTS[0]) == closed
+    here.close_unclaimed(set())
+
+
+def test_after_a_restart_too(first: int) -> None:
+    """A restarted control begins after the ports in use: what was closed before the crash is not given out first."""
+    before = places(first)
+    before.open(HOSTS[0])
+    kept = before.open(HOSTS[0])
+    after = places(first)
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    after.close_unclaimed(set(kept))
+    assert after.open(HOSTS[0]) == (first + 4, first + 5)
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
+
+
+def test_a_port_for_every_relay(first: int) -> None:
+    """And the words that say so when there is none left."""
+    here = places(first, relays=3)
+    opened = [here.open(HOSTS[0]), here.open(HOSTS[1])]
+    assert [len(ports) for ports in opened] == [4, 4]
+    here.close(incarnation(opened[0]))
+    assert here.open(HOSTS[0]) == opened[0]
+    with pytest.raises(NoPortError, match="4 per node"):
+        here.open(HOSTS[0])
+    here.close_unclaimed(set())
+
+
+def test_other_relays_after_a_restart_of_the_appliance(first: int) -> None:
+    """A node has as many ports as there are relays now; those it had and needs are the same."""
+    before = places(first, relays=2)
+    node = incarnation(before.open(HOSTS[0]))
+    had = node.ports
+    before.close_unclaimed(set())
+    more = places(first, relays=3)
+    assert more.reopen(node)
+    assert (node.ports[:3], len(set(node.ports))) == (had, 4)
+    more.close_unclaimed(set())
+    fewer = places(first, relays=1)
+    assert fewer.reopen(node)
+    assert node.ports == had[:2]
+    fewer.close_unclaimed(set())
+
+
+def test_a_port_of_another_range_is_not_given_out(first: int) -> None:
+    """What was kept from before the policy had this range is closed, and is nobody's from then on."""
+    before = Places(
+        "127.0.0.1",
+        range(first + 4, first + 8),
+        keep=lambda *_: None,
+        drop=lambda _: None,
+        named_as=NAMING.named_as,
+    )
+    kept = before.open(HOSTS[0])
+    dropped: list[str] = []
+    after = Places(
+        "127.0.0.1",
+        range(first, first + 4),
+        keep=lambda *_: None,
+        drop=dropped.append,
+        named_as=NAMING.named_as,
+    )
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
+    assert dropped == [f"port:{port}" for port in kept]
+    assert [*after.open(HOSTS[0]), *after.open(HOSTS[1])] == [*range(first, first + 4)]
+    with pytest.raises(NoPortError):
+        after.open(HOSTS[0])
+    after.close_unclaimed(set())
+
+
+def test_no_host_takes_all_ports() -> None:
+    """Hosts that take all they can, one after the other, leave some for the next; what is given back counts no more."""
+    ports = range(20_000, 20_800)
+    here = Places(
+        "127.0.0.1", ports, keep=lambda *_: None, drop=lambda _: None, named_as=NAMING.named_as, relays=4
+    )
+    here._listen = lambda: Listening(here._unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    for host in HOSTS[:3]:
+        taken = []
+        with pytest.raises(NoPortError, match=r"3 times as many as are left; widen \[Ports\] range"):
+            while True:
+                taken.append(here.open(host))
+        assert len(taken) >= 3
+    assert here.taken.total <= 800 - 10
+    before = here.taken.held(NAMING.named_as(HOSTS[2]))
+    here.close(incarnation(taken[0], HOSTS[2]))
+    assert here.taken.held(NAMING.named_as(HOSTS[2])) == before - 5
+    assert here.open(HOSTS[3])
+
+
+def test_many_addresses_of_one_network_are_one_host() -> None:
+    """Two hundred guests whom one network of the policy names have three quarters of the ports together."""
+    here = Places(
+        "127.0.0.1", range(20_000, 20_800), keep=lambda *_: None, drop=lambda _: None,
+        named_as=NAMING.named_as, relays=4,
+    )  # fmt: skip
+    here._listen = lambda: Listening(here._unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    refused = ""
+    for number in range(200):
+        try:
+            here.open(ipaddress.ip_address("10.1.0.0") + number)
+        except NoPortError as error:
+            refused = str(error)
+    assert refused.startswith("10.1.0.0/24 has 600 ports (5 per node), and 200 are left")
+    for _ in range(30):
+        here.open(HOSTS[0])

@@ -1,0 +1,306 @@
+"""Each relay is told what it carries, with its own port of each node; what moves takes its grants along."""
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.places import Places
+from appliance.master.reach.relays import RelayControl
+from appliance.policy import Policy, compile_policy
+from appliance.recorder import Recorder
+from appliance.ros.uris import parse_node_uri
+from appliance.shares.pool import Bounds
+from appliance.shares.table import GRANTS
+from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
+from appliance.store.state import StateStore
+
+pytestmark = pytest.mark.anyio
+HOST = ipaddress.ip_address("10.0.0.5")
+
+
+class Nothing:
+    """Takes every call and does nothing: journal, store, recorder, delivery."""
+
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_given, **_named: None
+
+
+class Ports(Nothing):
+    """A socket for each port, told apart by its descriptor."""
+
+    def __init__(self) -> None:
+        self.sockets: dict[int, socket.socket] = {}
+
+    def socket(self, port: int) -> socket.socket:
+        """As `Places`."""
+        if port not in self.sockets:
+            self.sockets[port] = socket.socket()
+        return self.sockets[port]
+
+
+class Link:
+    """A relay's end: what it was told, in order."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
+        self.end: Callable[[], None] = lambda: None
+
+    def attach(self, _loop: Any, received: Any, closed: Callable[[], None]) -> None:
+        """As `Channel`."""
+        self.say, self.end = received, closed
+
+    def send(self, message: messages.Message, descriptors: tuple[int, ...] = ()) -> None:
+        """As `Channel`."""
+        self.told.append((message, descriptors))
+
+    def close(self) -> None:
+        """As `Channel`."""
+
+    def heard(self) -> list[messages.Message]:
+        """What was told since the last time."""
+        told, self.told = [message for message, _descriptors in self.told], []
+        return told
+
+
+def policy(*limits: str) -> Policy:
+    """A policy with these limits."""
+    return compile_policy("\n".join(["[Limits]", *limits]), file="p.ini")
+
+
+class World:
+    """Two relays; /left and the service /serve belong to the first, /right to the second."""
+
+    def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
+        self.records: list[tuple[str, str, dict[str, Any]]] = []
+        self.registry = Registry(cast(Any, Nothing()))
+        self.allocation = Allocation(2)
+        self.policy = policy()
+        self.put(left=0, right=1)
+        self.ports = Ports()
+        self.relay = RelayControl(
+            self.registry,
+            cast(Places, self.ports),
+            cast(StateStore, Nothing()),
+            cast(Delivery, Nothing()),
+            cast(Recorder, self),
+            allocation=self.allocation,
+            policy=lambda: self.policy,
+            broken=lambda _incarnation: None,
+            grants=grants,
+        )
+        uri = "http://10.0.0.5:4000/"
+        self.node = Incarnation(
+            "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
+        )
+        self.registry.add(self.node)
+        self.links = [Link(), Link()]
+        for index, link in enumerate(self.links):
+            self.relay.attach(index, cast(Channel, link))
+        for kind, name, detail in (
+            (Kind.PUBLICATION, "/left", "std_msgs/String"),
+            (Kind.PUBLICATION, "/right", "std_msgs/String"),
+            (Kind.SERVICE, "/serve", "4001"),
+        ):
+            self.registry.register(self.node, kind, name, detail)
+            self.relay.placed(self.node, kind, name, detail)
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """As `Recorder`."""
+        self.records.append((event, reason, fields))
+        return ""
+
+    def put(self, **topics: int) -> None:
+        """These topics belong to these relays."""
+        resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
+        self.allocation.adopt(Plan({}, {**resources, (SERVICE, "/serve"): 0}))
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for one in self.ports.sockets.values():
+            one.close()
+
+
+async def test_each_relay_is_told_what_it_carries() -> None:
+    """With its own port of the node; so are grants, withdrawals and what a relay is told that comes anew."""
+    world = World()
+    relay, node, (first, second) = world.relay, world.node, world.links
+    placed = messages.NodePlaced("key", "/node", "10.0.0.5")
+    assert (placed, (world.ports.socket(2).fileno(),)) in first.told
+    assert (placed, (world.ports.socket(3).fileno(),)) in second.told
+    assert messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001) in first.heard()
+    assert messages.PublicationPlaced("key", "/right", "std_msgs/String") == second.heard()[-1]
+    assert [relay.port(node, Kind.PUBLICATION, name) for name in ("/left", "/right")] == [2, 3]
+    assert relay.port(node, Kind.SERVICE, "/serve") == 2
+    relay.grant_topic(node, "/right", HOST, "/ear")
+    grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
+    assert (first.heard(), second.heard()) == ([], [grant])
+    again = Link()
+    relay.attach(1, cast(Channel, again))
+    assert again.heard() == [
+        messages.StateBegan(2), placed, messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
+        messages.StateEnded(2),
+    ]  # fmt: skip
+    relay.withdrawn(node, Kind.PUBLICATION, "/left")
+    assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
+    relay.node_withdrawn(node)
+    assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
+    world.close()
+
+
+async def test_a_topic_moves_with_its_grants() -> None:
+    """Withdrawn by the old allocation, placed by the new one; other topics are not touched."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_topic(world.node, "/right", HOST, "/ear")
+    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    for link in world.links:
+        link.heard()
+    moves = [Move(TOPIC, "/right", 1, 0)]
+    relay.withdraw_moving(moves)
+    world.put(left=0, right=0)
+    relay.place_moved(moves)
+    assert second.heard() == [
+        messages.PublicationWithdrawn("key", "/right"),
+        messages.GrantRevoked("key", "/right", "10.0.0.5", "/ear"),
+    ]
+    assert first.heard() == [
+        messages.PublicationPlaced("key", "/right", "std_msgs/String"),
+        messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
+    ]
+    assert relay.port(world.node, Kind.PUBLICATION, "/right") == 2
+    world.close()
+
+
+async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -> None:
+    """Not on the relay it came from either, should the topic come back to it; so it is with a service."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_service(world.node, "/serve", HOST, "/c")
+    first.heard()
+    away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
+    relay.withdraw_moving(away)
+    assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
+    world.allocation.adopt(Plan({}, {(SERVICE, "/serve"): 1}))
+    relay.place_moved(away)
+    relay.revoke(relay.permissions()[0])
+    assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
+    relay.withdraw_moving(back)
+    world.put()
+    relay.place_moved(back)
+    assert first.heard() == [messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001)]
+    world.close()
+
+
+async def test_one_relay_goes_and_its_connections_with_it() -> None:
+    """Numbers of connections are each relay's own; who is asked after them gets numbers that differ."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    for link, topic in ((first, "/left"), (second, "/right")):
+        link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
+    assert len({one.number for one in relay.connections.values()}) == 2
+    lost: list[int] = []
+    relay.lost = lost.append
+    second.end()
+    assert [one.resource for one in relay.connections.values()] == ["/left"]
+    assert (lost, relay.presence) == ([1], "1 of 2 are away")
+    first.end()
+    assert relay.presence == "away"
+    world.close()
+
+
+async def test_a_publisher_that_is_cut_for_what_it_sent_is_recorded() -> None:
+    """With its address and name, as a denial that is folded; one whose connection only broke is not."""
+    world = World()
+    say = world.links[0].say
+    say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
+    assert world.records == []
+    say(messages.UpstreamLost("key", "/left", "a message of 1 GiB is declared", "limit exceeded"), ())
+    ((event, reason, fields),) = world.records
+    assert (event, reason) == ("limit exceeded", "a message of 1 GiB is declared")
+    assert (fields["host"], fields["caller_id"], fields["resource"]) == ("10.0.0.5", "/node", "/left")
+    assert fields["decision"] == "deny"
+    say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
+    assert len(world.records) == 1
+    world.close()
+
+
+async def test_what_a_relay_could_not_tell_is_said() -> None:
+    """Connections that nobody recorded, and traffic of the seconds without control as the rate that it was."""
+    world = World()
+    row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
+    world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
+    assert world.relay.traffic["key", "/left"].messages_per_second == 10
+    ((event, reason, fields),) = world.records
+    assert (event, fields["lost"]) == ("records lost", 7)
+    assert "7 connections" in reason
+    world.close()
+
+
+async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change() -> None:
+    """With publications and grants, to the relay that carries the topic; what has not changed is not said again."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+    relay.grant_topic(world.node, "/right", HOST, "/ear")
+    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    first.heard()
+    second.heard()
+    line = "/right = publisher 10.0.0.5 30 Hz, topic 1 MB/s, subscriber 5 Hz"
+    before, world.policy = world.policy, policy(line)
+    relay.policy_changed(before, world.policy)
+    placed = messages.PublicationPlaced(
+        "key", "/right", "std_msgs/String", messages.FlowLimit(30), messages.FlowLimit(bytes=1e6)
+    )
+    grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", messages.FlowLimit(5))
+    assert (first.heard(), second.heard()) == ([], [placed, grant])
+    relay.policy_changed(world.policy, policy(line))
+    assert second.heard() == []
+    relay.attach(1, cast(Channel, second))
+    told = second.heard()
+    assert placed in told
+    assert grant in told
+    before, world.policy = world.policy, policy()
+    relay.policy_changed(before, world.policy)
+    assert second.heard() == [
+        messages.PublicationPlaced("key", "/right", "std_msgs/String"),
+        messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
+    ]
+    world.close()
+
+
+async def test_what_a_limit_dropped_is_a_record_with_the_limits_line() -> None:
+    """Of publishers a warning, of what is throttled on purpose a note; both are counted."""
+    world = World()
+    world.policy = policy("/left = publisher 30 Hz, subscriber 5 Hz")
+    rows = [
+        messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
+        messages.LimitedRow("key", "/left", "subscriber", "10.0.0.6", "/ear", 3, 30),
+    ]
+    world.links[0].say(messages.MessagesLimited(rows), ())
+    [(event, _reason, one), (_event, _other_reason, other)] = world.records[-2:]
+    assert (event, one["severity"].value, other["severity"].value) == ("rate limited", "warning", "info")
+    assert (str(one["rule"]), one["count"], one["bytes"]) == ("[Limits] /left (p.ini:2)", 7, 70)
+    assert (other["host"], other["caller_id"], other["publisher"]) == ("10.0.0.6", "/ear", "/node")
+    assert world.relay.carried.limited_messages == {("/left", "publisher"): 7, ("/left", "subscriber"): 3}
+    world.close()
+
+
+async def test_grants_of_all_hosts_are_bounded() -> None:
+    """A host at its share, and of all hosts that with most, loses what nobody is connected by; others lose nothing."""
+    world = World(Bounds(whole=100, host=60, strangers=0, kept=0))
+    robot = ipaddress.ip_address("10.0.0.9")
+    world.relay.grant_topic(world.node, "/left", robot, "/ear")
+    for number in range(200):
+        world.relay.grant_topic(world.node, "/left", ipaddress.ip_address("10.1.0.1"), f"/ear{number}")
+        for guest in range(2, 5):
+            address = ipaddress.ip_address(f"10.1.0.{guest}")
+            world.relay.grant_topic(world.node, "/left", address, f"/ear{number}")
+        assert len(world.relay.permissions()) <= 100
+    assert "10.0.0.9" in {row.host for row in world.relay.permissions()}
+    world.close()

@@ -1,0 +1,102 @@
+"""A channel served by the relay's loop."""
+
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, UpstreamWanted
+from appliance.relay.connections.links import Link
+from appliance.relay.loop import Loop
+
+
+class Ends:
+    """A link and its other end."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.loop = Loop()
+        self.received: list[Any] = []
+        self.ended: list[str] = []
+        self.raw = ours
+        self.other = Channel(ours, RelayLink)
+        self.link = Link(self.loop, Channel(theirs, RelayLink), self._take, self.ended.append)
+
+    def _take(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        self.received.append(message)
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """End both."""
+        self.link.close()
+        self.other.close()
+        self.loop.close()
+
+
+def send(sock: socket.socket, count: int) -> None:
+    """So many withdrawals in one piece, as the kernel takes them at once."""
+    bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
+    data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
+    assert sock.send(data) == len(data)
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """Both ends."""
+    ends = Ends()
+    yield ends
+    ends.close()
+
+
+def test_thousands_of_messages_are_carried_out_in_slices_and_in_order(ends: Ends) -> None:
+    """Other sockets have their turn between the slices."""
+    send(ends.raw, 1000)
+    ends.loop.turn(1)
+    assert 0 < len(ends.received) < 1000
+    while len(ends.received) < 1000:
+        ends.loop.turn(1)
+    assert [message.key for message in ends.received] == [str(number) for number in range(1000)]
+
+
+def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
+    """Whoever is to be judged by the grants is judged by the latest."""
+    send(ends.raw, 1000)
+    ends.link.catch_up()
+    assert len(ends.received) == 1000
+
+
+def test_what_was_sent_before_the_end_counts(ends: Ends) -> None:
+    """Then the end is told, once."""
+    send(ends.raw, 600)
+    ends.other.close()
+    for _ in range(4):
+        ends.loop.turn(0.1)
+    assert len(ends.received) == 600
+    assert len(ends.ended) == 1
+
+
+def test_closing_closes_descriptors_that_nobody_took(ends: Ends) -> None:
+    """A replaced control leaves nothing open."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        for number in range(40):
+            ends.other.send(NodePlaced(str(number), "/n", "h"), (listening.fileno(),))
+        before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - of the kernel, not a folder
+        ends.link.close()
+        assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208 - of the kernel, not a folder
+
+
+def test_an_end_that_does_not_read_yet_gets_everything_later(ends: Ends) -> None:
+    """Nothing is lost while the socket is full, and nothing blocks."""
+    for number in range(20_000):
+        ends.link.send(UpstreamWanted(str(number), "/topic"))
+    keys: list[str] = []
+    while len(keys) < 20_000:
+        ends.loop.turn(0.1)
+        keys += [message.key for message, _descriptors in ends.other.receive()]
+    assert keys == [str(number) for number in range(20_000)]

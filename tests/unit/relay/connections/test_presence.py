@@ -1,0 +1,128 @@
+"""Subscribers that their publisher must see by name."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from appliance.relay.connections.memory import Memory
+from appliance.relay.connections.presence import Presences, looks_for_names
+from appliance.relay.context import RelayContext
+from appliance.relay.limits import Limits
+from appliance.relay.loop import Loop
+from appliance.relay.monitors.middle import Middle
+from appliance.relay.report import Reporter
+from appliance.ros.tcpros import HeaderParser
+from appliance.shares.pool import Standing
+
+TOPIC = "/fibonacci/goal"
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    """The relay's loop."""
+    loop = Loop()
+    yield loop
+    loop.close()
+
+
+@pytest.fixture
+def publisher() -> Iterator[socket.socket]:
+    """Where the publisher listens."""
+    with socket.create_server(("127.0.0.1", 0)) as sock:
+        sock.settimeout(0.01)
+        yield sock
+
+
+@pytest.fixture
+def presences(loop: Loop) -> Iterator[Presences]:
+    """The presences of one topic."""
+    limits = Limits()
+    reporter = Reporter(limits)
+    memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
+    scratch = memoryview(bytearray(64))
+    context = RelayContext(loop, limits, reporter, memory, scratch, Middle(loop, reporter))
+    presences = Presences(context, TOPIC)
+    yield presences
+    presences.close()
+
+
+def turn_until(loop: Loop, done: Callable[[], bool]) -> None:
+    """Let the loop turn until something has happened."""
+    deadline = time.monotonic() + 30
+    while not done():
+        assert time.monotonic() < deadline, "it did not happen"
+        loop.turn(0.01)
+
+
+def accept(loop: Loop, publisher: socket.socket) -> tuple[socket.socket, dict[str, str]]:
+    """The next connection at the publisher, and its header."""
+    found: list[tuple[socket.socket, dict[str, str]]] = []
+    parser, connections = HeaderParser(65536), list[socket.socket]()
+
+    def arrived() -> bool:
+        try:
+            if not connections:
+                connections.append(publisher.accept()[0])
+                connections[0].settimeout(0.01)
+            header = parser.feed(connections[0].recv(4096))
+        except TimeoutError:
+            return False
+        if header is not None:
+            found.append((connections[0], header))
+        return bool(found)
+
+    turn_until(loop, arrived)
+    return found[0]
+
+
+def ended(sock: socket.socket) -> bool:
+    """Whether the relay closed the connection."""
+    try:
+        return sock.recv(4096) == b""
+    except TimeoutError:
+        return False
+
+
+def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
+    loop: Loop, presences: Presences, publisher: socket.socket
+) -> None:
+    """One connection a name; the one that is served no longer is closed, the other stays."""
+    address = publisher.getsockname()
+    presences.want(frozenset({"/one", "/other"}), address)
+    seen = dict(
+        sorted((header["callerid"], sock) for sock, header in (accept(loop, publisher) for _ in "ab"))
+    )
+    assert list(seen) == ["/one", "/other"]
+    presences.want(frozenset({"/other"}), address)
+    turn_until(loop, lambda: ended(seen["/one"]))
+    assert not ended(seen["/other"])
+    for sock in seen.values():
+        sock.close()
+
+
+def test_a_presence_that_breaks_is_made_again(
+    loop: Loop, presences: Presences, publisher: socket.socket
+) -> None:
+    """The publisher closes it; it comes back under the same name."""
+    presences.want(frozenset({"/one"}), publisher.getsockname())
+    first, _header = accept(loop, publisher)
+    first.close()
+    second, header = accept(loop, publisher)
+    assert (header["callerid"], header["topic"], header["md5sum"]) == ("/one", TOPIC, "*")
+    second.close()
+
+
+@pytest.mark.parametrize(
+    ("type_name", "named"),
+    [
+        ("actionlib_tutorials/FibonacciActionGoal", True),
+        ("actionlib_msgs/GoalID", True),
+        ("actionlib_msgs/GoalStatusArray", False),
+        ("std_msgs/String", False),
+    ],
+)
+def test_only_the_topics_of_actions_need_names(type_name: str, named: bool) -> None:
+    """Goals and cancellations; nothing else is sent twice."""
+    assert looks_for_names(type_name) is named

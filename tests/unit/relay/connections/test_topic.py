@@ -1,0 +1,480 @@
+"""One relayed topic, told as a story of its publisher and its subscribers."""
+
+import struct
+from collections.abc import Mapping
+
+import pytest
+
+from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.relay.connections.frames import Batch
+from appliance.relay.connections.topic import RelayedTopic
+from tests.support.relay_memory import share
+
+HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
+
+
+def batch(*texts: bytes) -> Batch:
+    """Frames with these bodies."""
+    frames = [struct.pack("<I", len(text)) + text for text in texts]
+    data = b"".join(frames)
+    return Batch(memoryview(data), len(frames), len(data) - len(frames[-1]))
+
+
+class RecordedUpstream:
+    """Writes down what the topic asks of its publisher's connection."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.announced: tuple[list[str], str] = ([], "")
+
+    def want(self) -> None:
+        """Somebody is there."""
+        self.asked.append("want")
+
+    def spare(self) -> None:
+        """Nobody is there."""
+        self.asked.append("spare")
+
+    def pause(self, seconds: float) -> None:
+        """Do not read."""
+        self.asked.append(f"pause {seconds:.2f}")
+
+    def resume(self) -> None:
+        """Read."""
+        self.asked.append("resume")
+
+    def announce(self, names: frozenset[str], type_name: str) -> None:
+        """These are served."""
+        self.announced = (sorted(names), type_name)
+
+    def give_again(self) -> None:
+        """The latched message is wanted once more."""
+        self.asked.append("give again")
+
+
+class RecordedMember:
+    """A subscriber that takes everything until it is told that it is behind."""
+
+    def __init__(self, *, fits: bool = True, caller_id: str = "/listener") -> None:
+        self.caller_id = caller_id
+        self.header: Mapping[str, str] = {}
+        self.received = b""
+        self.missed = False
+        self.behind_since: float | None = None
+        self.was_cut = ""
+        self.trimmed = 0
+        self._fits = fits
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Take the header."""
+        self.header = header
+        return self._fits
+
+    def deliver(self, batch: Batch) -> int:
+        """Take the frames."""
+        self.received += bytes(batch.view)
+        return 0
+
+    @property
+    def full(self) -> bool:
+        """As told."""
+        return self.behind_since is not None
+
+    def trim(self) -> int:
+        """Pretend to drop three."""
+        self.trimmed += 1
+        return 3
+
+    def look(self) -> None:
+        """Nothing is looked at."""
+
+    def cut(self, reason: str) -> None:
+        """Remember why."""
+        self.was_cut = reason
+
+
+class Story:
+    """A topic with a clock that a test sets."""
+
+    def __init__(self, *, memory: int = 1 << 30, fresh: bool = True) -> None:
+        self.now = 100.0
+        self.share = share(memory)
+        self.refused: list[LatchRefused] = []
+        self.limited: list[tuple[str, int, int]] = []
+        self.topic = RelayedTopic(
+            "k",
+            "/chatter",
+            "/talker",
+            "10.0.0.1",
+            grace=0.05,
+            clock=lambda: self.now,
+            share=self.share,
+            fresh=fresh,
+            limited=lambda *row: self.limited.append(row),
+            make_room=lambda _size: None,
+            refused=self.refused.append,
+        )
+        self.upstream = RecordedUpstream()
+        self.topic.upstream = self.upstream
+
+    def receive(self, frames: Batch, late: float = 0.0) -> None:
+        """Frames have come, so long ago."""
+        self.topic.received(frames, self.now - late)
+
+    def join(self, caller_id: str = "/listener") -> RecordedMember:
+        """One more subscriber."""
+        member = RecordedMember(caller_id=caller_id)
+        self.topic.join(member)
+        return member
+
+
+def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_name() -> None:
+    """The publisher is asked for when the first comes; the header names the node, whatever it claims."""
+    story = Story()
+    member = story.join()
+    assert (story.upstream.asked, member.header) == (["want"], {})
+    story.topic.upstream_opened(HEADER)
+    assert member.header == HEADER | {"callerid": "/talker", "topic": "/chatter"}
+
+
+def test_everybody_gets_every_message_in_order() -> None:
+    """From the moment a subscriber is served."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    second = story.join()
+    story.receive(batch(b"2", b"3"))
+    assert first.received == bytes(batch(b"1", b"2", b"3").view)
+    assert second.received == bytes(batch(b"2", b"3").view)
+
+
+def test_what_is_beyond_a_limit_goes_to_no_monitor_and_to_no_subscriber() -> None:
+    """And the last message of a latching publisher goes on later, to both."""
+    story, judged = Story(), []
+    member = story.join()
+    story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # it is told if it is asked
+    story.topic.flow.set(FlowLimit(messages=2), None, story.now)
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    for number in range(4):
+        story.receive(batch(b"%d" % number))
+    assert (member.received, judged) == (bytes(batch(b"0").view), [1])
+    assert story.limited == [("publisher", 1, 5)] * 3
+    story.topic.tidy()
+    assert judged == [1]
+    story.now += 1
+    story.topic.tidy()
+    assert (member.received, judged) == (bytes(batch(b"0", b"3").view), [1, 4])
+    assert story.join().received == bytes(batch(b"3").view)
+
+
+def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
+    """At the next look, and once."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"1"))
+    story.topic.tidy()
+    assert member.received == bytes(batch(b"1").view)
+    member.missed = True
+    story.topic.tidy()
+    assert member.received == bytes(batch(b"1", b"1").view)
+
+
+def test_messages_are_numbered_as_they_come() -> None:
+    """Over batches and over connections: a record says which message of the publication it is about."""
+    story = Story()
+    story.topic.upstream_opened(HEADER)
+    batches = [batch(b"1", b"2"), batch(b"3"), batch(b"4")]
+    for one in batches[:2]:
+        story.receive(one)
+    story.topic.upstream_closed()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batches[2])
+    assert [one.first for one in batches] == [1, 3, 4]
+
+
+def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
+    """Not before."""
+    story = Story()
+    first, second = story.join(), story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.leave(first)
+    assert "spare" not in story.upstream.asked
+    story.topic.leave(second)
+    assert story.upstream.asked[-1] == "spare"
+
+
+def test_a_latched_message_is_given_once_to_each() -> None:
+    """Who triggers the connection gets it from the publisher, who comes later from us; nobody twice."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"old", b"new"))
+    second = story.join()
+    assert first.received == bytes(batch(b"old", b"new").view)
+    assert second.received == bytes(batch(b"new").view)
+
+
+def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
+    """A late subscriber of an ordinary topic starts with the next message."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    assert story.join().received == b""
+
+
+def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
+    """A topic that a monitor wants, with its publisher connected and nobody else."""
+    story = Story(fresh=fresh)
+    story.topic.monitor(lambda batch: batch, wanted=True)
+    story.topic.upstream_opened(HEADER | {"latching": latching})
+    return story
+
+
+def test_what_a_new_publisher_said_first_is_not_lost_to_a_monitor() -> None:
+    """Subscribers on their way get it, without a gap to what follows; nobody twice, and nobody who comes later."""
+    story = monitored()
+    story.receive(batch(b"0"))
+    story.now += 0.2
+    story.receive(batch(b"1"))
+    first = story.join()
+    assert first.received == bytes(batch(b"0", b"1").view)
+    second = story.join("/second")
+    assert second.received == bytes(batch(b"0", b"1").view)
+    story.topic.leave(second)
+    assert story.join("/second").received == b""
+    story.now += 0.9
+    assert story.join("/third").received == b""
+    story.topic.tidy()
+    assert story.share.used == 0
+
+
+@pytest.mark.parametrize("seconds", [0.3, 2.0, 60.0])
+def test_of_a_stream_that_nobody_hears_the_next_subscriber_gets_nothing_old(seconds: float) -> None:
+    """As in plain ROS: what comes from then on. A gun that is started anew acts on no old command."""
+    story = monitored()
+    for _ in range(int(seconds * 20) + 1):
+        story.receive(batch(b"old"))
+        story.now += 0.05
+    assert story.share.used == 0
+    member = story.join()
+    story.receive(batch(b"new"))
+    assert member.received == bytes(batch(b"new").view)
+
+
+@pytest.mark.parametrize("case", ["relay restarted", "connected again", "monitor loaded late", "came back"])
+def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
+    """Only one that has just appeared may have spoken because of the monitor."""
+    story = monitored(fresh=case != "relay restarted") if case != "monitor loaded late" else Story()
+    if case == "connected again":
+        story.topic.upstream_closed()
+        story.topic.upstream_opened(HEADER)
+    elif case == "monitor loaded late":
+        story.now += 6
+        story.topic.monitor(lambda batch: batch, wanted=True)
+        story.topic.upstream_opened(HEADER)
+    elif case == "came back":
+        member = story.join()
+        story.now += 6
+        story.topic.leave(member)
+    story.receive(batch(b"1"))
+    assert story.join("/next").received == b""
+
+
+def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
+    """It is let go at the next look at the counters, though no other message comes."""
+    story = monitored()
+    story.receive(batch(b"1"))
+    story.topic.tidy()
+    assert story.share.used > 0
+    story.now += 1.5
+    story.topic.tidy()
+    assert story.share.used == 0
+
+
+def test_a_latched_message_beyond_the_share_is_passed_on_and_not_kept() -> None:
+    """Control is told once; who comes later gets it from the publisher, as soon as there is room for it."""
+    story = Story(memory=100)
+    early = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.share.add(50)
+    for _ in range(2):
+        story.receive(batch(bytes(60)))
+    assert early.received == 2 * bytes(batch(bytes(60)).view)
+    assert story.refused == [LatchRefused("k", "/chatter", 64)]
+    assert (story.join().received, story.share.used) == (b"", 50)
+    assert "give again" not in story.upstream.asked
+    story.topic.repeat()
+    assert len(story.refused) == 2
+    story.share.add(-50)
+    late = story.join()
+    assert story.upstream.asked.count("give again") == 1
+    story.receive(batch(bytes(60)))
+    assert (late.received, story.share.used) == (bytes(batch(bytes(60)).view), 64)
+    assert story.join().received == late.received
+    story.topic.repeat()
+    assert len(story.refused) == 2
+
+
+def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
+    """The last message of a latched one; the next message of one whose subscriber triggered the connection."""
+    story = monitored(latching="1")
+    story.receive(batch(b"1"))
+    story.receive(batch(b"2"))
+    assert story.join().received == bytes(batch(b"2").view)
+    story = Story()
+    story.topic.monitor(lambda batch: batch, wanted=True)
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    assert story.join().received == b""
+
+
+def test_a_latched_message_is_forgotten_with_the_connection() -> None:
+    """The publisher sends it again when it is reached again; an old one is not made up for it."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"1"))
+    story.receive(batch(b"12"))
+    assert story.share.used == len(batch(b"12").view)
+    story.topic.upstream_closed()
+    assert story.join().received == b""
+    assert story.share.used == 0
+
+
+def test_subscribers_survive_the_loss_of_the_publisher() -> None:
+    """When it is reached again, messages go on on the same connections."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    assert member.was_cut == ""
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    assert member.received == bytes(batch(b"1").view)
+
+
+def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -> None:
+    """They must read the new header before they read a message of it."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    story.topic.upstream_opened(HEADER | {"md5sum": "other"})
+    assert "another type" in member.was_cut
+
+
+def test_an_old_header_is_not_given_once_nobody_stands_on_it() -> None:
+    """Whoever comes when the publisher is lost and its last subscriber gone waits for a new header."""
+    story = Story()
+    first = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.upstream_closed()
+    story.topic.leave(first)
+    late = story.join()
+    assert late.header == {}
+    story.topic.upstream_opened(HEADER | {"md5sum": "other"})
+    assert late.header["md5sum"] == "other"
+
+
+def test_a_subscriber_of_another_type_is_not_served() -> None:
+    """It refuses itself, and gets nothing."""
+    story = Story()
+    member = RecordedMember(fits=False)
+    story.topic.join(member)
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    assert member.received == b""
+
+
+def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
+    """One that keeps up is never delayed by the others; the full one drops."""
+    story = Story()
+    slow, quick = story.join(), story.join()
+    story.topic.upstream_opened(HEADER)
+    slow.behind_since = 100.0
+    story.receive(batch(b"1"))
+    assert (slow.trimmed, quick.trimmed) == (1, 0)
+    quick.behind_since = 100.01
+    story.receive(batch(b"2"))
+    assert story.upstream.asked[-1] == "pause 0.06"
+    story.topic.relieve()
+    assert story.upstream.asked[-1] == "resume"
+
+
+def test_a_stuck_subscriber_is_not_waited_for() -> None:
+    """After the grace the oldest of its messages are dropped and counted, and the publisher is read."""
+    story = Story()
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.traffic()
+    member.behind_since, story.now = 99.0, 100.0
+    story.receive(batch(b"1"))
+    assert member.trimmed == 1
+    assert "pause" not in "".join(story.upstream.asked)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1, [1] + [0] * 10, 0.0)
+
+
+def test_traffic_is_reported_once() -> None:
+    """Nothing new, nothing to report."""
+    story = Story()
+    assert story.topic.traffic() is None
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1", b"22"))
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1, [2] + [0] * 10, 0.0)
+    assert story.topic.traffic() is None
+
+
+def test_a_withdrawn_topic_cuts_who_is_served_and_who_waits() -> None:
+    """Each with the reason."""
+    story = Story()
+    served = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.cut_all("gone")
+    assert served.was_cut == "gone"
+    other = Story()
+    waiting = other.join()
+    other.topic.cut_all("gone")
+    assert waiting.was_cut == "gone"
+
+
+def test_the_upstream_hears_who_is_served() -> None:
+    """By name and type: when a subscriber is served, and when one leaves."""
+    scene = Story()
+    topic, upstream = scene.topic, scene.upstream
+    one, other = RecordedMember(caller_id="/one"), RecordedMember(caller_id="/other")
+    topic.join(one)
+    topic.upstream_opened({"type": "actionlib/TestActionGoal", "md5sum": "*"})
+    topic.join(other)
+    assert upstream.announced == (["/one", "/other"], "actionlib/TestActionGoal")
+    topic.leave(one)
+    assert upstream.announced == (["/other"], "actionlib/TestActionGoal")
+
+
+def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
+    """From receiving a batch to handing it over, for each message that goes on; nobody served, nothing delayed."""
+    story = Story()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"), late=0.003)
+    before = story.topic.traffic()
+    assert before is not None
+    assert before.delays == []
+    story.join()
+    story.topic.monitor(lambda frames: Batch(frames.view[:5], 1, 0), wanted=True)
+    story.receive(batch(b"1", b"2"), late=0.003)
+    story.topic.monitor(None, wanted=False)
+    story.receive(batch(b"1", b"2"), late=9.0)
+    row = story.topic.traffic()
+    assert row is not None
+    assert len(row.delays) == len(DELAY_BOUNDS) + 1
+    assert {
+        bound: count for bound, count in zip([*DELAY_BOUNDS, None], row.delays, strict=True) if count
+    } == {
+        0.005: 1,
+        None: 2,
+    }
+    assert row.delay_seconds == pytest.approx(18.003)

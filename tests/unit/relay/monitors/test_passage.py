@@ -1,0 +1,326 @@
+"""A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
+
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.channel.messages import Message, MonitorRow, SpecificationsStated
+from appliance.relay.connections.frames import FrameReceiver
+from appliance.relay.limits import Limits
+from appliance.relay.loop import Loop
+from appliance.relay.monitors.lane import Lane
+from appliance.relay.monitors.middle import Middle
+from appliance.relay.monitors.places import Place
+from appliance.relay.report import Reporter
+from appliance.ros.definitions import Definitions
+from appliance.rosmop.batch import Walked
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.logics.interface import FiniteRun
+from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.relay_memory import share
+from tests.unit.rosmop.acting import message
+from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
+
+MONITORS = Path(__file__).parents[4] / "monitors"
+
+
+class Heard(Reporter):
+    """Keeps what would be sent."""
+
+    def __init__(self) -> None:
+        super().__init__(Limits())
+        self.messages: list[Message] = []
+
+    @property
+    def attached(self) -> bool:
+        """There is a control."""
+        return True
+
+    def send(self, told: Message) -> None:
+        """Keep it."""
+        self.messages.append(told)
+
+
+class Monitored:
+    """Monitors in the middle, with a clock that is set, with or without the loops that take messages together."""
+
+    def __init__(
+        self, texts: dict[str, str], known: Definitions, *, together: bool, on_fault: Any = "drop"
+    ) -> None:
+        self.heard = Heard()
+        self.time = 1_000_000_000
+        self._loop = Loop()
+        self.middle = Middle(self._loop, self.heard)
+        self.middle.now = lambda: self.time  # type: ignore[method-assign]
+        self._lanes: dict[str, Lane] = {}
+        self.set = MonitorSet.load(texts, known, on_fault)
+        if together:
+            self.set.write_loops()
+        self.middle._compiled(SpecificationsStated(1, [], {}, {}, restarted=False), self.set)
+
+    def close(self) -> None:
+        """End."""
+        self.middle.close()
+        self._loop.close()
+
+    def through(self, traffic: Traffic, first: int = 1) -> tuple[int, bytes, bytes]:
+        """What is left of the messages: how many, all of them, the last."""
+        receiver = FrameReceiver(memoryview(bytearray(1 << 20)), 1 << 20, share(1 << 30))
+        receiver.buffer()[: len(traffic.frames)] = traffic.frames
+        batch = receiver.received(len(traffic.frames))
+        assert batch is not None
+        assert batch.messages == traffic.messages
+        batch.first = first
+        lane = self._lanes.setdefault(
+            traffic.topic, self.middle.lane(Place("key", traffic.topic, "10.0.0.7", "/talker"))
+        )
+        left = lane.through(batch)
+        if left is None:
+            return 0, b"", b""
+        return left.messages, bytes(left.view), bytes(left.keep_last().view)
+
+    def told(self) -> list[str]:
+        """Everything that was sent to control, the counts of a second in a fixed order."""
+        self.middle.tick()
+        self.middle.observations._flush()
+        told = sorted(repr(one) for one in self._events())
+        self.heard.messages.clear()
+        return told
+
+    def _events(self) -> Iterable[object]:
+        for one in self.heard.messages:
+            yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
+
+    def rows(self) -> list[MonitorRow]:
+        """The counters."""
+        return self.middle.telling.rows(self.set.monitors, self.middle.now())
+
+    def state(self) -> list[object]:
+        """Variables, states of properties, what is due."""
+        state: list[object] = [self.set.next_due]
+        for monitor in self.set.monitors:
+            state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
+            names = self.set._compiled.namespace
+            state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
+            state += [one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun)]
+            state += [one.run.deadline for one in monitor.properties]
+        return state
+
+
+def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
+          switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
+    """The same traffic both ways; fails at the first difference."""
+    ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
+    try:
+        for number, traffic in enumerate(all_traffic):
+            for way in ways:
+                way.time += 700_000
+                if switched is not None and number in (switched[0], switched[0] + 3):
+                    way.middle.switch(switched[1], number != switched[0])
+            one, together = (way.through(traffic) for way in ways)
+            assert one == together, f"batch {number} of {traffic.topic}"
+            one_state, state = (way.state() for way in ways)
+            assert one_state == state, f"after batch {number} of {traffic.topic}"
+            if number % 4 == 3:
+                one_told, told = (way.told() for way in ways)
+                assert one_told == told
+        one_told, told = (way.told() for way in ways)
+        assert one_told == told
+        assert ways[0].rows() == ways[1].rows()
+    finally:
+        for way in ways:
+            way.close()
+    return ways[1]
+
+
+def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
+    """Specifications that are right, and what comes."""
+    texts = Specifications(seed).texts()
+    messages = Messages(seed)
+    return {f"{number}.rv": text for number, text in enumerate(texts)}, [
+        messages.traffic() for _ in range(12)
+    ]
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@given(st.integers(0, 1 << 40))
+def test_random_monitors_do_the_same_together(seed: int) -> None:
+    """Whatever monitors do, a batch taken together is what its messages are one by one."""
+    texts, traffic = random_case(seed)
+    try:
+        agree(texts, definitions(), traffic, ("drop", "pass")[seed % 2], (2, "s1") if seed % 3 == 0 else None)
+    except SpecificationError:
+        return
+
+
+HARD = {
+    "two specifications, the second gives up": """
+        first() { int n = 0; event e(double x, int kind) /plain own/Plain '{x:x, kind:kind}' { n++; x = x + 1; } }
+        second() { event e(double x, int count) /plain own/Plain '{x:x, count:count}' {
+            if (x > 3) { ROS_WARN("high"); return; } if (count % 2 == 1 / (count + 7)) { return; } count = 3; } }""",
+    "back to what it was": """
+        there() { event e(int count) /plain own/Plain '{count:count}' { count = count + 1; } }
+        back() { event e(int count) /plain own/Plain '{count:count}' { count = count - 1; } }""",
+    "back to what it was, written in pieces": """
+        s() { ros::Time saved; event a(ros::Time t) /plain own/Plain '{when:t}' { saved = t; }
+              event part(unsigned int n) /plain own/Plain '{when.nsec:n}' { n = n + 1; }
+              event whole(ros::Time t) /plain own/Plain '{when:t}' { t = saved; } }""",
+    "who changes it differs": """
+        one() { event e(int count, int kind) /plain own/Plain '{count:count, kind:kind}' {
+            if (kind != 1) { count = 17; } } }
+        two() { event e(double x) /plain own/Plain '{x:x}' { if (x > 2) { x = 2; } }
+                event f(bool on) /plain own/Plain '{on:on}' { on = false; } }
+        three() { event e(float y) /plain own/Plain '{y:y}' { if (y == 2.5) { y = 3; } }
+                  event last() /plain own/Plain '{}' { } }""",
+    "what is written stands side by side": """
+        one() { event e(double x) /plain own/Plain '{x:x}' { x = 7; } }
+        two() { event e(float y) /plain own/Plain '{y:y}' { y = 8; } }""",
+    "a drop after a change": """
+        change() { event e(float y) /plain own/Plain '{y:y}' { y = y * 2; } }
+        drop() { event e(int kind) /plain own/Plain '{kind:kind}' { if (kind == 1) { return; } } }""",
+    "DROP and what follows": """
+        s() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' {
+            if (kind == 1) { DROP; n++; } n += 10; } }""",
+    "a state that is handled": """
+        s() { event e(int kind) /plain own/Plain '{kind:kind}' when (kind == 1) { }
+            fsm: a [ e -> b ] b [ e -> c ] c [ e -> a ] @c { ROS_WARN("c"); } }""",
+    "a verdict that drops and resets": """
+        s() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' { n++; }
+            event o() /stamped own/Stamped '{}' { }
+            ere: e e o @fail { DROP; __RESET; } }""",
+    "a budget that runs out": """
+        s() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x, kind:2}' {
+            if (count == 5 && x > 50) { while (true) { n++; } } n = 1; } }""",
+    "a string and what stands behind it": """
+        s() { event e(std::string f, double x, double v) /stamped own/Stamped '{frame:f, x:x, values[1]:v}' {
+            if (f == "abc") { x = v; } else { v = 7; } } }""",
+    "a time": """
+        s() { event e(ros::Time t) /plain own/Plain '{when:t}' { t.sec = 9; } }""",
+    "a bool": """
+        s() { event e(bool on) /plain own/Plain '{on:on}' { on = on; } }""",
+    "a timer beside": """
+        s() { int n = 0; event e(int count) /plain own/Plain '{count:count}' { n++; if (n > 20) { return; } }
+            event tick() every 1ms { n = 0; ROS_INFO("tick"); } }""",
+    "held": """
+        hold s() { event e() /plain own/Plain '{}' { } }""",
+    "first values that fault": """
+        s() { int n = 0; int m = 5 / n; event e(int count) /plain own/Plain '{count:count}' { count = m; } }""",
+    "the time": """
+        s() { double t = 0; event e() /plain own/Plain '{}' { t = ros::Time::now().toSec(); } }""",
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
+    """Changes that are taken back, faults in the middle, drops after changes: as one by one."""
+    for seed in range(8):
+        messages = Messages(seed)
+        agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
+
+
+def _shipped_traffic(seed: int) -> list[Traffic]:
+    """Messages on the topics of the shipped specifications."""
+    random = Messages(seed)._random
+    kinds = {
+        "/landshark/battery": lambda: message("sensor_msgs/BatteryState", percentage=random.random(), voltage=12.0),
+        "/landshark/gps": lambda: message("sensor_msgs/NavSatFix", latitude=37.4 + random.random() / 9),
+        "/landshark/odom": lambda: message("nav_msgs/Odometry", pose__pose__position__x=random.uniform(0, 40),
+                                           twist__twist__linear__x=random.uniform(-2, 2)),
+        "/landshark_control/base_velocity": lambda: message(
+            "geometry_msgs/TwistStamped", twist__linear__x=random.uniform(-1, 1)),
+        "/landshark/joint_states": lambda: message(
+            "sensor_msgs/JointState", name=["turret_pan", "turret_tilt"][: random.choice((1, 2, 2, 2))],
+            position=[0.1, random.uniform(-1, 1)]),
+        "/landshark_control/trigger": lambda: message("std_msgs/Header", frame_id="ocu") + b"\x01",
+        "/landshark/scan": lambda: message("sensor_msgs/LaserScan", angle_increment=0.1,
+                                           ranges=[random.uniform(0, 5) for _ in range(4)]),
+    }  # fmt: skip
+    found = []
+    for _ in range(30):
+        topic = random.choice(sorted(kinds))
+        bodies = [kinds[topic]() for _ in range(random.choice((1, 3, 9)))]
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+        found.append(Traffic(topic, frames, len(bodies)))
+    return found
+
+
+def test_shipped_monitors_do_the_same_together() -> None:
+    """The specifications in `monitors/`, all in force, on traffic of the LandShark."""
+    known = definitions().extended(
+        Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": "Header header\nuint8 trigger\n"})
+    )
+    texts = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
+    for seed in range(5):
+        agree(texts, known, _shipped_traffic(seed))
+
+
+def test_most_messages_are_taken_together() -> None:
+    """A monitor that reads, writes and steps looks at no message of a batch singly, but for the first of a second."""
+    text = """s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' { x = count + 0.5; }
+                  fsm: a [ e -> b ] b [ e -> a ] @fail { } }"""
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    single = 0
+    process = monitored.set.process
+
+    def counted(*arguments: Any) -> Any:
+        nonlocal single
+        single += 1
+        return process(*arguments)
+
+    monitored.set.process = counted  # type: ignore[method-assign, assignment]
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    frame = struct.pack("<I", len(body)) + body
+    for _ in range(5):
+        left = monitored.through(Traffic("/plain", frame * 1000, 1000))
+        assert left == (1000, left[1], left[1][-len(frame) :])
+        assert struct.unpack_from("<d", left[1], 4 + 5) == (5.5,)
+    monitored.middle.tick()
+    assert single == 1
+    assert [(row.events, row.changes) for row in monitored.rows()] == [(5000, 5000)]
+    monitored.close()
+
+
+def test_what_several_change_is_counted_for_each_of_them() -> None:
+    """Taken together, by bits and runs, as one by one: a message counts for each monitor that changed it."""
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    frames = b"".join(struct.pack("<I", len(one)) + one for one in (far, body, body, quiet, far, quiet))
+    monitored = agree(
+        {"x.rv": HARD["who changes it differs"]}, definitions(), [Traffic("/plain", frames, 6)] * 50
+    )
+    assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
+
+
+def test_a_defect_of_the_loops_is_told_once_and_the_engine_goes_on() -> None:
+    """Messages go on, one by one; the loops of this topic are not tried again."""
+    monitored = Monitored(
+        {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
+        definitions(),
+        together=True,
+    )
+    tried = []
+
+    def defect(*arguments: object) -> Walked:
+        tried.append(arguments)
+        raise ZeroDivisionError
+
+    walker = monitored.set.walker("/plain")
+    assert walker is not None
+    walker.walk = defect  # type: ignore[method-assign, assignment]
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    frame = struct.pack("<I", len(body)) + body
+    changed = frame[:5] + struct.pack("<i", 3) + frame[9:]
+    for _ in range(3):
+        left = monitored.through(Traffic("/plain", frame * 6, 6))
+        assert left == (6, changed * 6, changed)
+    told = [one for one in monitored.told() if "kind='fault'" in one]
+    assert len(told) == len(tried) == 1
+    assert "a defect of rosrv" in told[0]
+    monitored.close()

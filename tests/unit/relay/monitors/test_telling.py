@@ -1,0 +1,203 @@
+"""What control is told of monitors: who dropped, changed and published, in records and counters."""
+
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
+from appliance.relay.monitors.places import Place
+from tests.unit.relay.monitors.test_passage import Monitored
+from tests.unit.rosmop.acting import message
+from tests.unit.rosmop.random_specifications import Traffic, definitions
+
+COMMAND = "geometry_msgs/Twist"
+STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {
+    if (v > 1) { v = 1; ROS_WARN("too fast"); PUBLISH(/alarm, std_msgs/String, s); } } }"""
+TURN = "turn() { event drive(double w) /cmd geometry_msgs/Twist '{angular:{z:w}}' { if (w > 1) { w = 1; } } }"
+LOOK = """look() { event drive(double y) /cmd geometry_msgs/Twist '{linear:{y:y}}' { if (y > 1) { return; } }
+    event on() /cmd geometry_msgs/Twist '{}' { } }"""
+
+
+class Told:
+    """Three monitors on one topic: two that limit, and one after them that changes nothing."""
+
+    def __init__(
+        self, *, together: bool, on_fault: str = "drop", texts: tuple[str, ...] = (STOP, TURN, LOOK)
+    ) -> None:
+        files = {f"{place}.rv": text for place, text in enumerate(texts)}
+        self.monitored = Monitored(files, definitions(), together=together, on_fault=on_fault)
+
+    def send(self, *commands: tuple[float, float, float]) -> None:
+        """Commands (forward, sideways, turn) in one batch."""
+        bodies = [message(COMMAND, linear__x=x, linear__y=y, angular__z=z) for x, y, z in commands]
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+        self.monitored.through(Traffic("/cmd", frames, len(bodies)))
+
+    def events(self, kind: str) -> list[MonitorEvent]:
+        """What control is told of this kind when the second is over."""
+        self.monitored.middle.tick()
+        self.monitored.middle.observations._flush()
+        found: list[Any] = [one for one in self.monitored._events() if getattr(one, "kind", "") == kind]
+        self.monitored.heard.messages.clear()
+        return found
+
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Drops and changes by monitor."""
+        return {row.name: (row.drops, row.changes) for row in self.monitored.rows()}
+
+
+@pytest.fixture(params=[False, True], ids=["one by one", "together"])
+def told(request: pytest.FixtureRequest) -> Iterator[Told]:
+    """Both ways."""
+    told = Told(together=request.param)
+    yield told
+    told.monitored.close()
+
+
+def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None:
+    """Though events of two others happen after it, which change nothing."""
+    told.send((5, 0, 0))
+    [change] = told.events("change")
+    assert (change.monitor, change.text) == ("stop", "stop changed a message")
+    assert change.detail == {
+        "events": ["stop.drive", "turn.drive", "look.drive", "look.on"],
+        "changed_by": ["stop.drive"],
+        "number": 1,
+    }
+    assert told.counts() == {"stop": (0, 1), "turn": (0, 0), "look": (0, 0)}
+
+
+def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> None:
+    """One record, under the last of them; so does the count of the others in the same second."""
+    told.send((5, 0, 5), *[(0, 0, 5)] * 3, *[(0.5, 0, 3), (4, 0, 3)] * 2)
+    full, *summed = told.events("change")
+    assert (full.monitor, full.text) == ("turn", "stop and turn changed a message")
+    assert full.detail["changed_by"] == ["stop.drive", "turn.drive"]
+    assert sorted((one.monitor, one.count, one.text, str(one.detail)) for one in summed) == [
+        ("turn", 2, "stop.drive, turn.drive", "{'changed_by': ['stop.drive', 'turn.drive']}"),
+        ("turn", 5, "", "{}"),
+    ]
+    assert told.counts() == {"stop": (0, 3), "turn": (0, 8), "look": (0, 0)}
+
+
+def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
+    """With what it said itself, if anything: not with what another one did; and nothing has changed."""
+    told.send((5, 5, 5))
+    [drop] = told.events("drop")
+    assert (drop.monitor, drop.text) == ("look", "look.drive dropped it")
+    assert told.counts() == {"stop": (0, 0), "turn": (0, 0), "look": (1, 0)}
+
+
+def test_what_is_published_is_recorded_under_its_monitor(told: Told) -> None:
+    """Though others' events happen after it."""
+    told.send((5, 0, 0))
+    [published] = told.events("publish")
+    assert (published.monitor, published.resource) == ("stop", "/alarm")
+
+
+def test_a_fault_that_was_passed_over_is_not_what_dropped() -> None:
+    """With `on_fault: pass`, the drop has the reason and the name of who dropped."""
+    faulty = STOP.replace("v = 1;", "v = 1 / (int) (v - 5);")
+    told = Told(together=False, on_fault="pass", texts=(faulty, LOOK))
+    told.send((5, 5, 0))
+    [drop] = told.events("drop")
+    assert (drop.monitor, drop.text) == ("look", "look.drive dropped it")
+    told.monitored.close()
+
+
+def test_a_fault_drops_under_the_name_of_its_monitor() -> None:
+    """Though the last event that happened was another's."""
+    faulty = LOOK.replace("'{linear:{y:y}}'", "'{linear:{y:y}}' when (1 / (int) (y - 5) == 0)")
+    told = Told(together=False, texts=(STOP, faulty))
+    told.send((5, 5, 0))
+    [drop] = told.events("drop")
+    assert (drop.monitor, drop.text) == ("look", "fault in look: division by zero")
+    assert drop.detail["events"] == ["stop.drive"]
+    told.monitored.close()
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(together: bool) -> None:
+    """A publisher that makes every message another set's fills neither the log nor loses what is counted."""
+    texts = {
+        f"{bit}.rv": f"m{bit}() {{ event e(double v) /pose geometry_msgs/PoseWithCovariance '{{covariance[{bit}]:v}}'"
+        " { if (v > 1) { v = 1; } } }"
+        for bit in range(9)
+    }
+    monitored = Monitored(texts, definitions(), together=together)
+    bodies = [
+        message("geometry_msgs/PoseWithCovariance", covariance=[2.0 * (who >> bit & 1) for bit in range(36)])
+        for who in range(256, 512)
+    ]
+    frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+    monitored.through(Traffic("/pose", frames, len(bodies)))
+    monitored.middle.tick()
+    assert {row.name: row.changes for row in monitored.rows()} == dict.fromkeys(
+        (f"m{bit}" for bit in range(8)), 128
+    ) | {"m8": 256}
+    monitored.middle.observations._flush()
+    changes: list[Any] = [one for one in monitored._events() if getattr(one, "kind", "") == "change"]
+    assert {one.monitor for one in changes} == {"m8"}
+    assert sum(one.count or 1 for one in changes) == 256
+    assert len(changes) <= 102
+    monitored.close()
+
+
+def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
+    """Who reads of a drop in the audit log finds it in the counters, events included."""
+    told.send((1, 5, 0))
+    told.monitored.middle.observations._flush()
+    *_before, events, counters = told.monitored.heard.messages
+    assert isinstance(events, MonitorsReported)
+    assert isinstance(counters, MonitorsCounted)
+    assert [one.kind for one in events.events] == ["drop"]
+    rows = {row.name: (row.events, row.drops) for row in counters.rows}
+    assert rows == {"stop": (1, 0), "turn": (1, 0), "look": (1, 1)}
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["one by one", "together"])
+@pytest.mark.parametrize("equal", [False, True], ids=["of any length", "equally long"])
+def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -> None:
+    """Caller id and host, the number in the publication, and the header as it was received."""
+    look = """look() { event far(int seq) /scan geometry_msgs/PoseStamped '{header:{seq:seq}}' {
+        if (seq == 7 || seq == 9) { seq = 0; return; } if (seq == 8) { int zero = 0; seq = 1 / zero; } } }"""
+    told = Told(together=together, texts=(look,), on_fault="pass")
+    header: dict[str, object] = {"header__stamp__sec": 1_700_000_000, "header__stamp__nanosec": 5}
+    bodies = []
+    for seq in range(1, 11):
+        frame = "m" * (3 if equal else seq)
+        header |= {"header__seq": seq, "header__frame_id": frame}
+        bodies.append(message("geometry_msgs/PoseStamped", **header))
+    frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+    told.monitored.through(Traffic("/scan", frames, len(bodies)), first=101)
+    told.monitored.middle.tick()
+    told.monitored.middle.observations._flush()
+    found: list[Any] = [one for one in told.monitored._events() if isinstance(one, MonitorEvent)]
+    [drop, more] = [one for one in found if one.kind == "drop"]
+    [fault] = [one for one in found if one.kind == "fault"]
+    assert {(one.host, one.caller_id) for one in (drop, more, fault)} == {("10.0.0.7", "/talker")}
+    places = [(one.detail["number"], one.detail["seq"], one.detail["stamp"]) for one in (drop, fault)]
+    assert places == [(107, 7, "1700000000.000000005"), (108, 8, "1700000000.000000005")]
+    assert (more.count, "number" in more.detail) == (1, False)
+    told.monitored.close()
+
+
+def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> None:
+    """A client that calls itself by ever new names makes no record for each; the first is named, hosts are apart."""
+    told = Told(together=True)
+    observations = told.monitored.middle.observations
+    for number in range(50):
+        for host in ("10.0.0.1", "10.0.0.2"):
+            observations.note("drop", "gate", Place("k", "/mode", host, f"/client{number}"), 1, "no")
+    first, second, *counts = told.events("drop")
+    assert [(one.host, one.caller_id, one.count) for one in (first, second)] == [
+        ("10.0.0.1", "/client0", 0),
+        ("10.0.0.2", "/client0", 0),
+    ]
+    assert [(one.host, one.caller_id, one.count) for one in counts] == [
+        ("10.0.0.1", "", 49),
+        ("10.0.0.2", "", 49),
+    ]
+    told.monitored.close()

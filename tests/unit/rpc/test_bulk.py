@@ -1,0 +1,122 @@
+"""Room for what is large: one request of a host, two in all, given back whatever happens."""
+
+import asyncio
+import datetime
+import ipaddress
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.master.calls.parameter_charges import measure
+from appliance.ros.xmlrpc import Value, build_response
+from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
+from appliance.shares.pool import Standing
+
+HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 5)]
+VALUES: st.SearchStrategy[Value] = st.recursive(
+    st.one_of(st.booleans(), st.integers(-9, 9), st.floats(), st.text("xy", max_size=30)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=5), st.dictionaries(st.text("ab", max_size=5), inner, max_size=5)
+    ),
+    max_leaves=30,
+)
+
+
+def test_room_for_one_of_a_host_and_two_in_all() -> None:
+    """Who has room keeps it; another host's waits for a free one only, and a host waits for its own."""
+
+    async def scene() -> None:
+        turns = bulk_turns(lambda _host: Standing.REGISTERED)
+        inside: list[Any] = []
+        go = asyncio.Event()
+
+        async def request(host: Any) -> None:
+            async with Bulk(turns, host) as bulk:
+                await bulk.take()
+                await bulk.take()  # again is nothing more
+                inside.append(host)
+                await go.wait()
+                inside.remove(host)
+
+        tasks = [asyncio.create_task(request(host)) for host in [HOSTS[0]] * 3 + HOSTS[1:]]
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert inside == HOSTS[:AT_ONCE]
+        go.set()
+        await asyncio.gather(*tasks)
+        assert not inside
+
+    asyncio.run(scene())
+
+
+def test_room_comes_back_after_a_failure() -> None:
+    """A request that fails or is cancelled gives back what it took; one that took nothing gives back nothing."""
+
+    async def scene() -> None:
+        turns = bulk_turns(lambda _host: Standing.REGISTERED)
+        for _ in range(3):
+            with pytest.raises(KeyError):
+                async with Bulk(turns, HOSTS[0]) as bulk:
+                    await bulk.take()
+                    raise KeyError
+            async with Bulk(turns, HOSTS[0]):
+                pass
+        async with asyncio.timeout(20), Bulk(turns, HOSTS[0]) as bulk:
+            await bulk.take()
+            assert bulk.taken
+
+    asyncio.run(scene())
+
+
+@given(value=VALUES)
+def test_weight_is_that_of_the_mirror(value: Value) -> None:
+    """A value weighs what it counts for in the bound of all parameters."""
+    assert weigh(value, 1 << 30) == measure(value)[0]
+
+
+def test_counting_ends_when_it_is_enough() -> None:
+    """A look at a huge value is short."""
+    wide: Value = [list(range(1000)) for _ in range(1000)]
+    assert 5000 <= weigh(wide, 5000) < 20_000
+    assert 5000 <= weigh(dict.fromkeys(map(str, range(100_000)), 1), 5000) < 6000
+    assert weigh(datetime.datetime(2025, 1, 1), 10) > 0  # noqa: DTZ001 - XML-RPC has no time zones
+
+
+def test_weight_is_about_what_is_written() -> None:
+    """Within a factor of two of the bytes on the wire."""
+    value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": "x" * 5000}
+    assert 0.5 < weigh(value, 1 << 30) / len(build_response(value)) < 2
+
+
+def test_large_values_of_a_host_go_one_at_a_time() -> None:
+    """A guest's second large value waits for its first; its small one and another host's large one do not."""
+
+    async def scene() -> None:
+        large = LargeWrites(1000, lambda _host: Standing.REGISTERED)
+        inside: list[str] = []
+        go = asyncio.Event()
+
+        async def write(name: str, host: Any, size: int) -> None:
+            async with large.turn(host, ["x" * size]):
+                inside.append(name)
+                await go.wait()
+                inside.remove(name)
+
+        guest, robot = HOSTS[:2]
+        wanted = (
+            ("first", guest, 2000),
+            ("second", guest, 2000),
+            ("small", guest, 10),
+            ("robot", robot, 2000),
+        )
+        tasks = [asyncio.create_task(write(*one)) for one in wanted]
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert inside == ["first", "small", "robot"]
+        go.set()
+        await asyncio.gather(*tasks)
+        assert not inside
+
+    asyncio.run(scene())

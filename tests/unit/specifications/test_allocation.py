@@ -1,0 +1,135 @@
+"""Topics, services and specifications are spread over relay processes; what is connected stays together."""
+
+import json
+
+import pytest
+
+from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, groups_of
+from appliance.specifications.files import Checked, Sources, check
+
+
+def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
+    """A specification with an event on each topic."""
+    events = "".join(
+        f"event e{number}() {topic} std_msgs/String '{{}}' {{ {body} }}"
+        for number, topic in enumerate(topics)
+    )
+    return f"{name}() {{ {variables} {events} }}"
+
+
+def checked(**files: str) -> Checked:
+    """What files of these names have."""
+    return check(Sources({f"{name}.rv": text for name, text in files.items()}))
+
+
+def together(**files: str) -> list[set[str]]:
+    """The groups of files."""
+    return [{name.removesuffix(".rv") for name in group.files} for group in groups_of(checked(**files))]
+
+
+def test_specifications_without_anything_in_common_are_apart() -> None:
+    """The largest group comes first, then by name."""
+    two = spec("b", "/b") + spec("c", "/c")
+    assert together(a=spec("a", "/a"), b=two, d=spec("d", "/d")) == [{"b"}, {"a"}, {"d"}]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        spec("b", "/b", "/a"),
+        spec("b", "/b", body="n++;"),
+        spec("b", "/b", variables="std_msgs::String s;", body="PUBLISH(/a, std_msgs/String, s);"),
+    ],
+    ids=["topic", "variable", "publishes onto the other's topic"],
+)
+def test_what_is_in_common_joins(other: str) -> None:
+    """Across a third one, too."""
+    a = spec("a", "/a", variables="int n;")
+    assert together(a=a, b=other) == [{"a", "b"}]
+    assert together(a=a, b=other, c=spec("c", "/c", "/b")) == [{"a", "b", "c"}]
+
+
+def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
+    """They have nothing to do with each other."""
+    service = "NAME() { event e() service /x std_srvs/SetBool request '{}' { } }"
+    topic = spec("t", "/x")
+    joined = together(a=service.replace("NAME", "a"), b=service.replace("NAME", "b"), t=topic)
+    assert joined == [{"a", "b"}, {"t"}]
+
+
+def test_a_fresh_start_is_balanced_and_kept() -> None:
+    """Over the monitors; another life of control finds the same, another number of relays begins anew."""
+    kept: list[str] = []
+    first = Allocation(2, kept.append)
+    names = "abcd"
+    both = checked(**{name: spec(name, f"/{name}") for name in names})
+    first.adopt(first.plan(both))
+    relays = [first.of_file(f"{name}.rv") for name in names]
+    assert sorted(relays) == [0, 0, 1, 1]
+    assert [first.of(TOPIC, f"/{name}") for name in names] == relays
+    second = Allocation(2)
+    assert second.restore(kept[-1])
+    assert [second.of(TOPIC, f"/{name}") for name in names] == relays
+    assert not Allocation(3).restore(kept[-1])
+    for broken in ("", "[]", "{}", json.dumps({"relays": 2, "files": 1, "resources": []})):
+        assert not Allocation(2).restore(broken)
+
+
+def test_a_specification_comes_to_the_topics_that_are_carried() -> None:
+    """Nothing moves when it has one topic, or all its topics are on one relay; else as few as can be."""
+    allocation = Allocation(4)
+    here = {f"/t{number}": allocation.of(TOPIC, f"/t{number}") for number in range(64)}
+    assert set(here.values()) == {0, 1, 2, 3}
+    carried = {(TOPIC, topic) for topic in here}
+    for topic in list(here)[:8]:
+        assert allocation.plan(checked(a=spec("a", topic)), carried).moves == ()
+    on = [[topic for topic, relay in here.items() if relay == one] for one in range(2)]
+    plan = allocation.plan(checked(a=spec("a", *on[0][:2], on[1][0])), carried)
+    assert plan.moves == (Move(TOPIC, on[1][0], 1, 0),)
+    allocation.adopt(plan)
+    after = allocation.plan(Checked(), carried)
+    assert after.moves == ()
+    assert allocation.plan(Checked(), set()).resources == {}
+
+
+def test_monitors_that_run_move_only_when_they_must_and_the_fewest() -> None:
+    """Where two relays' monitors are joined, those of the relay with more stay, whatever topics that moves."""
+    allocation = Allocation(2)
+    first = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
+    allocation.adopt(allocation.plan(checked(**first)))
+    assert allocation.of_file("a.rv") != allocation.of_file("b.rv")
+    joined = checked(**first, c=spec("c", "/a", "/b", "/c"))
+    carried = {(TOPIC, "/b"), (SERVICE, "/b")}
+    plan = allocation.plan(joined, carried)
+    assert plan.moved_files == {"b.rv"}
+    assert [(move.kind, move.name) for move in plan.moves] == [(TOPIC, "/b")]
+    allocation.adopt(plan)
+    assert allocation.plan(checked(**first), carried).moved_files == frozenset()
+
+
+def test_what_moves_moves_one_way() -> None:
+    """A relay that gets topics can try their monitors first, because it gives up none of its own."""
+    allocation = Allocation(2)
+    first = {name: spec(name, f"/{name}") for name in "abcd"}
+    allocation.adopt(allocation.plan(checked(**first)))
+    assert [allocation.of_file(f"{name}.rv") for name in "abcd"] == [0, 1, 0, 1]
+    crossed = checked(**first, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d"))
+    carried = {(TOPIC, f"/{name}") for name in "abcd"}
+    plan = allocation.plan(crossed, carried)
+    assert {move.target for move in plan.moves} == {0}
+    assert (plan.moved_files, plan.losing) == (frozenset({"b.rv", "d.rv"}), frozenset({1}))
+    assert set(plan.files.values()) == {0}
+
+
+def test_a_relay_whose_topic_gets_its_monitor_elsewhere_gives_something_up() -> None:
+    """Although no file moves: its monitors stay until it does not carry the topic any more."""
+    allocation = Allocation(2)
+    files = {"a": spec("a", "/a"), "b": spec("b", "/b")}
+    allocation.adopt(allocation.plan(checked(**files)))
+    changed = checked(a=spec("a", "/other"), b=spec("b", "/b", "/a"))
+    plan = allocation.plan(changed, {(TOPIC, "/a"), (TOPIC, "/b")})
+    assert (plan.moves, plan.moved_files, plan.losing) == (
+        (Move(TOPIC, "/a", 0, 1),),
+        frozenset[str](),
+        frozenset({0}),
+    )

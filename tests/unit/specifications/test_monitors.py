@@ -1,0 +1,327 @@
+"""The specifications in force: revisions, switches, what the relay is told and what it says."""
+
+import asyncio
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.channel import messages
+from appliance.recorder import Recorder
+from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.specifications.relays import NoRelays
+from appliance.store.state import StateStore
+
+A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
+B = "hold b() { event said() /other std_msgs/String '{}' { } }"
+
+C = "c() { event said() /third std_msgs/String '{}' { } }"
+
+
+class Desk:
+    """The monitors of one control over its life times, with a relay that takes everything."""
+
+    def __init__(self, home: Path) -> None:
+        self.home, self.folder = home, home / "monitors"
+        self.folder.mkdir()
+        (self.folder / "a.rv").write_text(A)
+        self.log = AuditLog(home / "audit.db")
+        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        happened = self.recorder.happened
+
+        def noted(event: str, reason: str, **fields: Any) -> str:
+            self.events.append((event, fields))
+            return happened(event, reason, **fields)
+
+        self.recorder.happened = noted  # type: ignore[method-assign]
+        self.store = StateStore(home, failed=pytest.fail)
+        self.sent: list[messages.Message] = []
+        self.findings: list[str] = []
+        self.began: list[str] = []
+
+    def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
+        """A control starts."""
+        monitors = Monitors(self.folder if folder else None, enable, self.store, self.recorder)
+        monitors.connect(Taking(self, monitors))
+        monitors.start(restarted=restarted)
+        return monitors
+
+
+class Taking(NoRelays):
+    """One relay, which takes everything, or refuses it with the findings of the desk."""
+
+    def __init__(self, desk: Desk, monitors: Monitors) -> None:
+        self.desk, self.monitors = desk, monitors
+
+    def send(self, message: messages.Message, relay: int) -> bool:
+        """It answers in the next turn of the loop."""
+        self.desk.sent.append(message)
+        if isinstance(message, messages.SpecificationsStated):
+            answer: messages.Message = messages.SpecificationsTaken(
+                message.revision, self.desk.began, [], message.statement
+            )
+            if self.desk.findings:
+                answer = messages.SpecificationsRefused(
+                    message.revision, self.desk.findings, message.statement
+                )
+            asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
+        return True
+
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    """A folder with one specification."""
+    desk = Desk(tmp_path)
+    yield desk
+    desk.store.close()
+    desk.log.close()
+
+
+async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: Desk) -> None:
+    """The same folder again is no new revision; an operator's revision stays until `reload`."""
+    first = desk.monitors()
+    assert (first.revision, first.names(), first.differs_from_folder) == (1, ["a"], False)
+    await desk.store.settled()
+    again = desk.monitors()
+    assert again.revision == 1
+    desk.began = ["b"]
+    replaced = await again.load({"b.rv": B}, {}, who="eve", note="")
+    assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
+    assert replaced.began == ["b"]
+    restarted = desk.monitors()
+    assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
+    back = await restarted.reload(who="operator", prune=True)
+    assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
+    loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
+    assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
+    assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
+
+
+async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
+    """What was loaded while the robot runs stays, over restarts, too; what the folder brought goes with its file."""
+    monitors = desk.monitors()
+    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    (desk.folder / "c.rv").write_text(C)
+    kept = await monitors.reload(who="operator")
+    assert (kept.added, kept.removed, kept.kept) == (["c.rv"], [], ["b.rv"])
+    assert monitors.names() == ["a", "b", "c"]
+    await desk.store.settled()
+    restarted = desk.monitors()
+    assert restarted.names() == ["a", "b", "c"]
+    (desk.folder / "c.rv").unlink()
+    again = await restarted.reload(who="operator")
+    assert (again.removed, again.kept, restarted.names()) == (["c.rv"], ["b.rv"], ["a", "b"])
+    pruned = await restarted.reload(who="operator", prune=True)
+    assert (pruned.removed, pruned.kept, restarted.differs_from_folder) == (["b.rv"], [], False)
+
+
+async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
+    """Nothing is removed, the words say what to do, and nothing is said to differ from a folder that is not there."""
+    desk = Desk(tmp_path)
+    monitors = desk.monitors(folder=False)
+    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    assert not monitors.differs_from_folder
+    for prune in (False, True):
+        with pytest.raises(SpecificationsRefusedError, match="no folder of specifications is configured"):
+            await monitors.reload(who="operator", prune=prune)
+    assert monitors.names() == ["b"]
+    desk.store.close()
+    desk.log.close()
+
+
+async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
+    """Whether control or the relay finds the fault; it is a record."""
+    monitors = desk.monitors()
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+    assert not desk.sent
+    desk.findings = ["b.rv:1:1: error: something"]
+    with pytest.raises(SpecificationsRefusedError, match="something"):
+        await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    assert (monitors.revision, monitors.names()) == (1, ["a"])
+    assert [event for event, _ in desk.events].count("specifications refused") == 3
+    desk.findings = []
+    (desk.folder / "a.rv").write_text("nonsense")
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.reload(who="eve")
+    await desk.store.settled()
+    with pytest.raises(SpecificationsRefusedError):
+        desk.monitors()
+
+
+async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
+    """Only what changes is told and recorded; `--enable` is for those that nobody has switched."""
+    monitors = desk.monitors("none")
+    assert monitors.enabled("a") is False
+    assert await monitors.switch(["a", "a"], True, who="eve") == ["a"]
+    assert await monitors.switch(["a"], True, who="eve") == []
+    assert desk.sent == [messages.MonitorSwitched("a", True)]
+    assert desk.monitors("none").enabled("a") is True
+    assert monitors.statement().enabled == {"a": True}
+    with pytest.raises(UnknownMonitorError, match="there are: a"):
+        await monitors.switch(["nobody"], True, who="eve")
+    with pytest.raises(SpecificationsRefusedError, match="--enable"):
+        desk.monitors("a,nobody")
+    assert [fields["who"] for event, fields in desk.events if event == "monitor enabled"] == ["eve"]
+
+
+async def test_a_monitor_that_was_removed_while_the_robot_ran_does_not_keep_it_from_starting(
+    desk: Desk,
+) -> None:
+    """Though `--enable` still names it; nor does a crash of control."""
+    monitors = desk.monitors("a")
+    await monitors.remove(["a"], who="eve")
+    assert desk.monitors("a").names() == []
+    assert desk.monitors("a", restarted=True).names() == []
+
+
+async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) -> None:
+    """The first relay of an appliance is not; nor is a control that finds its relay as it was."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    assert monitors.statement().restarted is False
+    monitors.received(messages.SpecificationsTaken(1, ["a", "b"], []))
+    assert "monitors restarted" not in [event for event, _ in desk.events]
+    assert monitors.statement().restarted is True
+    monitors.received(messages.SpecificationsTaken(1, ["a", "b"], ["b"]))
+    assert [fields["held"] for event, fields in desk.events if event == "monitors restarted"] == [["b"]]
+    assert monitors.held == {"b"}
+    assert await monitors.resume(["a", "b"], who="eve") == ["b"]
+    assert desk.sent[-1] == messages.MonitorResumed("b")
+    await desk.store.settled()
+    control = desk.monitors(restarted=True)
+    assert control.statement().restarted is True
+    control.received(messages.SpecificationsTaken(1, [], []))
+    assert [event for event, _ in desk.events].count("monitors restarted") == 1
+
+
+async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
+    """And a file goes whole or not at all."""
+    monitors = desk.monitors()
+    user = "c() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+    await monitors.load(
+        {"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}, {}, who="eve", note=""
+    )
+    for names in (["a"], ["c"]):
+        with pytest.raises(SpecificationsRefusedError):
+            await monitors.remove(names, who="eve")
+    with pytest.raises(UnknownMonitorError):
+        await monitors.remove(["nobody"], who="eve")
+    assert (await monitors.remove(["c", "d"], who="eve")).removed == ["c.rv"]
+    assert (await monitors.remove(["a.rv"], who="eve")).removed == ["a.rv"]
+
+
+async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) -> None:
+    """Two engineers cannot overwrite each other: not after a load, a switch, or a resumption."""
+    monitors = desk.monitors()
+    seen = [monitors.tag]
+    await monitors.load({"b.rv": B}, {}, who="adam", note="", expected=monitors.tag)
+    seen.append(monitors.tag)
+    await monitors.switch(["a"], False, who="adam", expected=monitors.tag)
+    seen.append(monitors.tag)
+    monitors.received(messages.SpecificationsTaken(2, [], ["b"]))
+    await monitors.resume(["b"], who="adam", expected=monitors.tag)
+    assert len({*seen, monitors.tag}) == 4
+    for stale in seen:
+        changes: list[Callable[[], Any]] = [
+            partial(monitors.load, {"b.rv": B}, {}, who="eve", note="", expected=stale),
+            partial(monitors.reload, who="eve", expected=stale),
+            partial(monitors.remove, ["a"], who="eve", expected=stale),
+            partial(monitors.switch, ["a"], True, who="eve", expected=stale),
+            partial(monitors.resume, ["b"], who="eve", expected=stale),
+        ]
+        for change in changes:
+            with pytest.raises(MonitorsChangedError, match="look at them first") as caught:
+                await change()
+            assert caught.value.tag == monitors.tag
+    assert (monitors.revision, monitors.enabled("a")) == (2, False)
+
+
+async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
+    """One that is loaded later under its name is as `--enable` says; so it is in the next life of control."""
+    monitors = desk.monitors()
+    await monitors.switch(["a"], False, who="eve")
+    await monitors.load({"a.rv": A.replace("{", "{ int n;", 1)}, {}, who="eve", note="")
+    assert not monitors.enabled("a")
+    await monitors.remove(["a"], who="eve")
+    await monitors.load({"a.rv": A}, {}, who="eve", note="")
+    assert monitors.enabled("a")
+    assert desk.monitors(restarted=True).enabled("a")
+
+
+async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> None:
+    """The relay that comes will hold its topics: nobody is told that they go on."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
+    monitors.connect(NoRelays())
+    with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
+        await monitors.resume(["b"], who="eve")
+    assert "monitor resumed" not in [event for event, _ in desk.events]
+    assert monitors.held == {"b"}
+
+
+async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> None:
+    """Though they come at once, and the first takes its time."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
+    tag = monitors.tag
+    done = await asyncio.gather(
+        monitors.load({"c.rv": A.replace("a()", "c()")}, {}, who="adam", note="", expected=tag),
+        monitors.switch(["a"], False, who="eve", expected=tag),
+        monitors.resume(["b"], who="eve", expected=tag),
+        return_exceptions=True,
+    )
+    assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
+    assert monitors.enabled("a")
+    assert messages.MonitorResumed("b") not in desk.sent
+
+
+async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
+    """A switch that was so already, an unknown name and a bad specification leave it; no start brings one back."""
+    monitors = desk.monitors()
+    first = monitors.tag
+    assert await monitors.switch(["a"], True, who="eve") == []
+    assert await monitors.resume(["a"], who="eve") == []
+    with pytest.raises(UnknownMonitorError):
+        await monitors.switch(["a", "nobody"], False, who="eve")
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+    assert monitors.tag == first
+    await monitors.switch(["a"], False, who="eve")
+    await monitors.switch(["a"], True, who="eve")
+    assert monitors.tag != first
+    assert desk.monitors().tag == desk.monitors(restarted=True).tag == monitors.tag
+
+
+async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
+    """The bytes before and after as hexadecimal digits; what could not be told, too."""
+    monitors = desk.monitors()
+    told = [
+        messages.MonitorEvent("change", "a", "k", "/chatter", 1, "a changed", {}, b"\x01", b"\x02", 1),
+        messages.MonitorEvent("change", "a", "k", "/chatter", 2, "", {}, count=41),
+        messages.MonitorEvent("fault", "a", "k", "/chatter", 3, "a.rv:1:2: division by zero", {"line": 1}),
+    ]
+    together = {"changed_by": ["a.e", "b.e", "b.f"]}
+    told += [
+        messages.MonitorEvent(
+            "change", "b", "k", "/cmd", 4, "a and b changed a message", together, b"\x01", b"\x02", 1
+        ),
+        messages.MonitorEvent("change", "b", "k", "/cmd", 5, "a.e, b.e, b.f", together, count=9),
+    ]
+    monitors.received(messages.MonitorsReported(told, 5))
+    changed = [fields for event, fields in desk.events if event == "message changed"]
+    assert (changed[0]["before"], changed[0]["after"], changed[1]["count"]) == ("01", "02", 41)
+    assert changed[3]["more"] == together
+    assert (monitors.records.counts["change", "a"], monitors.records.counts["change", "b"]) == (52, 10)
+    assert (monitors.records.at["change", "/chatter"], monitors.records.at["change", "/cmd"]) == (42, 10)
+    assert [fields["lost"] for event, fields in desk.events if event == "records lost"] == [5]

@@ -1,0 +1,39 @@
+"""What monitors did becomes records, whatever names their details have."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.search import export
+from appliance.channel.messages import MonitorEvent
+from appliance.recorder import Recorder
+from appliance.specifications.observed import MonitorRecords
+from tests.support.audit import settle
+
+NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")
+
+
+@pytest.mark.parametrize("kind", ["verdict", "drop", "change", "fault", "log", "publish"])
+def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
+    """A verdict has a category of its own, and a robot's names are not ours to choose."""
+    log = AuditLog(tmp_path / "audit.db")
+    records = MonitorRecords(Recorder(log, strict=False, deny_when_failed=False))
+    detail = {"logic": "fsm", **{name: f"its {name}" for name in NAMES}}
+    event = MonitorEvent(
+        kind, "gun", "key", "/trigger", 10**18, "told", detail, host="10.0.0.7", caller_id="/joystick"
+    )
+    records.reported([event] * 2, lost=0)
+    settle(log)
+    assert records.counts == {(kind, "gun"): 2}
+    found = [
+        entry.record
+        for entry in export(tmp_path / "audit.db", Filter())
+        if entry.record.resource == "/trigger"
+    ]
+    assert len(found) == 2
+    assert found[0].category == "monitor"
+    assert (found[0].host, found[0].caller_id) == ("10.0.0.7", "/joystick")
+    assert (found[0].detail["category"], found[0].detail["logic"]) == ("its category", "fsm")
+    log.close()

@@ -1,0 +1,82 @@
+"""Tests of what callers are told, and not told, while nothing can be recorded."""
+
+import asyncio
+import time
+from typing import Any
+
+import pytest
+
+from appliance.audit.budget import Budget
+from appliance.audit.ids import IdSource
+from appliance.recorder import NOT_RECORDED, Recorder
+from appliance.shares.pool import Standing
+from appliance.shares.table import AUDIT_BYTES
+
+GUEST, STRANGER = "10.0.0.66", "10.9.9.9"
+
+
+class Log:
+    """An audit log that cannot be written."""
+
+    def __init__(self) -> None:
+        self.ids = IdSource(clock=time.time_ns)
+        self.failed: str | None = "/var/lib/rosrv/control/audit.db: database or disk is full"
+        self.records: list[Any] = []
+        self.budget = Budget(lambda host: Standing.STRANGER if host == STRANGER else Standing.NAMED)
+
+    def record(self, record: Any) -> None:
+        """Take it."""
+        self.budget.charge(record)
+        self.records.append(record)
+
+    async def wait_durable(self) -> str | None:
+        """Say why not."""
+        return self.failed
+
+
+def recorder(log: Log, *, deny: bool) -> Recorder:
+    """As control makes it."""
+    return Recorder(log, strict=True, deny_when_failed=deny)  # type: ignore[arg-type]  # stands for the log
+
+
+def test_nobody_is_told_where_the_log_is() -> None:
+    """While the log cannot be written requests are denied; where it is and what is wrong is not for a node."""
+    one = recorder(Log(), deny=True)
+    assert one.obstacle == NOT_RECORDED
+    assert "/" not in NOT_RECORDED
+    assert asyncio.run(one.durable()) is not None
+
+
+@pytest.mark.parametrize("failed", [None, "full"])
+def test_when_it_is_to_go_on_without(failed: str | None) -> None:
+    """With `on_audit_failure: allow`, or while the log is well, nothing stands in the way."""
+    log = Log()
+    log.failed = failed
+    assert recorder(log, deny=failed is None).obstacle is None
+    if failed is not None:
+        assert asyncio.run(recorder(log, deny=False).durable()) is None
+
+
+def test_what_is_refused_to_a_stranger_says_so() -> None:
+    """A refusal of an address that no rule names is marked; what others get wrong, or are granted, is not."""
+    log = Log()
+    one = recorder(log, deny=True)
+    one.happened("limit exceeded", "too much", decision="deny", host=STRANGER)
+    one.happened("limit exceeded", "too much", decision="deny", host=GUEST)
+    one.happened("rest call", "", decision="allow", host=STRANGER)
+    one.happened("connection closed", "", host=STRANGER)
+    assert [record.stranger for record in log.records] == [True, False, False, False]
+    assert [record.detail.get("stranger", False) for record in log.records] == [True, False, False, False]
+
+
+def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
+    """Once a host owes more than its share, what it causes without a call is marked to be folded; decisions are not."""
+    log = Log()
+    one = recorder(log, deny=True)
+    one.happened("connection opened", "", host=GUEST)
+    one.happened("malformed", "x" * AUDIT_BYTES.bounds.host, host=GUEST)
+    one.happened("connection opened", "", host=GUEST)
+    one.happened("limit exceeded", "", host=GUEST, decision="deny")
+    one.happened("connection opened", "", host="10.0.0.1")
+    assert [record.folds for record in log.records] == [False, False, True, False, False]
+    assert GUEST in one.owing(GUEST)
