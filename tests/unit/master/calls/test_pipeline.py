@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from appliance.master.calls import pipeline
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.pipeline import Pipeline
-from appliance.master.calls import pipeline
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Registry
 from appliance.policy import compile_policy
