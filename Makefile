@@ -23,20 +23,15 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/mypy
-	$(BIN)/mypy tests benchmarks distribution
 	$(BIN)/lint-imports
-	@# Four at a time on two cores: many wait for something.
-	$(PYTEST) tests/unit -n 4 --quiet
+	$(PYTEST) tests/unit -n auto --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	@# Two at a time. What fails while the machine is busy with another test is tried once more, alone, and both are shown.
-	$(PYTEST) tests/integration --quiet -n 2 --dist loadfile --durations=10 || \
-		{ echo "== once more, alone: what failed"; $(PYTEST) tests/integration --quiet --last-failed --last-failed-no-failures none; }
+	$(PYTEST) tests/integration -n auto --dist loadfile --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	$(PYTEST) tests/system --quiet --durations=15 || \
-		{ echo "== once more: what failed"; $(PYTEST) tests/system --quiet --last-failed --last-failed-no-failures none; }
+	$(PYTEST) tests/system --quiet --durations=15
 
 package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package

@@ -30,7 +30,8 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
-from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port, wait_until
+from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
+from tests.support.waiting import eventually
 
 HERE = Path(__file__).parent
 PROGRAM = HERE.parent / "build" / "benchmarks" / "relay_load"
@@ -179,7 +180,7 @@ class RosRelay:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        wait_until(self._answers, "rosmaster answers")
+        eventually(self._answers, "rosmaster answers")
         self._api = SimpleXMLRPCServer((LOOPBACK, 0), logRequests=False)
         self._api.register_instance(self)
         self._api_uri = f"http://{LOOPBACK}:{self._api.server_address[1]}/"
@@ -209,7 +210,7 @@ class RosRelay:
             found[:] = [node for topic, nodes in publishers if topic == taken for node in nodes]
             return bool(found)
 
-        wait_until(published, f"{self.name} publishes")
+        eventually(published, f"{self.name} publishes")
         uri = call(self._uri, "lookupNode", "/load", found[0])[2]
         return int(call(uri, "requestTopic", "/load_listener", taken, [["TCPROS"]])[2][2]), taken
 

@@ -1,5 +1,6 @@
-"""Fixtures that the tests with real nodes share; each ends what it started."""
+"""Fixtures that tests with real nodes share, each ends what it started; how many run at once; what is tried again."""
 
+import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from appliance.network.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
+from tests.support.outside import outside
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 from tests.support.site import Site
@@ -69,3 +71,27 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
             if running is not None:
                 report.sections.append((f"What {name} said", running.story()))
     return report
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """`-n auto`: as many as there are cores, at least two; twice as many unit tests, for many wait for something."""
+    cores = len(os.sched_getaffinity(0))
+    units_only = all("tests/unit" in argument for argument in config.args)
+    return 2 * cores if units_only else max(2, cores)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What tests/outside.toml lists is tried a second time when it fails; nothing else is."""
+    listed = outside()
+    for item in items:
+        if item.nodeid.partition("[")[0] in listed:
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Why what was tried again may fail."""
+    listed = outside()
+    for report in terminalreporter.getreports("rerun"):
+        reason = " ".join(listed[report.nodeid.partition("[")[0]].split())
+        terminalreporter.write_line(f"tried again: {report.nodeid}: {reason}")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
 from tests.support.rosmaster import master_at
-from tests.support.syslog import eventually
+from tests.support.waiting import eventually
 
 LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
 
@@ -49,7 +49,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
         old.reload(LOADED)
         token = old.ready["token"]
         with busy(old.master_uri):
-            eventually(lambda: old.audit(event="checkpoint"))
+            eventually(lambda: old.audit(event="checkpoint"), "a checkpoint is recorded")
             old.rosrv("backup", str(file))
         assert "complete and unchanged" in old.rosrv("audit", "verify").stdout
 
@@ -73,7 +73,8 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
         eventually(
             lambda: (
                 json.loads(new.rosrv("audit", "verify", "--json").stdout)["signed_through"] > before["last"]
-            )
+            ),
+            "what came since is signed",
         )
         assert new.audit(event="signature refused") == []
     finally:

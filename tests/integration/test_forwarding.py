@@ -15,7 +15,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from tests.support.appliance import Appliance
 from tests.support.forgery import write_anew
 from tests.support.rosmaster import master_at
-from tests.support.syslog import Message, StreamCollector, eventually
+from tests.support.syslog import Message, StreamCollector
+from tests.support.waiting import eventually
 
 
 @contextmanager
@@ -37,7 +38,7 @@ def work(appliance: Appliance, count: int) -> None:
 
 def another_life(appliance: Appliance, role: str, before: list[int]) -> None:
     """Return once the process was started again."""
-    eventually(lambda: appliance.pids(role) not in ([], before))
+    eventually(lambda: appliance.pids(role) not in ([], before), f"another {role} runs")
 
 
 def all_sequences(appliance: Appliance) -> set[int]:
@@ -83,14 +84,14 @@ def test_a_receiver_that_is_away(tmp_path: Path) -> None:
         start = time.monotonic()
         work(appliance, 200)
         assert time.monotonic() - start < 10
-        eventually(lambda: forwarding_status(appliance)["trouble"])
+        eventually(lambda: forwarding_status(appliance)["trouble"], "the trouble is in the status")
         told = appliance.rosrv("status", check=False)
         assert told.returncode == 1
         assert "the audit log is not forwarded to tcp://" in told.stdout
-        eventually(lambda: appliance.audit(event="forwarding failed"))
+        eventually(lambda: appliance.audit(event="forwarding failed"), "it is recorded")
         collector.open()
-        eventually(lambda: not forwarding_status(appliance)["trouble"])
-        eventually(lambda: appliance.audit(event="forwarding resumed"))
+        eventually(lambda: not forwarding_status(appliance)["trouble"], "the trouble is over")
+        eventually(lambda: appliance.audit(event="forwarding resumed"), "that it is over is recorded")
         wanted = all_sequences(appliance)
         collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
 

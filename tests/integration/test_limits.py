@@ -12,7 +12,7 @@ from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Host, Process
 from tests.support.requirements import need_root, needs
-from tests.support.syslog import eventually
+from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 MONITOR = "counter() { int heard; event said() /watched std_msgs/String '{}' { heard++; } }"
@@ -109,7 +109,7 @@ def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
     assert first["detail"]["part"] == "publisher"
     if topic == "/watched":
         # The relay reports its counters once in a second.
-        eventually(lambda: judged(appliance) - before >= len(heard))
+        eventually(lambda: judged(appliance) - before >= len(heard), "what was heard is counted")
         assert judged(appliance) - before < talker.seen(event="sent")[-1]["number"]
 
 

@@ -13,8 +13,8 @@ import pytest
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros
 from tests.support.processes import Process
-from tests.support.relay_driver import wait_until
 from tests.support.requirements import needs
+from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 WORDS = """
@@ -369,7 +369,7 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
             operator.send(tilt)
             operator.wait_for(event="fired", tilt=tilt)
         gun.wait_for_count(2, event="shot")
-        wait_until(
+        eventually(
             lambda: monitor(appliance, "safeTrigger")["drops"] == 1,
             "the trigger at the robot itself is dropped",
         )

@@ -1,8 +1,7 @@
 """The policy changes while a robot works: what is taken back stops at once, what is granted again goes on by itself."""
 
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from appliance.network.lab import Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.requirements import needs
+from tests.support.waiting import eventually
 
 NO_CHATTER = OPEN_POLICY.replace("[Subscribers]", "/chatter =\n[Subscribers]", 1)
 NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
@@ -70,7 +70,7 @@ def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that
     appliance.stop()
     appliance.policy_file.write_text(NO_CHATTER)
     appliance.start()
-    wait_until(lambda: appliance.audit("--event", "revoked", resource="/chatter"))
+    eventually(lambda: appliance.audit("--event", "revoked", resource="/chatter"), "it is recorded")
     said = ros.run("rostopic", "info", "/chatter").stdout
     assert "/voice" not in said.partition("Subscribers")[0]
     appliance.rosrv("policy", "rollback")
@@ -94,11 +94,11 @@ def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
         voice = ros.talker(client, "/chatter", name="voice")
         listener.wait_for(event="received")
         voice.popen.send_signal(signal.SIGSTOP)
-        wait_until(lambda: appliance.audit("--event", "node lost", caller_id="/voice"))
+        eventually(lambda: appliance.audit("--event", "node lost", caller_id="/voice"), "it is lost")
         appliance.reload(NO_CHATTER)
         assert appliance.audit("--event", "revoked", caller_id="/voice", resource="/chatter")
         voice.popen.send_signal(signal.SIGCONT)
-        wait_until(lambda: appliance.audit("--event", "node returned", caller_id="/voice"))
+        eventually(lambda: appliance.audit("--event", "node returned", caller_id="/voice"), "it is back")
         assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0]
         appliance.rosrv("policy", "rollback")
         after = listener.mark()
@@ -110,15 +110,8 @@ def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
     assert appliance.process is not None
     appliance.policy_file.write_text(NO_CHATTER)
     appliance.process.popen.send_signal(signal.SIGHUP)
-    wait_until(lambda: appliance.status()["policy"]["revision"] == 2)
+    eventually(lambda: appliance.status()["policy"]["revision"] == 2, "the new policy is in force")
     appliance.policy_file.write_text("[Nonsense]\n")
     appliance.process.popen.send_signal(signal.SIGHUP)
-    wait_until(lambda: appliance.audit("--event", "policy refused"))
+    eventually(lambda: appliance.audit("--event", "policy refused"), "the refusal is recorded")
     assert appliance.status()["policy"]["revision"] == 2
-
-
-def wait_until(happened: Callable[[], object]) -> None:
-    """Wait for something that the appliance does on its own, at most a minute."""
-    deadline = time.monotonic() + 60
-    while not happened():
-        assert time.monotonic() < deadline, "it did not happen"

@@ -51,6 +51,7 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from tests.support.waiting import eventually
 
 LOOPBACK = "127.0.0.1"
 _URI = re.compile(r"^\w+://([^:/]+):(\d+)")
@@ -264,7 +265,7 @@ class RelayDriver:
         self.link = self.relay.open_link(self._received)
 
     def __enter__(self) -> "RelayDriver":
-        wait_until(lambda: _answers(self._rosmaster_port), "rosmaster answers")
+        eventually(lambda: _answers(self._rosmaster_port), "rosmaster answers")
         self._thread.start()
         return self
 
@@ -378,16 +379,6 @@ def free_port() -> int:
     """A port that is free now; only for programs that cannot be given port 0 (rosmaster)."""
     with socket.create_server((LOOPBACK, 0)) as sock:
         return int(sock.getsockname()[1])
-
-
-def wait_until(condition: Callable[[], bool], what: str, seconds: float = 30.0) -> None:
-    """Wait for something that has no event of its own; fails loudly."""
-    deadline = time.monotonic() + seconds
-    pause = threading.Event()
-    while not condition():
-        if time.monotonic() > deadline:
-            raise AssertionError(f"not within {seconds} s: {what}")
-        pause.wait(0.02)
 
 
 def _answers(port: int) -> bool:

@@ -9,7 +9,6 @@ import re
 import socket
 import ssl
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -218,11 +217,3 @@ def _counted(read: Callable[[int], bytes]) -> bytes | None:
         assert len(digits) < 8, digits
     message = read(int(digits))
     return message if len(message) == int(digits) else None
-
-
-def eventually(condition: Callable[[], object], timeout: float = LIMIT) -> None:
-    """Wait until something is so that nobody tells."""
-    deadline, pause = time.monotonic() + timeout, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline, "not so within the limit"
-        pause.wait(0.02)

@@ -18,7 +18,8 @@ from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import Process
 from tests.support.requirements import need_root
 from tests.support.rosmaster import master_at
-from tests.support.syslog import eventually, parse
+from tests.support.syslog import parse
+from tests.support.waiting import eventually
 
 KEEPER = "10.83.0.9"
 FORWARDER = (61017, 61014)  # its user, in the group that may read the log
@@ -54,7 +55,10 @@ class Keeper:
     def running(self) -> Iterator[None]:
         """While it runs."""
         with Process(self.host, self._command, env={}, label="rsyslogd") as process:
-            eventually(lambda: self.host.run(partial(_connects, KEEPER, 6514)) == "connected")
+            eventually(
+                lambda: self.host.run(partial(_connects, KEEPER, 6514)) == "connected",
+                "the keeper takes connections",
+            )
             yield
             process.stop()
 
@@ -138,13 +142,16 @@ def test_another_machine_keeps_the_log(lab: Lab, folder: Path, isolation: str) -
         with keeper.running():
             node.run(partial(set_parameters, uri, 30))
             wanted = log_of(appliance)
-            eventually(lambda: wanted <= keeper.sequences())
+            eventually(lambda: wanted <= keeper.sequences(), "the keeper has every record")
         node.run(partial(set_parameters, uri, 30))
         wanted = log_of(appliance)
         assert not wanted <= keeper.sequences()
         with keeper.running():
-            eventually(lambda: wanted <= keeper.sequences())
-            eventually(lambda: sum("rosrvCheckpoint@32473" in line for line in keeper.lines()) >= 2)
+            eventually(lambda: wanted <= keeper.sequences(), "the keeper has every record")
+            eventually(
+                lambda: sum("rosrvCheckpoint@32473" in line for line in keeper.lines()) >= 2,
+                "checkpoints came",
+            )
         verified = appliance.rosrv("audit", "verify", "--checkpoints", str(keeper.file))
         assert "kept elsewhere agree" in verified.stdout
         rogue = [parse(line.encode()) for line in keeper.lines() if "rogue" in line]
@@ -160,7 +167,7 @@ def test_datagrams_to_rsyslog(lab: Lab, folder: Path) -> None:
     with keeper.running(), Appliance(machine, options=("--config", str(config))) as appliance:
         machine.run(partial(set_parameters, "http://10.83.0.2:11311", 30))
         wanted = log_of(appliance)
-        eventually(lambda: wanted <= keeper.sequences())
+        eventually(lambda: wanted <= keeper.sequences(), "the keeper has every record")
 
 
 @pytest.mark.parametrize("backend", ["nft", "iptables"])

@@ -12,8 +12,8 @@ import pytest
 
 from appliance.shares.table import REST_CONNECTIONS
 from tests.support.appliance import Appliance
-from tests.support.relay_driver import wait_until
 from tests.support.rest import Rest
+from tests.support.waiting import eventually
 
 WRITES = ("/v1/policy", "/v1/policy/rollback", "/v1/policy/reload", "/v1/policy/confirm")
 READS = (
@@ -202,7 +202,7 @@ def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
         def said(text: str) -> str:
             return next((line for line in process.errors if text in line), "")
 
-        wait_until(lambda: bool(said("first access token")), "the path of the token is printed")
+        eventually(lambda: bool(said("first access token")), "the path of the token is printed")
         path = Path(said("first access token").rpartition(" ")[2])
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert len(process.output().splitlines()) == 1
@@ -241,7 +241,7 @@ def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
         def ended() -> int:
             return len(select.select(idle, [], [], 0)[0])
 
-        wait_until(
+        eventually(
             lambda: ended() >= len(idle) - REST_CONNECTIONS.bounds.host,
             "all beyond the share of a host are closed",
         )
@@ -249,5 +249,5 @@ def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
         other.request("GET", "/healthz")
         assert other.getresponse().status == 200
         other.close()
-        wait_until(lambda: ended() == len(idle), "those that are left end, too")
+        eventually(lambda: ended() == len(idle), "those that are left end, too")
         assert rest.with_token(None).get("/healthz").status == 200

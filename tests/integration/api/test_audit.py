@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.relay_driver import wait_until
 from tests.support.rest import Rest
+from tests.support.waiting import eventually
 
 POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault = *\n"
 
@@ -239,7 +239,7 @@ def test_followers_have_a_share_each(appliance: Appliance, rest: Rest) -> None:
     """A viewer's token takes six of sixteen streams, and is told; an admin still follows, and there is room again."""
     made = appliance.rosrv("token", "add", "greedy", "--role", "viewer", "--json").stdout
     admin, rest = rest, rest.with_token(json.loads(made)["token"])
-    wait_until(lambda: rest.get("/v1/whoami").status == 200, "the api knows the token")
+    eventually(lambda: rest.get("/v1/whoami").status == 200, "the api knows the token")
     open_ones: list[Generator[dict[str, str], None, None]] = []
     with pytest.raises(AssertionError, match="too many clients"):
         while len(open_ones) <= 16:

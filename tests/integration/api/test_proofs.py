@@ -10,8 +10,8 @@ import pytest
 
 from appliance.store.order_proof import HEADER, proof_of, reading_key, statement
 from tests.support.appliance import ROSRV, Appliance
-from tests.support.relay_driver import wait_until
 from tests.support.rest import Answer, Rest
+from tests.support.waiting import eventually
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_what_somebody_in_between_does_to_an_order_is_refused_and_recorded(runni
         assert refused.status == 403, (method, target, refused.body)
     assert revisions(holder.rest) == before
     records = running.audit("--event", "order refused")
-    wait_until(lambda: len(running.audit("--event", "order refused")) >= known + 3, "recorded")
+    eventually(lambda: len(running.audit("--event", "order refused")) >= known + 3, "recorded")
     records = running.audit("--event", "order refused")
     assert {one["decision"] for one in records} == {"deny"}
     assert {one["detail"]["who"] for one in records} == {"first"}
@@ -106,7 +106,7 @@ def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
         "POST", "/v1/policy", text.encode(), {"If-Match": "*", "Content-Type": "text/plain"}
     )
     running.kill("control")
-    wait_until(lambda: holder.rest.get("/v1/challenge").status == 200, "control is back")
+    eventually(lambda: holder.rest.get("/v1/challenge").status == 200, "control is back")
     refused = holder.rest.request("POST", "/v1/policy", text.encode(), kept_back)
     assert (refused.status, "since it started" in refused.json["detail"]) == (403, True)
 

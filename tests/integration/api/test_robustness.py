@@ -16,6 +16,7 @@ import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root
+from tests.support.waiting import eventually
 
 
 @pytest.fixture
@@ -41,11 +42,9 @@ def process_row(appliance: Appliance, role: str) -> dict[str, Any]:
     return next(one for one in rows if one["role"] == role)
 
 
-def until_another(appliance: Appliance, role: str, pid: int, seconds: float = 30) -> None:
+def until_another(appliance: Appliance, role: str, pid: int) -> None:
     """Wait until a process of the role runs that is not this one."""
-    deadline = time.monotonic() + seconds
-    while appliance.pids(role) in ([], [pid]):
-        assert time.monotonic() < deadline, appliance.story()
+    eventually(lambda: appliance.pids(role) not in ([], [pid]), appliance.story)
 
 
 def test_a_killed_api_costs_nothing_but_a_moment(appliance: Appliance) -> None:

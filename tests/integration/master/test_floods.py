@@ -17,6 +17,7 @@ from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering, whole
 from tests.support.processes import LIMIT
 from tests.support.rosmaster import master_at
+from tests.support.waiting import eventually
 
 POLICY = OPEN_POLICY
 HOST = "10.77.0.66"
@@ -76,10 +77,7 @@ def bystander(field: Field, calls: int = 30) -> float:
 
 def settled(field: Field, role: str, most: int) -> None:
     """What a flood left in memory is gone after a while: what was under way when it ended is still worked off."""
-    deadline = time.monotonic() + LIMIT
-    while (size := field.memory(role)) >= most:
-        assert time.monotonic() < deadline, f"{role} keeps {(size - most) >> 20} MiB more than it may"
-        threading.Event().wait(0.2)
+    eventually(lambda: field.memory(role) < most, f"{role} keeps less than {most >> 20} MiB")
 
 
 @pytest.fixture

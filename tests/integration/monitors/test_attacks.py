@@ -21,8 +21,8 @@ from appliance.cli.admin_socket import AdminSocket
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Event, Process
-from tests.support.relay_driver import wait_until
 from tests.support.requirements import needs
+from tests.support.waiting import eventually
 
 ROUNDS = 25  # of four changes each
 
@@ -85,7 +85,7 @@ def counted(listener: Process) -> Event:
 
 def caught_up(listener: Process, last: int) -> Event:
     """The same, when the last message has come."""
-    wait_until(lambda: counted(listener)["last"] == last, f"message {last}", seconds=90)
+    eventually(lambda: counted(listener)["last"] == last, f"message {last}", seconds=90)
     return counted(listener)
 
 
@@ -123,7 +123,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     for listener in (fast, stopped):
         listener.wait_for(event="first")
     stopped.popen.send_signal(signal.SIGSTOP)
-    wait_until(
+    eventually(
         lambda: ask(appliance, StatusWanted())["dropped"] > 0, "the stopped one's queue is full", seconds=90
     )
     slow = ros.node("rospy", "counting_listener", "/flood", "--slow", "0.002", name="slow")
@@ -147,7 +147,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     assert seen == sorted(seen)
     assert seen[-1] == ROUNDS
     lost = missing(counts[slow]) + missing(counts[stopped])
-    wait_until(
+    eventually(
         lambda: ask(appliance, StatusWanted())["dropped"] == lost, f"{lost} messages are counted as dropped"
     )
     assert missing(counts[stopped]) > 0
@@ -182,15 +182,15 @@ def test_a_relay_that_is_killed_while_specifications_are_loaded(
             in_force = number
         else:
             assert "try again" in answers[0].error + " ".join(answers[0].findings)
-        wait_until(lambda: len(relays(appliance)) == 2, "both relays run")
+        eventually(lambda: len(relays(appliance)) == 2, "both relays run")
         before = counted(listener)["last"]
 
         def settled(before: int = before, version: int = in_force) -> bool:
             count = counted(listener)
             return int(count["last"]) > before + 50 and versions(count)[-1] == version
 
-        wait_until(settled, f"messages go on, through version {in_force}")
+        eventually(settled, f"messages go on, through version {in_force}")
     load(appliance, tag=tag(9))
-    wait_until(lambda: versions(counted(listener))[-1] == 9, "the next load is in force")
+    eventually(lambda: versions(counted(listener))[-1] == 9, "the next load is in force")
     assert ask(appliance, MonitorsWanted())["refused"] == []
     talker.send("")

@@ -13,9 +13,9 @@ import pytest
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process
-from tests.support.relay_driver import wait_until
 from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster
+from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 SPECIFICATION = """
@@ -104,7 +104,7 @@ def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: R
     assert without_gap([int(words[1]) for words in heard])
     restarted = appliance.audit(event="monitors restarted")
     assert [record["detail"]["monitors"] for record in restarted] == [["left"]]
-    wait_until(lambda: int(str(rows(appliance)["right"]["events"])) > 5, "the counters of the second relay")
+    eventually(lambda: int(str(rows(appliance)["right"]["events"])) > 5, "the counters of the second relay")
     assert set(rows(appliance)) == {"left", "right"}
 
 
@@ -164,11 +164,11 @@ def test_services_are_carried_by_the_relay_of_their_monitor(
         client.wait_for(event="answered")
     appliance.rosrv("monitor", "load", str(path))
     appliance.kill("control")
-    wait_until(lambda: len(rows(appliance)) == 3, "control is back")
+    eventually(lambda: len(rows(appliance)) == 3, "control is back")
     for client in clients:
         client.send("true")
         client.wait_for_count(2, event="answered")
-    wait_until(lambda: int(str(rows(appliance)["gate"]["events"])) == 2, "the monitor has seen both requests")
+    eventually(lambda: int(str(rows(appliance)["gate"]["events"])) == 2, "the monitor has seen both requests")
 
 
 @pytest.mark.parametrize("client", CLIENTS)

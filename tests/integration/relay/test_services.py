@@ -8,7 +8,8 @@ import pytest
 from appliance.channel.messages import ClientRevoked, ConnectionClosed, ConnectionOpened, ConnectionRefused
 from appliance.ros.tcpros import HeaderParser, encode_header
 from tests.support.nodes import Client, RosSession
-from tests.support.relay_driver import LOOPBACK, Face, RelayDriver, wait_until
+from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
+from tests.support.waiting import eventually
 
 BOTH: tuple[Client, Client] = ("rospy", "roscpp")
 
@@ -50,7 +51,7 @@ def test_calls_are_answered(
         return [m.kind for m in messages if m.caller_id == "/client"]
 
     expected = ["service"] * (1 if options else 3)
-    wait_until(lambda: len(opened()) >= len(expected), "control is told of each connection")
+    eventually(lambda: len(opened()) >= len(expected), "control is told of each connection")
     assert opened() == expected
 
 

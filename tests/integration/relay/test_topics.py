@@ -21,7 +21,8 @@ from appliance.channel.messages import (
 )
 from appliance.ros.tcpros import HeaderParser, encode_header
 from tests.support.nodes import Client, RosSession
-from tests.support.relay_driver import LOOPBACK, Face, RelayDriver, wait_until
+from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
+from tests.support.waiting import eventually
 
 BOTH: tuple[Client, Client] = ("rospy", "roscpp")
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
@@ -141,7 +142,7 @@ def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosS
     node.wait_for(event="ready")
     face = driver.faces["/big"]
     driver.link.send(GrantInstalled(face.key, "/big", LOOPBACK, "/raw"))
-    wait_until(lambda: "/big" in face.publications, "the topic is registered")
+    eventually(lambda: "/big" in face.publications, "the topic is registered")
     sock, _header = subscribe(face, {"callerid": "/raw", "topic": "/big", **STRING})
     with sock, sock.makefile("rb") as stream:
         for size in (5, 10_000_000, 5, 3_000_000, 3_000_000, 0):

@@ -6,7 +6,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,6 +21,7 @@ from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
+from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog
 
 _LIMIT_SECONDS = 30
@@ -34,10 +34,7 @@ def events(path: Path) -> Counter[str]:
 
 def await_state(log: AuditLog, *, failed: bool) -> None:
     """Wait until the log says that it failed, or that it works."""
-    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
-    while (log.failed is not None) != failed:
-        assert time.monotonic() < end, f"failed is still {log.failed!r}"
-        tick.wait(0.01)
+    eventually(lambda: (log.failed is not None) == failed, lambda: f"failed is still {log.failed!r}")
 
 
 @pytest.mark.parametrize("durability", ["strict", "batched"])
@@ -57,10 +54,7 @@ def test_batched_is_on_disk_soon_without_being_asked(make_log: MakeLog, path: Pa
     """A record is on disk soon after it was recorded though nobody waits for it."""
     log = make_log()
     log.record(decision(log))
-    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
-    while not search(path, Filter(event="decision")).entries:
-        assert time.monotonic() < end
-        tick.wait(0.01)
+    eventually(lambda: search(path, Filter(event="decision")).entries, "it is on disk")
 
 
 def test_flushed_calls_back(make_log: MakeLog) -> None:

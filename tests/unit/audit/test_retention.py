@@ -17,6 +17,7 @@ from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
+from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog, Notary
 
 _DAY = 86_400_000_000_000
@@ -25,10 +26,7 @@ _LIMIT_SECONDS = 30
 
 def await_removal(path: Path, through: int = 1) -> None:
     """Wait until retention removed the records up to a sequence."""
-    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
-    while next(export(path, Filter(), page=1)).sequence <= through:
-        assert time.monotonic() < end
-        tick.wait(0.02)
+    eventually(lambda: next(export(path, Filter(), page=1)).sequence > through, "they are removed")
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:

@@ -1,8 +1,6 @@
 """Tests of room on the log's disk: what is told before it is full, and that all goes on by itself."""
 
 import subprocess
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from appliance.audit.search import search
 from appliance.shares.pool import Standing
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
+from tests.support.waiting import eventually
 
 _LIMIT_SECONDS = 30
 _RESERVE = 4 << 20
@@ -33,10 +32,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 def await_degraded(log: AuditLog, *, degraded: bool) -> None:
     """Wait until the log says that room is scarce, or does not any more."""
-    tick, end = threading.Event(), time.monotonic() + _LIMIT_SECONDS
-    while (log.degraded is not None) is not degraded:
-        assert time.monotonic() < end, log.degraded
-        tick.wait(0.05)
+    eventually(lambda: (log.degraded is not None) is degraded, lambda: f"degraded: {log.degraded}")
 
 
 def test_a_disk_that_fills_is_told_before_it_is_full(disk: Path) -> None:
