@@ -36,6 +36,7 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -333,117 +334,66 @@ def isolation_rules(
     `udp` are ports that are forwarded besides the TCP ports of the settings.
     """
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
+    forwarded = partial(Rule, chain=Chain.FORWARD)
+    leaving = partial(Rule, chain=Chain.LEAVING, leaves_on=inward)
     rules = [
         Rule(
+            "the appliance does not reach the host's loopback",
+            Verdict.DROP,
             chain=Chain.IN,
-            purpose="the appliance does not reach the host's loopback",
-            verdict=Verdict.DROP,
             arrives_on=inward,
             destination="127.0.0.0/8",
             new_connection=True,
         ),
-        Rule(
-            chain=Chain.FORWARD,
-            purpose="forwarded ports",
-            verdict=Verdict.RETURN,
-            leaves_on=inward,
-            translated=True,
-        ),
-        Rule(
-            chain=Chain.FORWARD,
-            purpose="no other way to the appliance",
-            verdict=Verdict.DROP,
-            leaves_on=inward,
-            unknown=True,
-        ),
-        Rule(
-            chain=Chain.ARRIVING,
-            purpose="the host's own loopback",
-            verdict=Verdict.RETURN,
-            arrives_on=LOOPBACK,
-        ),
-        Rule(
-            chain=Chain.LEAVING,
-            purpose="no packet of others under an address of the host",
-            verdict=Verdict.DROP,
+        forwarded("forwarded ports", Verdict.RETURN, leaves_on=inward, translated=True),
+        forwarded("no other way to the appliance", Verdict.DROP, leaves_on=inward, unknown=True),
+        Rule("the host's own loopback", Verdict.RETURN, chain=Chain.ARRIVING, arrives_on=LOOPBACK),
+        leaving(
+            "no packet of others under an address of the host",
+            Verdict.DROP,
             arrives_on=outward,  # neighbour discovery is made here, and is said to arrive where it leaves
-            leaves_on=inward,
             local_source=True,
             forwarded=True,
         ),
-        Rule(
-            chain=Chain.LEAVING,
-            purpose="the host's own packets: full TTL",
-            verdict=Verdict.FULL_HOPS,
-            leaves_on=inward,
-            forwarded=False,
-        ),
+        leaving("the host's own packets: full TTL", Verdict.FULL_HOPS, forwarded=False),
     ]
     for family, end in ends.items():
         if family not in routers:
-            rules.append(
-                Rule(
-                    chain=Chain.FORWARD,
-                    purpose=f"the host is no IPv{family} router",
-                    verdict=Verdict.DROP,
-                    family=family,
-                    arrives_on=outward,
-                    leaves_on=outward,
-                )
-            )
+            no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
+            rules.append(no_router(f"the host is no IPv{family} router", Verdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
         rules += [_forward("UDP", ports, end, outward) for ports in udp]
-        rules.append(
-            Rule(
-                chain=Chain.SOURCE_NAT,
-                purpose=f"the appliance's own connections, IPv{family}",
-                verdict=Verdict.MASQUERADE,
-                source=end.network,
-                leaves_on=outward,
-            )
-        )
+        masqueraded = partial(Rule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
+        rules.append(masqueraded(f"the appliance's own connections, IPv{family}", Verdict.MASQUERADE))
     return tuple(rules)
 
 
 def _true_sources(family: Family, end: Ends, inward: Interface) -> tuple[Rule, ...]:
     """Nobody has an address of the link but its two ends, and what enters it has the source it came with."""
+    elsewhere = partial(Rule, chain=Chain.ARRIVING, arrives_on=Interface(inward.name, other=True))
+    entering = partial(Rule, chain=Chain.KEPT_SOURCE, family=family, leaves_on=inward)
     return (
-        Rule(
-            chain=Chain.ARRIVING,
-            purpose=f"IPv{family} addresses of the appliance's link, from elsewhere",
-            verdict=Verdict.DROP,
-            arrives_on=Interface(inward.name, other=True),
-            source=end.network,
+        elsewhere(
+            f"IPv{family} addresses of the appliance's link, from elsewhere", Verdict.DROP, source=end.network
         ),
-        Rule(
-            chain=Chain.KEPT_SOURCE,
-            purpose=f"to the appliance: nobody else translates IPv{family} sources",
-            verdict=Verdict.KEEP_SOURCE,
-            family=family,
-            leaves_on=inward,
-        ),
+        entering(f"to the appliance: nobody else translates IPv{family} sources", Verdict.KEEP_SOURCE),
     )
 
 
 def _loopback(family: Family, inward: Interface) -> Rule:
     """127.0.0.1 is forwarded under the veth's address; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
-        return Rule(
-            chain=Chain.KEPT_SOURCE,
-            purpose="from the host's own loopback",
-            verdict=Verdict.MASQUERADE,
-            source="127.0.0.0/8",
-            leaves_on=inward,
-        )
-    return Rule(chain=Chain.NAT, purpose="not from ::1", verdict=Verdict.RETURN, destination="::1")
+        local = partial(Rule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
+        return local("from the host's own loopback", Verdict.MASQUERADE)
+    return Rule("not from ::1", Verdict.RETURN, chain=Chain.NAT, destination="::1")
 
 
 def _forward(protocol: Literal["TCP", "UDP"], ports: PortRange, end: Ends, outward: Interface) -> Rule:
     return Rule(
+        f"{protocol} {ports} to the appliance, IPv{family_of(end.appliance)}",
+        Verdict.DNAT,
         chain=Chain.NAT,
-        purpose=f"{protocol} {ports} to the appliance, IPv{family_of(end.appliance)}",
-        verdict=Verdict.DNAT,
         arrives_on=outward,
         tcp_ports=ports if protocol == "TCP" else None,
         udp_ports=ports if protocol == "UDP" else None,

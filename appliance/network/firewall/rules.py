@@ -15,7 +15,7 @@ Invariants:
 
 import ipaddress
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from functools import partial
 from typing import Literal, NamedTuple
@@ -65,16 +65,14 @@ class Verdict(StrEnum):
     """What becomes of a packet that matches."""
 
     RETURN = "RETURN"  # none of the appliance's business: on to the rules of others
-    ACCEPT = "ACCEPT"
     RESET = "RESET"  # TCP reset: the peer sees "connection refused"
     DROP = "DROP"
     DNAT = "DNAT"
     MASQUERADE = "MASQUERADE"
     COUNTED = "COUNTED"  # the connection is marked: what matches `answered` is no more true of it
     KEEP_SOURCE = "KEEP SOURCE"  # translated to the source it has: no later chain can give it another
-    FULL_HOPS = (
-        "FULL HOPS"  # TTL or hop limit 255, and on: a router that passes the packet on makes it smaller
-    )
+    # TTL or hop limit 255, and on: a router that passes the packet on makes it smaller
+    FULL_HOPS = "FULL HOPS"
 
 
 @dataclass(frozen=True)
@@ -126,13 +124,14 @@ class RateLimit:
             raise ValueError("a rate limit takes 1 to 100000 new connections per second, and for the burst")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Rule:
     """One rule: it matches when everything that is given matches."""
 
-    chain: Chain
     purpose: str  # shown by `rosrv status` and kept as the rule's comment; at most 100 characters
     verdict: Verdict
+    _: KW_ONLY
+    chain: Chain
     family: Family | None = None  # None: both
     arrives_on: Interface | None = None
     leaves_on: Interface | None = None
@@ -152,29 +151,25 @@ class Rule:
     distant: bool = False  # a router passed it on: its TTL or hop limit is below 255
     new_connection: bool = False  # as the connection tracker sees it
     unknown: bool = False  # of no connection that the tracker knows: new, untracked, invalid
-    answered: bool = (
-        False  # of a connection whose opener has answered our SYN-ACK, and that is not counted yet
-    )
+    answered: bool = False  # of a connection, not counted yet, whose opener has answered our SYN-ACK
     translated: bool = False  # belongs to a connection whose destination was translated
     to: str | None = None  # of DNAT: the address
 
     def __post_init__(self) -> None:
-        if self.verdict is Verdict.RESET and self.tcp_ports is None:
-            raise ValueError(f"rule {self.purpose!r}: only TCP can be reset")
-        if self.udp_ports is not None and self.is_tcp:
-            raise ValueError(f"rule {self.purpose!r}: a packet is TCP or UDP, not both")
-        if self.uid is not None and self.chain is not Chain.OUT:
-            raise ValueError(f"rule {self.purpose!r}: a packet has an owner in {Chain.OUT} only")
-        if self.forwarded is not None and self.chain is not Chain.LEAVING:
-            raise ValueError(
-                f"rule {self.purpose!r}: where a packet came from is matched in {Chain.LEAVING} only"
-            )
-        if self.above is not None and not self.answered:
-            raise ValueError(
-                f"rule {self.purpose!r}: a limit counts who has answered; others may be named by anybody"
-            )
-        if (self.verdict is Verdict.DNAT) != (self.to is not None):
-            raise ValueError(f"rule {self.purpose!r}: DNAT and its address go together")
+        impossible = {
+            "only TCP can be reset": self.verdict is Verdict.RESET and self.tcp_ports is None,
+            "a packet is TCP or UDP, not both": self.udp_ports is not None and self.is_tcp,
+            f"a packet has an owner in {Chain.OUT} only": self.uid is not None
+            and self.chain is not Chain.OUT,
+            f"where a packet came from is matched in {Chain.LEAVING} only": self.forwarded is not None
+            and self.chain is not Chain.LEAVING,
+            "a limit counts who has answered; others may be named by anybody": self.above is not None
+            and not self.answered,
+            "DNAT and its address go together": (self.verdict is Verdict.DNAT) != (self.to is not None),
+        }
+        for reason, is_so in impossible.items():
+            if is_so:
+                raise ValueError(f"rule {self.purpose!r}: {reason}")
 
     @property
     def is_tcp(self) -> bool:
@@ -287,12 +282,7 @@ class FirewallSettings:
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
-        for port in (
-            self.rosmaster_port,
-            self.inner_port,
-            self.master_port,
-            self.api_port,
-        ):
+        for port in (self.rosmaster_port, self.inner_port, self.master_port, self.api_port):
             if port is not None:
                 PortRange.one(port)
         for network in (*self.api_networks, *self.tunnel_only, *self.neighbours):
@@ -301,16 +291,31 @@ class FirewallSettings:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} {getattr(self, name)} is no user id")
 
+    @property
+    def api_ports(self) -> PortRange | None:
+        """The REST port as a range; None without REST."""
+        return None if self.api_port is None else PortRange.one(self.api_port)
+
 
 LOOPBACK = Interface("lo")
 OUTSIDE = Interface("lo", other=True)
 _ANY_PORT = PortRange(1, MAX_PORT)
 
+# What most rules share: first packets from outside, and those that local users send over loopback.
+_arriving = partial(Rule, chain=Chain.IN, arrives_on=OUTSIDE, opening=True)
+_connecting = partial(Rule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True)
+_sending = partial(Rule, chain=Chain.OUT)
+
 
 def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
     """Return the rules of the appliance's namespace, in the order in which they are tried."""
     return (
-        *(_own_packets_only(address) for address in settings.neighbours),
+        *(
+            _arriving(
+                f"{neighbour}: the machine's own packets only", Verdict.DROP, source=neighbour, distant=True
+            )
+            for neighbour in settings.neighbours
+        ),
         *(
             rule
             for network in settings.tunnel_only
@@ -346,44 +351,9 @@ def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[Rule, 
 
 def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Rule, ...]:
     return (
-        Rule(
-            chain=Chain.IN,
-            purpose=f"{name}: not from outside",
-            verdict=Verdict.RESET,
-            arrives_on=OUTSIDE,
-            tcp_ports=ports,
-            opening=True,
-        ),
-        Rule(
-            chain=Chain.OUT,
-            purpose=f"{name}: {user} may",
-            verdict=Verdict.RETURN,
-            leaves_on=LOOPBACK,
-            tcp_ports=ports,
-            opening=True,
-            uid=uid,
-        ),
-        Rule(
-            chain=Chain.OUT,
-            purpose=f"{name}: no other user",
-            verdict=Verdict.RESET,
-            leaves_on=LOOPBACK,
-            tcp_ports=ports,
-            opening=True,
-        ),
-    )
-
-
-def _own_packets_only(neighbour: str) -> Rule:
-    """Refuse packets that the machine at the other end of the link passed on under an address of its own."""
-    return Rule(
-        chain=Chain.IN,
-        purpose=f"{neighbour}: the machine's own packets only",
-        verdict=Verdict.DROP,
-        arrives_on=OUTSIDE,
-        source=neighbour,
-        opening=True,
-        distant=True,
+        _arriving(f"{name}: not from outside", Verdict.RESET, tcp_ports=ports),
+        _connecting(f"{name}: {user} may", Verdict.RETURN, tcp_ports=ports, uid=uid),
+        _connecting(f"{name}: no other user", Verdict.RESET, tcp_ports=ports),
     )
 
 
@@ -393,15 +363,7 @@ def _rosmaster(settings: FirewallSettings) -> tuple[Rule, ...]:
         return ()
     uid = settings.rosmaster_uid
     return (
-        Rule(
-            chain=Chain.OUT,
-            purpose="rosmaster: connects to nothing else",
-            verdict=Verdict.RESET,
-            leaves_on=LOOPBACK,
-            tcp_ports=_ANY_PORT,
-            opening=True,
-            uid=uid,
-        ),
+        _connecting("rosmaster: connects to nothing else", Verdict.RESET, tcp_ports=_ANY_PORT, uid=uid),
         _sends_nothing_out("rosmaster", uid),
     )
 
@@ -411,15 +373,15 @@ def _own_node(settings: FirewallSettings) -> tuple[Rule, ...]:
     node = settings.own_node
     if node is None:
         return ()
-    api = partial(Rule, chain=Chain.OUT, destination=node.address, tcp_ports=_ANY_PORT, opening=True)
-    answer = partial(Rule, chain=Chain.OUT, uid=node.uid, accepting=True)
+    api = partial(_sending, destination=node.address, tcp_ports=_ANY_PORT, opening=True)
+    answer = partial(_sending, uid=node.uid, accepting=True)
     return (
-        api(purpose="own node's API: control may", verdict=Verdict.RETURN, uid=settings.control_uid),
-        api(purpose="own node's API: no other user", verdict=Verdict.RESET),
+        api("own node's API: control may", Verdict.RETURN, uid=settings.control_uid),
+        api("own node's API: no other user", Verdict.RESET),
         *_inner_ports("own node's messages", node.ports, "relay", node.relay_uid),
-        answer(purpose="own node: control is answered", verdict=Verdict.RETURN, source=node.address),
-        answer(purpose="own node: the relay is answered", verdict=Verdict.RETURN, from_ports=node.ports),
-        answer(purpose="own node: nobody else is answered", verdict=Verdict.DROP),
+        answer("own node: control is answered", Verdict.RETURN, source=node.address),
+        answer("own node: the relay is answered", Verdict.RETURN, from_ports=node.ports),
+        answer("own node: nobody else is answered", Verdict.DROP),
         *inner_port("own node's master", node.master_port, "rosout", node.uid),
         *_ports_of_others(node.uid, settings),
         _sends_nothing_out("own node", node.uid),
@@ -431,51 +393,31 @@ def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[Rule]:
 
     Not said positively: which ports the faces and relays have, a new policy may change.
     """
-    connects = partial(Rule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True, uid=uid)
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
-        yield connects(purpose="own node: faces and relays", verdict=Verdict.RETURN, tcp_ports=faces)
+        yield _connecting("own node: faces and relays", Verdict.RETURN, tcp_ports=faces, uid=uid)
     closed = {
         "RVMaster port": PortRange.one(settings.master_port),
-        "REST port": PortRange.one(settings.api_port) if settings.api_port is not None else None,
+        "REST port": settings.api_ports,
         "low port": PortRange(1, 1023),
         "port of the kernel's choice": chosen,
     }
     for name, ports in closed.items():
         if ports is not None:
-            yield connects(purpose=f"own node: no {name}", verdict=Verdict.RESET, tcp_ports=ports)
+            yield _connecting(f"own node: no {name}", Verdict.RESET, tcp_ports=ports, uid=uid)
 
 
 def _sends_nothing_out(name: str, uid: int) -> Rule:
-    return Rule(
-        chain=Chain.OUT,
-        purpose=f"{name}: sends nothing out",
-        verdict=Verdict.DROP,
-        leaves_on=OUTSIDE,
-        uid=uid,
-    )
+    return _sending(f"{name}: sends nothing out", Verdict.DROP, leaves_on=OUTSIDE, uid=uid)
 
 
 def _tunnel_only(network: str, interface: str | None) -> tuple[Rule, ...]:
     """An address that is taken from, and sent to, through its tunnel only."""
     outside = Interface(interface, other=True) if interface else None
+    refused = partial(Rule, verdict=Verdict.DROP, clear_text=interface is None)
     return (
-        Rule(
-            chain=Chain.IN,
-            purpose=f"{network}: through its tunnel only",
-            verdict=Verdict.DROP,
-            source=network,
-            arrives_on=outside,
-            clear_text=interface is None,
-        ),
-        Rule(
-            chain=Chain.OUT,
-            purpose=f"{network}: never in clear text",
-            verdict=Verdict.DROP,
-            destination=network,
-            leaves_on=outside,
-            clear_text=interface is None,
-        ),
+        refused(f"{network}: through its tunnel only", chain=Chain.IN, source=network, arrives_on=outside),
+        refused(f"{network}: never in clear text", chain=Chain.OUT, destination=network, leaves_on=outside),
     )
 
 
@@ -483,94 +425,55 @@ def _forwarding(forwarder: Forwarder | None) -> tuple[Rule, ...]:
     """The forwarder's packets go to its receiver; whatever else its user sends goes nowhere."""
     if forwarder is None:
         return ()
+    sending = partial(_sending, uid=forwarder.uid)
     ports = PortRange.one(forwarder.port)
     return (
-        Rule(
-            chain=Chain.OUT,
-            purpose="audit log's forwarder: its receiver",
-            verdict=Verdict.RETURN,
+        sending(
+            "audit log's forwarder: its receiver",
+            Verdict.RETURN,
             destination=forwarder.address,
             tcp_ports=None if forwarder.datagrams else ports,
             udp_ports=ports if forwarder.datagrams else None,
-            uid=forwarder.uid,
         ),
-        Rule(
-            chain=Chain.OUT,
-            purpose="audit log's forwarder: nobody else",
-            verdict=Verdict.DROP,
-            uid=forwarder.uid,
-        ),
+        sending("audit log's forwarder: nobody else", Verdict.DROP),
     )
 
 
 def _api(settings: FirewallSettings) -> tuple[Rule, ...]:
-    if settings.api_port is None:
+    ports = settings.api_ports
+    if ports is None:
         return ()
-    ports = PortRange.one(settings.api_port)
-    allowed = (
-        Rule(
-            chain=Chain.IN,
-            purpose=f"REST port: {network} may",
-            verdict=Verdict.RETURN,
-            arrives_on=OUTSIDE,
-            source=network,
-            tcp_ports=ports,
-            opening=True,
-        )
-        for network in settings.api_networks
-    )
     return (
         *_rate_limit(settings.new_connections, "REST port", ports),
-        *allowed,
-        Rule(
-            chain=Chain.IN,
-            purpose="REST port: no other network",
-            verdict=Verdict.RESET,
-            arrives_on=OUTSIDE,
-            tcp_ports=ports,
-            opening=True,
+        *(
+            _arriving(f"REST port: {network} may", Verdict.RETURN, source=network, tcp_ports=ports)
+            for network in settings.api_networks
         ),
+        _arriving("REST port: no other network", Verdict.RESET, tcp_ports=ports),
     )
 
 
 def _rate_limits(settings: FirewallSettings) -> tuple[Rule, ...]:
-    ports = [("RVMaster port", PortRange.one(settings.master_port))]
-    if settings.node_ports is not None:
-        ports.append(("node and relay ports", settings.node_ports))
-    return tuple(rule for name, one in ports for rule in _rate_limit(settings.new_connections, name, one))
+    limit, nodes = settings.new_connections, settings.node_ports
+    return (
+        *_rate_limit(limit, "RVMaster port", PortRange.one(settings.master_port)),
+        *(_rate_limit(limit, "node and relay ports", nodes) if nodes is not None else ()),
+    )
 
 
-def _chosen_by_the_kernel(settings: FirewallSettings) -> tuple[Rule, ...]:
+def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[Rule]:
     """Nobody outside has business with the ports of the own nodes; with those that were chosen, he may have."""
     if settings.client_ports is None:
-        return ()
-    chosen = (
-        ("RVMaster port", PortRange.one(settings.master_port)),
-        ("node and relay ports", settings.node_ports),
-        ("REST port", PortRange.one(settings.api_port) if settings.api_port is not None else None),
-    )
-    return (
-        *(
-            Rule(
-                chain=Chain.IN,
-                purpose=f"{name}: not one of the kernel's choice",
-                verdict=Verdict.RETURN,
-                arrives_on=OUTSIDE,
-                tcp_ports=ports,
-                opening=True,
-            )
-            for name, ports in chosen
-            if ports is not None and ports.overlaps(settings.client_ports)
-        ),
-        Rule(
-            chain=Chain.IN,
-            purpose="own nodes' ports: not from outside",
-            verdict=Verdict.RESET,
-            arrives_on=OUTSIDE,
-            tcp_ports=settings.client_ports,
-            opening=True,
-        ),
-    )
+        return
+    chosen = {
+        "RVMaster port": PortRange.one(settings.master_port),
+        "node and relay ports": settings.node_ports,
+        "REST port": settings.api_ports,
+    }
+    for name, ports in chosen.items():
+        if ports is not None and ports.overlaps(settings.client_ports):
+            yield _arriving(f"{name}: not one of the kernel's choice", Verdict.RETURN, tcp_ports=ports)
+    yield _arriving("own nodes' ports: not from outside", Verdict.RESET, tcp_ports=settings.client_ports)
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[Rule, ...]:
@@ -582,22 +485,8 @@ def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[R
     """
     if limit is None:
         return ()
+    established = partial(Rule, chain=Chain.IN, arrives_on=OUTSIDE, tcp_ports=ports, answered=True)
     return (
-        Rule(
-            chain=Chain.IN,
-            purpose=f"{name}: new connections per host",
-            verdict=Verdict.DROP,
-            arrives_on=OUTSIDE,
-            tcp_ports=ports,
-            answered=True,
-            above=limit,
-        ),
-        Rule(
-            chain=Chain.IN,
-            purpose=f"{name}: counted",
-            verdict=Verdict.COUNTED,
-            arrives_on=OUTSIDE,
-            tcp_ports=ports,
-            answered=True,
-        ),
+        established(f"{name}: new connections per host", Verdict.DROP, above=limit),
+        established(f"{name}: counted", Verdict.COUNTED),
     )
