@@ -23,8 +23,8 @@ from appliance.api.problems import ProblemError
 from appliance.api.rates import Buckets, peer_key
 from appliance.channel.messages import Asked, TokenKept
 from appliance.config import is_loopback
+from appliance.order_proof import reading_hash, reading_id
 from appliance.shares.pool import Standing
-from appliance.store.order_proof import reading_hash, reading_id
 from appliance.store.tokens import is_secret, parse_token
 
 _KNOWN_SECONDS = 900.0

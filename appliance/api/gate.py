@@ -32,7 +32,7 @@ from appliance.api.problems import REASON, ProblemError, defect
 from appliance.api.rates import Buckets
 from appliance.channel.messages import Asked
 from appliance.config import ApiLimits
-from appliance.store.order_proof import HEADER
+from appliance.order_proof import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network

@@ -23,7 +23,7 @@ from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challen
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.control.rest_rights import RANKS, role_for
 from appliance.control.tokens import Tokens
-from appliance.store.order_proof import (
+from appliance.order_proof import (
     HEADER,
     BadProofError,
     is_signed,

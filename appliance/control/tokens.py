@@ -6,7 +6,6 @@ recorded.
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 from appliance.audit.record import Severity
 from appliance.channel.messages import TokenKept
@@ -115,7 +114,7 @@ class Tokens:
         if row is None:
             known = ", ".join(sorted(one.name for one in self._rows.values() if one.usable(now))) or "none"
             raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
-        revoked = replace(row, revoked=now)
+        revoked = row._replace(revoked=now)
         self._keep(revoked)
         self._recorder.happened(
             "token revoked",

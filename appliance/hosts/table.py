@@ -13,7 +13,6 @@ import ipaddress
 import itertools
 import re
 import time
-from dataclasses import replace
 
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.hosts.declared import Declared
@@ -203,7 +202,7 @@ class HostTable:
             return None
         following = certificate.next
         self.revoked.add(name, row.serial, row.expires)
-        taken = self._set(replace(row, serial=following.serial, expires=following.expires))
+        taken = self._set(row._replace(serial=following.serial, expires=following.expires))
         self._set_certificate(CertificateRow(name, time.time(), following.certificate))
         self.changed()
         return taken
@@ -213,7 +212,7 @@ class HostTable:
         row = self.enrolled_row(name)
         self._revoke_certificates(row)
         self.changed()
-        return self._set(replace(row, revoked=time.time()))
+        return self._set(row._replace(revoked=time.time()))
 
     def keep_ports(self, row: PortsRow) -> None:
         """What somebody saw of a machine's ports. Raises `HostRefusedError`."""
@@ -237,4 +236,4 @@ class HostTable:
         certificate = self.certificates.get(row.name)
         if certificate is not None and certificate.next is not None:
             self.revoked.add(row.name, certificate.next.serial, certificate.next.expires)
-            self._set_certificate(replace(certificate, next=None))
+            self._set_certificate(certificate._replace(next=None))

@@ -17,7 +17,8 @@ from typing import Any
 
 import msgspec
 
-Parameters = Sequence[str | int | float | bytes | None]
+Parameter = str | int | float | bytes | None
+Parameters = Sequence[Parameter]
 Statement = tuple[str, Parameters]
 
 _LENGTH = struct.Struct(">I")

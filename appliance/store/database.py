@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from appliance.store.ahead import Parameters, WriteAhead
+from appliance.store.ahead import Parameter, Parameters, WriteAhead
 
 _GROUP = 2_000
 _GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for company: it is safe in `ahead`
@@ -74,6 +74,16 @@ class Database:
             except OSError as error:
                 self._failed(f"{self._path.with_suffix('.ahead')}: {error}")
         self._queue.put(_Queued(sql, parameters, ahead))
+
+    def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
+        """Queue a row of a table, in the place of the one that has its key; see `submit`."""
+        marks = ", ".join("?" * len(row))
+        self.submit(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row, ahead=ahead)  # noqa: S608  fixed names
+
+    def delete(self, table: str, **where: Parameter) -> None:
+        """Queue that the rows with these values in these columns are gone; see `submit`."""
+        wanted = " AND ".join(f"{column} = ?" for column in where)
+        self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
 
     async def settled(self) -> None:
         """Wait until everything queued so far is in the file."""

@@ -1,7 +1,7 @@
 """The tables of hosts that come through tunnels: who is enrolled, with which certificate, who is awaited."""
 
 import json
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from appliance.store.database import Database
 
@@ -29,8 +29,7 @@ CREATE TABLE IF NOT EXISTS revocation (
 _LONGEST_SECONDS = 398 * 86_400.0  # of a certificate's life, as the authority has it
 
 
-@dataclass(frozen=True, slots=True)
-class HostRow:
+class HostRow(NamedTuple):
     """An enrolled host: its virtual address, its certificate's serial number (hexadecimal) and end.
 
     Times are seconds since the epoch; `revoked` is None while it may come. The address stays its name's.
@@ -44,8 +43,7 @@ class HostRow:
     revoked: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class NextCertificate:
+class NextCertificate(NamedTuple):
     """A certificate that its host has been given and has not said to have put in place."""
 
     serial: str
@@ -53,8 +51,7 @@ class NextCertificate:
     certificate: str
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateRow:
+class CertificateRow(NamedTuple):
     """The certificate (PEM) of a host, when it was made, and the one that is to follow it."""
 
     name: str
@@ -63,8 +60,7 @@ class CertificateRow:
     next: NextCertificate | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PortsRow:
+class PortsRow(NamedTuple):
     """What was seen of a machine's ROS ports from outside; `name` is a host's, or an address."""
 
     name: str
@@ -74,8 +70,7 @@ class PortsRow:
     who: str
 
 
-@dataclass(frozen=True, slots=True)
-class AwaitedRow:
+class AwaitedRow(NamedTuple):
     """A host that is awaited with a one-time token, of which only the hash is kept. One for each name."""
 
     name: str
@@ -89,8 +84,7 @@ class AwaitedRow:
     who: str
 
 
-@dataclass(frozen=True, slots=True)
-class RevokedRow:
+class RevokedRow(NamedTuple):
     """A certificate that is no longer its host's: since when, and its own end. `name` is empty if not known."""
 
     serial: str
@@ -107,10 +101,7 @@ class HostTables:
 
     def save(self, row: HostRow) -> None:
         """Keep a host, its new certificate, or that it is revoked."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO host VALUES (?, ?, ?, ?, ?, ?)",
-            (row.name, row.address, row.serial, row.expires, row.enrolled, row.revoked),
-        )
+        self._database.put("host", *row)
 
     def hosts(self) -> list[HostRow]:
         """All hosts that were ever enrolled, by name."""
@@ -118,74 +109,42 @@ class HostTables:
 
     def save_certificate(self, row: CertificateRow) -> None:
         """Keep the certificate of a host."""
-        following = row.next
-        self._database.submit(
-            "INSERT OR REPLACE INTO host_certificate VALUES (?, ?, ?, ?, ?, ?)",
-            (
-                row.name, row.made, row.certificate,
-                following.serial if following else None,
-                following.expires if following else None,
-                following.certificate if following else None,
-            ),
-        )  # fmt: skip
+        self._database.put("host_certificate", *row[:-1], *(row.next or (None, None, None)))
 
     def certificates(self) -> list[CertificateRow]:
         """The certificates of all hosts."""
         return [
             CertificateRow(
-                name,
-                made,
-                certificate,
-                NextCertificate(serial, expires, text) if serial is not None else None,
+                name, made, certificate, NextCertificate(*following) if following[0] is not None else None
             )
-            for name, made, certificate, serial, expires, text in self._database.query(
-                "SELECT * FROM host_certificate"
-            )
+            for name, made, certificate, *following in self._database.query("SELECT * FROM host_certificate")
         ]
 
     def save_ports(self, row: PortsRow) -> None:
         """Keep what was seen of a machine's ports."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO host_ports VALUES (?, ?, ?, ?, ?)",
-            (row.name, row.state, json.dumps(row.open), row.checked, row.who),
-        )
+        self._database.put("host_ports", row.name, row.state, json.dumps(row.open), row.checked, row.who)
 
     def ports(self) -> list[PortsRow]:
         """Everything that was seen of ports."""
-        return [
-            PortsRow(name, state, json.loads(opened), checked, who)
-            for name, state, opened, checked, who in self._database.query("SELECT * FROM host_ports")
-        ]
+        rows = self._database.query("SELECT * FROM host_ports")
+        return [PortsRow(name, state, json.loads(opened), *told) for name, state, opened, *told in rows]
 
     def save_awaited(self, row: AwaitedRow) -> None:
         """Keep a one-time token, in the place of an earlier one of its name."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO enrolment_token VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                row.name, row.id, row.hash, row.created, row.expires, row.address, row.days,
-                json.dumps(row.kit), row.who,
-            ),
-        )  # fmt: skip
+        self._database.put("enrolment_token", *row[:-2], json.dumps(row.kit), row.who)
 
     def forget_awaited(self, name: str) -> None:
         """A token was used, or has ended."""
-        self._database.submit("DELETE FROM enrolment_token WHERE name = ?", (name,))
+        self._database.delete("enrolment_token", name=name)
 
     def awaited(self) -> list[AwaitedRow]:
         """The tokens that were not used."""
-        return [
-            AwaitedRow(name, token, digest, created, expires, address, days, json.loads(kit), who)
-            for name, token, digest, created, expires, address, days, kit, who in self._database.query(
-                "SELECT * FROM enrolment_token"
-            )
-        ]
+        rows = self._database.query("SELECT * FROM enrolment_token")
+        return [AwaitedRow._make((*row[:-2], json.loads(row[-2]), row[-1])) for row in rows]
 
     def save_revoked(self, row: RevokedRow) -> None:
         """Keep that a certificate is revoked."""
-        self._database.submit(
-            "INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)",
-            (row.serial, row.name, row.moment, row.expires),
-        )
+        self._database.submit("INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)", row)
 
     def forget_revoked(self, before: float) -> None:
         """Certificates that ended before this moment are good for nothing, revoked or not."""

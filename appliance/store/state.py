@@ -1,15 +1,14 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
+from appliance.order_proof import TokenKeys
 from appliance.store import hosts
 from appliance.store.database import Database
-from appliance.store.order_proof import TokenKeys
 from appliance.store.tokens import TokenRow
 
 _SCHEMA = """
@@ -53,8 +52,7 @@ CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) 
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter that is kept at once
 
 
-@dataclass(frozen=True, slots=True)
-class IncarnationRow:
+class IncarnationRow(NamedTuple):
     """One incarnation as it is kept; `changed` is seconds since the epoch.
 
     `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
@@ -73,8 +71,7 @@ class IncarnationRow:
     more_relay_ports: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class RegistrationRow:
+class RegistrationRow(NamedTuple):
     """One registration as it is kept; `ordinal` is its place in the order they were made."""
 
     key: str
@@ -84,8 +81,7 @@ class RegistrationRow:
     ordinal: int
 
 
-@dataclass(frozen=True, slots=True)
-class PermissionRow:
+class PermissionRow(NamedTuple):
     """One grant of the relay (`kind` "topic" or "service")."""
 
     key: str
@@ -95,8 +91,7 @@ class PermissionRow:
     caller_id: str
 
 
-@dataclass(frozen=True, slots=True)
-class RevisionRow:
+class RevisionRow(NamedTuple):
     """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where."""
 
     revision: int
@@ -107,8 +102,7 @@ class RevisionRow:
     note: str
 
 
-@dataclass(frozen=True, slots=True)
-class MonitorRevisionRow:
+class MonitorRevisionRow(NamedTuple):
     """Specifications that were in force (`sources` is JSON); `loaded` is seconds since the epoch."""
 
     revision: int
@@ -138,73 +132,47 @@ class StateStore:
 
     def save_incarnation(self, row: IncarnationRow) -> None:
         """Keep an incarnation, or its new `life`."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO incarnation VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                row.key, row.name, row.host, row.api, row.told,
-                row.outer_port, row.relay_port, int(row.own), row.life, row.changed,
-            ),
-        )  # fmt: skip
-        self._database.submit("DELETE FROM relay_port WHERE key = ?", (row.key,))
+        self._database.put("incarnation", *row[:-1])
+        self._database.delete("relay_port", key=row.key)
         for relay, port in enumerate(row.more_relay_ports, start=1):
-            self._database.submit(
-                "INSERT OR REPLACE INTO relay_port VALUES (?, ?, ?)", (row.key, relay, port)
-            )
+            self._database.put("relay_port", row.key, relay, port)
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""
-        self._database.submit("DELETE FROM incarnation WHERE key = ?", (key,))
-        self._database.submit("DELETE FROM relay_port WHERE key = ?", (key,))
-        self._database.submit("DELETE FROM registration WHERE key = ?", (key,))
-        self._database.submit("DELETE FROM permission WHERE key = ?", (key,))
+        for table in ("incarnation", "relay_port", "registration", "permission"):
+            self._database.delete(table, key=key)
 
     def save_registration(self, row: RegistrationRow) -> None:
         """Keep a registration."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO registration VALUES (?, ?, ?, ?, ?)",
-            (row.key, row.kind, row.resource, row.detail, row.ordinal),
-        )
+        self._database.put("registration", *row)
 
     def remove_registration(self, key: str, kind: str, resource: str) -> None:
         """Drop a registration."""
-        self._database.submit(
-            "DELETE FROM registration WHERE key = ? AND kind = ? AND resource = ?", (key, kind, resource)
-        )
+        self._database.delete("registration", key=key, kind=kind, resource=resource)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
         """Everything that is kept, registrations in order."""
+        query = self._database.query
         ports: dict[str, tuple[int, ...]] = {}
-        for key, port in self._database.query("SELECT key, port FROM relay_port ORDER BY key, relay"):
+        for key, port in query("SELECT key, port FROM relay_port ORDER BY key, relay"):
             ports[key] = (*ports.get(key, ()), port)
         incarnations = [
-            IncarnationRow(
-                key, name, host, api, told, outer, relay, bool(own), life, changed, ports.get(key, ())
-            )
-            for key, name, host, api, told, outer, relay, own, life, changed in self._database.query(
-                "SELECT * FROM incarnation ORDER BY changed"
-            )
+            IncarnationRow._make((*row, ports.get(row[0], ())))._replace(own=bool(row[7]))
+            for row in query("SELECT * FROM incarnation ORDER BY changed")
         ]
-        registrations = [
-            RegistrationRow(*row)
-            for row in self._database.query("SELECT * FROM registration ORDER BY ordinal")
+        return incarnations, [
+            RegistrationRow(*row) for row in query("SELECT * FROM registration ORDER BY ordinal")
         ]
-        return incarnations, registrations
 
     # --- grants ---
 
     def save_permission(self, row: PermissionRow) -> None:
         """Keep a grant."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO permission VALUES (?, ?, ?, ?, ?)",
-            (row.key, row.kind, row.resource, row.host, row.caller_id),
-        )
+        self._database.put("permission", *row)
 
     def remove_permission(self, row: PermissionRow) -> None:
         """Drop a grant."""
-        self._database.submit(
-            "DELETE FROM permission WHERE key = ? AND kind = ? AND resource = ? AND host = ? AND caller_id = ?",
-            (row.key, row.kind, row.resource, row.host, row.caller_id),
-        )
+        self._database.delete("permission", **row._asdict())
 
     def permissions(self) -> list[PermissionRow]:
         """All grants that are kept."""
@@ -214,9 +182,7 @@ class StateStore:
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
         """Keep the whole parameter tree, in the place of the changes before it."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO parameters VALUES (1, ?)", (msgspec.msgpack.encode(tree),), ahead=False
-        )
+        self._database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
         # Changes that stay though the tree has them (after a crash) are made once more, in order: the tree is the same.
         self._database.submit(
             "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
@@ -231,9 +197,7 @@ class StateStore:
         if data is not None and len(data) > LARGEST_CHANGE:
             return
         self._parameter_changes += 1
-        self._database.submit(
-            "INSERT OR REPLACE INTO parameter_change VALUES (?, ?, ?)", (self._parameter_changes, key, data)
-        )
+        self._database.put("parameter_change", self._parameter_changes, key, data)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
         """The changes since the tree was kept, in order; None for a parameter that is gone."""
@@ -244,7 +208,7 @@ class StateStore:
 
     def parameter_owned(self, key: str, host: str) -> None:
         """From this key on the parameters are this host's."""
-        self._database.submit("INSERT OR REPLACE INTO parameter_owner VALUES (?, ?)", (key, host))
+        self._database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
         """This key and those below it have no owner of their own any more."""
@@ -263,30 +227,20 @@ class StateStore:
         rows = self._database.query("SELECT tree FROM parameters WHERE id = 1")
         return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
 
-    # --- policy revisions ---
+    # --- revisions of the policy and of the specifications ---
 
     def save_revision(self, row: RevisionRow) -> None:
         """Keep a policy that comes into force."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO policy_revision VALUES (?, ?, ?, ?, ?, ?)",
-            (row.revision, row.text, row.file, row.loaded, row.who, row.note),
-        )
+        self._database.put("policy_revision", *row)
 
     def revisions(self) -> list[RevisionRow]:
         """All kept revisions, the newest first."""
-        return [
-            RevisionRow(*row)
-            for row in self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
-        ]
-
-    # --- revisions of the specifications ---
+        rows = self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
+        return [RevisionRow(*row) for row in rows]
 
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
         """Keep specifications that come into force."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO monitor_revision VALUES (?, ?, ?, ?, ?)",
-            (row.revision, row.sources, row.loaded, row.who, row.note),
-        )
+        self._database.put("monitor_revision", *row)
 
     def monitor_revision(self) -> MonitorRevisionRow | None:
         """The last that came into force; None when there never was one."""
@@ -297,30 +251,21 @@ class StateStore:
 
     def save_token(self, row: TokenRow) -> None:
         """Keep a token, or that it is revoked."""
-        self._database.submit(
-            "INSERT OR REPLACE INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (row.id, row.name, row.role, row.salt, row.hash, row.created, row.expires, row.revoked),
-        )
+        self._database.put("token", *row[:-1])
         if row.keys is not None:
-            self._database.submit(
-                "INSERT OR REPLACE INTO token_keys VALUES (?, ?, ?)",
-                (row.id, row.keys.reading, row.keys.verifying),
-            )
+            self._database.put("token_keys", row.id, *row.keys)
 
     def tokens(self) -> list[TokenRow]:
         """All tokens that were ever made, the oldest first."""
-        kept = {
-            token: TokenKeys(reading, verifying)
-            for token, reading, verifying in self._database.query("SELECT * FROM token_keys")
-        }
+        kept = {token: TokenKeys(*keys) for token, *keys in self._database.query("SELECT * FROM token_keys")}
         rows = self._database.query("SELECT * FROM token ORDER BY created")
-        return [replace(TokenRow(*row), keys=kept.get(row[0])) for row in rows]
+        return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
 
     # --- settings ---
 
     def save_setting(self, name: str, value: str) -> None:
         """Keep a named value."""
-        self._database.submit("INSERT OR REPLACE INTO setting VALUES (?, ?)", (name, value))
+        self._database.put("setting", name, value)
 
     def settings(self) -> dict[str, str]:
         """All named values."""

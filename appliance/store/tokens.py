@@ -12,9 +12,9 @@ import hashlib
 import hmac
 import re
 import secrets
-from dataclasses import dataclass
+from typing import NamedTuple
 
-from appliance.store.order_proof import TokenKeys, keys_of
+from appliance.order_proof import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
@@ -28,8 +28,7 @@ class BadTokenNameError(ValueError):
     """A name no token can have; the text says which can."""
 
 
-@dataclass(frozen=True, slots=True)
-class TokenRow:
+class TokenRow(NamedTuple):
     """A token as it is kept; times are seconds since the epoch, `revoked` None while it is not."""
 
     id: str

@@ -5,7 +5,7 @@ Invariants:
 1. The token leaves this machine encrypted, for a server whose certificate is trusted (`--api-ca`, else the system's
    authorities), or not at all: there is no way to switch that off. Clear text is for loopback addresses.
 2. The token comes from the environment, never from the command line, which every user of the machine can see. It
-   does not leave the program: its reading key is sent, and each order is signed (`store/order_proof.py`).
+   does not leave the program: its reading key is sent, and each order is signed (`order_proof.py`).
 3. Nothing is followed elsewhere: no redirect, no proxy, no credentials from `.netrc`.
 """
 
@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.cli.admin_socket import SECONDS, NotRunningError
-from appliance.store.order_proof import HEADER, proof_of, reading_key, statement
+from appliance.order_proof import HEADER, proof_of, reading_key, statement
 from appliance.store.tokens import parse_token
 
 _CONNECT_SECONDS = 10.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from appliance.store.order_proof import HEADER, proof_of, reading_key, statement
+from appliance.order_proof import HEADER, proof_of, reading_key, statement
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.rest import Answer, Rest
 from tests.support.waiting import eventually

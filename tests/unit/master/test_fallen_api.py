@@ -19,7 +19,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.messages import Asked
 from appliance.control.rest import RestLink
 from appliance.control.tokens import Tokens
-from appliance.store.order_proof import proof_of, reading_key, statement
+from appliance.order_proof import proof_of, reading_key, statement
 from appliance.store.state import StateStore
 from tests.support.heard import Heard
 

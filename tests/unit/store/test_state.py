@@ -4,7 +4,6 @@ import os
 import signal
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -71,7 +70,7 @@ def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
         append(ahead, statement)
 
     monkeypatch.setattr(WriteAhead, "append", observed)
-    node = replace(incarnation("k1"), more_relay_ports=(19003, 19004))
+    node = incarnation("k1")._replace(more_relay_ports=(19003, 19004))
     registration = RegistrationRow("k1", "publication", "/a", "*", 1)
     grant = PermissionRow("k1", "topic", "/a", "10.0.0.9", "/listener")
     store = reopened(tmp_path)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.store.order_proof`: the vectors of `docs/rest.md`, and that no proof fits another request."""
+"""Tests of `appliance.order_proof`: the vectors of `docs/rest.md`, and that no proof fits another request."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.store.order_proof import (
+from appliance.order_proof import (
     BadProofError,
     is_signed,
     keys_of,
@@ -115,7 +115,7 @@ def test_what_is_no_proof_is_told(header: str) -> None:
 
 def test_the_page_shows_what_a_script_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """The example of docs/rest.md makes the reading key and the proof of the vectors."""
-    page = (Path(__file__).parents[3] / "docs" / "rest.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "rest.md").read_text()
     [example] = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
     monkeypatch.setenv("ROSRV_TOKEN", TOKEN)
     names: dict[str, Any] = {}

@@ -20,7 +20,7 @@ import base64
 import hashlib
 import hmac
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -36,8 +36,7 @@ class BadProofError(ValueError):
     """A proof or a request that none can be made for; the text says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class TokenKeys:
+class TokenKeys(NamedTuple):
     """What is kept of a token's keys: SHA-256 of the reading key, the public half of the signing key; 32 bytes each."""
 
     reading: bytes
