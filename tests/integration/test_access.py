@@ -73,7 +73,7 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
     assert "[Publishers] /topic1" in answer[1]
     heard = listener.wait_for_count(5, event="received")
     assert {event["publisher"] for event in heard} == {"/rightful"}
-    (record,) = appliance.audit("--deny", resource="/topic1")
+    (record,) = appliance.recorded("--deny", resource="/topic1")
     assert (record["host"], record["caller_id"], record["category"]) == ("10.77.0.66", "/forged", "publish")
     assert (record["rule"]["section"], record["rule"]["key"]) == ("Publishers", "/topic1")
     assert record["rule"]["line"] == POLICY.splitlines().index("/topic1 = first") + 1
@@ -91,7 +91,7 @@ def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, seco
     talker = ros.talker("roscpp", "/topic1", name="driver")
     listener = ros.listener("rospy", "/topic1")
     ros.on(second).run("rosnode", "kill", "/driver", check=False)
-    assert appliance.audit("--deny", host="10.77.0.66", resource="shutdown")
+    assert appliance.recorded("--deny", host="10.77.0.66", resource="shutdown")
     listener.wait_for(event="received", since=listener.mark())
     assert talker.running
     ros.run("rosnode", "kill", "/driver")

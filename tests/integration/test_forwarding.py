@@ -137,7 +137,7 @@ def test_history_written_anew_by_root(tmp_path: Path) -> None:
         with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/thief")[0] == 0
         work(appliance, 20)
-        (theft,) = appliance.audit("--caller", "/thief")
+        (theft,) = appliance.recorded("--caller", "/thief")
         collector.wait_for(
             lambda messages: any(int(one.fields["sequence"]) >= theft["sequence"] for one in sealed(messages))
         )

@@ -104,7 +104,7 @@ def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
     talker.wait_for_count(2 * len(heard), event="sent")
     assert heard[-1] > len(heard)
     assert without_gap(numbers(other))
-    [first, *_] = reversed(appliance.audit("--event", "rate limited", caller_id=f"/{name}"))
+    [first, *_] = reversed(appliance.recorded("--event", "rate limited", caller_id=f"/{name}"))
     assert (first["host"], first["resource"], first["rule"]["key"]) == ("10.77.0.10", topic, topic)
     assert first["detail"]["part"] == "publisher"
     if topic == "/watched":

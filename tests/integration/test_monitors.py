@@ -82,13 +82,13 @@ def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
     bad.wait_for(event="ready")
     listener.wait_for_count(20, event="received")
     assert not [event for event in listener.seen(event="received") if "bad" in event["data"]]
-    assert appliance.audit(event="message dropped", resource="/chatter")
-    told = appliance.audit(event="message changed", resource="/chatter")
+    assert appliance.recorded(event="message dropped", resource="/chatter")
+    told = appliance.recorded(event="message changed", resource="/chatter")
     changed = next(one for one in told if "before" in one["detail"])  # the others are sums of a second
     assert bytes.fromhex(changed["detail"]["before"])[4:].startswith(b"good")
     assert changed["detail"]["before_fields"]["data"].startswith("good")
     assert bytes.fromhex(changed["detail"]["after"])[4:].startswith(b"checked good")
-    assert "a bad word" in {one["reason"] for one in appliance.audit(event="monitor log")}
+    assert "a bad word" in {one["reason"] for one in appliance.recorded(event="monitor log")}
 
 
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
@@ -116,8 +116,8 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     appliance.rosrv("monitor", "reload")
     assert monitor(appliance, "words")["enabled"] is True
     for event in ("monitor disabled", "monitor enabled"):
-        assert appliance.audit(event=event, resource="words")[0]["detail"]["who"] == "operator"
-    loaded = [record["detail"] for record in appliance.audit(event="specifications loaded")]
+        assert appliance.recorded(event=event, resource="words")[0]["detail"]["who"] == "operator"
+    loaded = [record["detail"] for record in appliance.recorded(event="specifications loaded", count=3)]
     assert ["words.rv"] in [detail["removed"] for detail in loaded]
     assert ["words.rv"] in [detail["changed"] for detail in loaded]
 
@@ -155,7 +155,7 @@ def test_a_new_relay_begins_in_the_initial_state_and_says_so(appliance: Applianc
     plain.wait_for_count(before + 5, event="received")
     assert plain.seen(event="received")[-1]["data"].startswith("hello")
     assert monitor(appliance, "gate")["held"] is True
-    alarm = appliance.audit(event="monitors restarted")[0]
+    alarm = appliance.recorded(event="monitors restarted")[0]
     assert (alarm["severity"], alarm["detail"]["held"]) == ("alarm", ["gate"])
     before = len(listener.seen(event="received"))
     appliance.rosrv("monitor", "resume", "gate")
@@ -254,7 +254,7 @@ def test_requests_are_refused_and_responses_changed(
     client.send("false")
     client.wait_for_count(2, event="answered")
     assert [event["data"] for event in server.wait_for_count(2, event="called")] == [True, False]
-    refused = appliance.audit(event="message dropped", resource="/mode")[0]
+    refused = appliance.recorded(event="message dropped", resource="/mode")[0]
     assert refused["detail"]["monitor"] == "gate"
 
 
@@ -373,7 +373,7 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
             lambda: monitor(appliance, "safeTrigger")["drops"] == 1,
             "the trigger at the robot itself is dropped",
         )
-        dropped = appliance.audit(event="message dropped", resource="/landshark_control/trigger")
+        dropped = appliance.recorded(event="message dropped", resource="/landshark_control/trigger")
         assert dropped[0]["detail"]["monitor"] == "safeTrigger"
 
 
@@ -394,5 +394,5 @@ def test_the_publisher_has_the_configured_name_and_is_hidden_and_faults_pass(
         assert alarm.wait_for(event="received")["publisher"] == "/guard"
         heard = [event["data"] for event in listener.wait_for_count(3, event="received")]
         assert [text.startswith("checked") for text in heard] == [True, False, True]
-        assert appliance.audit(event="monitor fault")[0]["detail"]["values"]["heard"] == 2
+        assert appliance.recorded(event="monitor fault")[0]["detail"]["values"]["heard"] == 2
         assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout

@@ -34,7 +34,7 @@ def test_a_rollback_gives_running_nodes_back_what_a_bad_policy_took(
     ros.talker(client, "/chatter", name="voice")
     listener.wait_for(event="received")
     appliance.reload(without)
-    revoked = appliance.audit("--event", "revoked")
+    revoked = appliance.recorded("--event", "revoked")
     assert {record["resource"] for record in revoked} == {"/chatter"}
     assert all(record["rule"]["key"] == "/chatter" for record in revoked)
     assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0] or (
@@ -96,7 +96,7 @@ def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
         voice.popen.send_signal(signal.SIGSTOP)
         eventually(lambda: appliance.audit("--event", "node lost", caller_id="/voice"), "it is lost")
         appliance.reload(NO_CHATTER)
-        assert appliance.audit("--event", "revoked", caller_id="/voice", resource="/chatter")
+        assert appliance.recorded("--event", "revoked", caller_id="/voice", resource="/chatter")
         voice.popen.send_signal(signal.SIGCONT)
         eventually(lambda: appliance.audit("--event", "node returned", caller_id="/voice"), "it is back")
         assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0]

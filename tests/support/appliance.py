@@ -18,6 +18,7 @@ from typing import Any, Self
 
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
 from tests.support.rest import Rest
+from tests.support.waiting import eventually
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 OPEN_POLICY = """\
@@ -125,6 +126,15 @@ class Appliance:
         return [
             record for record in records if all(record.get(key) == value for key, value in fields.items())
         ]
+
+    def recorded(self, *flags: str, count: int = 1, **fields: Any) -> list[dict[str, Any]]:
+        """The same, once there are so many: a record is on disk, and a relay's report at control, a little later."""
+
+        def found() -> list[dict[str, Any]] | None:
+            records = self.audit(*flags, **fields)
+            return records if len(records) >= count else None
+
+        return eventually(found, lambda: f"{count} records {flags} {fields}\n{self.story()}")
 
     def reload(self, policy: str) -> None:
         """Write the policy file and have it read again."""

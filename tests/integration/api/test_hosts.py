@@ -96,7 +96,7 @@ def test_wrong_enrolment_tokens_are_slowed_down(running: Appliance, nobody: Rest
     """Each is recorded; after some of them the host has to wait, before anything is looked at."""
     body = {"token": TOKEN, "request": signing_request(make_key(), "laptop").decode()}
     assert "was used before" in problem(nobody.post("/v1/enrol", body), 403, "not-recognised")
-    assert running.audit("--event", "enrolment refused")
+    assert running.recorded("--event", "enrolment refused")
     problem(nobody.post("/v1/enrol", body | {"token": "rosrv_0_0"}), 422, "bad-input")
     problem(nobody.post("/v1/enrol", body | {"request": "x" * 30_000}), 413, "too-large")
     for _attempt in range(200):
@@ -112,7 +112,7 @@ def test_nobody_renews_outside_a_tunnel(running: Appliance, nobody: Rest) -> Non
     body = {"request": signing_request(make_key(), "laptop").decode(), "proof": "AAAA"}
     problem(nobody.post("/v1/hosts/laptop/renew", body), 403, "not-recognised")
     problem(nobody.post("/v1/hosts/laptop/renewed"), 403, "not-recognised")
-    assert running.audit("--event", "renewal refused")
+    assert running.recorded("--event", "renewal refused")
 
 
 def test_the_authority_and_its_list_are_public(nobody: Rest) -> None:

@@ -18,6 +18,7 @@ from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.rest import Rest
+from tests.support.waiting import eventually
 
 WITHOUT_PUBLISHERS = OPEN_POLICY.replace("[Publishers]\ndefault = *\n", "[Publishers]\n/allowed = *\n")
 TRANSPORT = ("--api", "127.0.0.1:0", "--api-tls", "off")
@@ -55,6 +56,12 @@ def register(uri: str, topic: str) -> Any:
         return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
 
 
+def call_with(appliance: Appliance, status: int) -> dict[str, Any] | None:
+    """The record of a call of /v1/policy that ended with this status, once there is one."""
+    calls = appliance.audit("--event", "rest call", resource="/v1/policy")
+    return next((one for one in calls if one["detail"]["status"] == status), None)
+
+
 def test_a_wrong_policy_is_refused_whole_with_every_place(appliance: Appliance) -> None:
     """Each finding has line and column, the problem those of the first; nothing changes; the refusal is recorded."""
     rest = appliance.rest()
@@ -66,12 +73,11 @@ def test_a_wrong_policy_is_refused_whole_with_every_place(appliance: Appliance) 
     assert [(one["line"], one["severity"]) for one in problem["findings"]] == [(3, "error"), (4, "error")]
     assert "did you mean Publishers?" in problem["findings"][1]["text"]
     assert rest.get("/v1/policy").json["revision"] == 1
-    calls = appliance.audit("--event", "rest call", resource="/v1/policy")
-    refused = next(one for one in calls if one["detail"]["status"] == 422)
+    refused = eventually(lambda: call_with(appliance, 422), "the refused call is recorded")
     assert refused["detail"]["who"] == "first"
     assert "policy:3:1" in refused["reason"]
     assert refused["decision"] == "deny"
-    [recorded] = appliance.audit("--event", "policy refused")
+    [recorded] = appliance.recorded("--event", "policy refused")
     assert recorded["detail"]["who"] == "first"
     assert "revision 2:3:1" in recorded["detail"]["findings"][0]
 
@@ -89,7 +95,7 @@ def test_a_right_policy_is_in_force_at_once_and_survives(appliance: Appliance) -
     assert [(one["what"], one["resource"]) for one in posted.json["ends"]] == [("publication", "/cmd_vel")]
     assert posted.etag == '"2"'
     assert register(appliance.master_uri, "/cmd_vel")[0] == 0
-    loaded = appliance.audit("--event", "policy loaded")[0]
+    loaded = appliance.recorded("--event", "policy loaded")[0]
     assert loaded["detail"]["who"] == "first"
     status = appliance.status()["policy"]
     assert (status["revision"], status["differs_from_file"], status["who"]) == (2, True, "first")
@@ -242,7 +248,7 @@ def test_reload_takes_the_file(appliance: Appliance) -> None:
     assert (answer.json["revision"], answer.json["replaced"]) == (3, 2)
     assert rest.get("/v1/policy").json["differs_from_file"] is False
     assert rest.get("/v1/policy").json["who"] == "disk"
-    assert appliance.audit("--event", "policy loaded")[0]["detail"]["who"] == "first"
+    assert appliance.recorded("--event", "policy loaded")[0]["detail"]["who"] == "first"
     appliance.policy_file.write_text("[Nodes]\nnonsense\n")
     refused = rest.post("/v1/policy/reload", match='"3"')
     assert refused.status == 422
@@ -294,6 +300,21 @@ def test_a_body_that_makes_no_sense_is_told(rest: Rest, body: bytes, kind: str, 
         assert (answer.json["line"], answer.json["column"]) == (2, 2)
 
 
+def reported(rest: Rest) -> dict[str, Any] | None:
+    """The topic /chatter in the graph, once the relay has told how many messages come (once in a second)."""
+    topic: dict[str, Any] = next(
+        one for one in rest.get("/v1/graph").json["topics"] if one["name"] == "/chatter"
+    )
+    return topic if topic["publishers"][0]["messages_per_second"] > 1 else None
+
+
+def measured(rest: Rest) -> str | None:
+    """The metrics, once there is a delay of a message of /chatter in them."""
+    metrics = rest.get("/metrics").body.decode()
+    counted = re.search(r'rosrv_relay_delay_seconds_count\{resource="/chatter"\} [1-9]', metrics)
+    return metrics if counted else None
+
+
 def test_the_graph_shows_who_talks_to_whom(appliance: Appliance, tmp_path: Path) -> None:
     """Two real nodes: both are there, the topic is mediated, the connection and the rate are seen."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -301,18 +322,14 @@ def test_the_graph_shows_who_talks_to_whom(appliance: Appliance, tmp_path: Path)
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.talker("rospy", "/chatter", name="talker")
         listener = ros.listener("rospy", "/chatter", name="listener")
-        for count in range(15, 100, 15):  # some seconds of traffic, as much as it takes to be reported
-            listener.wait_for_count(count, event="received")
-            topic = next(one for one in rest.get("/v1/graph").json["topics"] if one["name"] == "/chatter")
-            if topic["publishers"][0]["messages_per_second"] > 1:
-                break
+        listener.wait_for(event="received")
+        topic = eventually(lambda: reported(rest), "the relay's report of the topic")
+        metrics = eventually(lambda: measured(rest), "the relay's report of delays")
     assert topic["type"] == "std_msgs/String"
     assert topic["mediated"] is True
     assert topic["subscribers"] == ["/listener"]
     assert topic["connections"] == [{"from": "/talker", "to": "/listener", "host": "127.0.0.1"}]
     assert 1 < topic["publishers"][0]["messages_per_second"] < 50
-    metrics = rest.get("/metrics").body.decode()
     assert 'rosrv_relay_messages_total{resource="/chatter"}' in metrics
-    assert re.search(r'rosrv_relay_delay_seconds_count\{resource="/chatter"\} [1-9]', metrics)
     assert 0 < topic["publishers"][0]["delay_seconds"] < 1
     assert 'rosrv_decisions_total{category="publish",outcome="allow"}' in metrics

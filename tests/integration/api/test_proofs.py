@@ -89,9 +89,7 @@ def test_what_somebody_in_between_does_to_an_order_is_refused_and_recorded(runni
         refused = holder.rest.request(method, target, body.encode(), headers)
         assert refused.status == 403, (method, target, refused.body)
     assert revisions(holder.rest) == before
-    records = running.audit("--event", "order refused")
-    eventually(lambda: len(running.audit("--event", "order refused")) >= known + 3, "recorded")
-    records = running.audit("--event", "order refused")
+    records = running.recorded("--event", "order refused", count=known + 3)
     assert {one["decision"] for one in records} == {"deny"}
     assert {one["detail"]["who"] for one in records} == {"first"}
     good = holder.rest.request("POST", "/v1/policy", text.encode(), fresh)

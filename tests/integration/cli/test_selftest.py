@@ -54,7 +54,7 @@ def test_a_message_really_goes_through(appliance: Appliance) -> None:
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         state = str(master.getSystemState("/looker"))
     assert "selftest" not in state
-    records = appliance.audit("--caller", "/rosrv_selftest_publisher", "--category", "publish")
+    records = appliance.recorded("--caller", "/rosrv_selftest_publisher", "--category", "publish")
     assert {one["resource"] for one in records} == {"/rosrv_selftest"}
 
 

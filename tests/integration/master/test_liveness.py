@@ -41,7 +41,7 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
             tail.wait_for(event="node lost", caller_id="/brief")
         finally:
             tail.stop()
-        assert [record["caller_id"] for record in appliance.audit("--event", "node lost")] == ["/brief"]
+        assert [record["caller_id"] for record in appliance.recorded("--event", "node lost")] == ["/brief"]
 
 
 def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Host, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_a_machine_that_vanished_holds_no_name(
     pair.ear.wait_for(lambda event: str(event.get("data", "")).startswith("second"), timeout=PATIENCE)
     assert time.monotonic() - began < PATIENCE
     voice.kill()  # it would wait for its master when it is interrupted
-    assert pair.appliance.audit("--event", "takeover")
+    assert pair.appliance.recorded("--event", "takeover")
 
 
 def test_a_node_that_hangs_holds_its_name_until_it_is_lost(pair: Pair) -> None:

@@ -102,7 +102,7 @@ def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: R
     heard = [event["data"].split() for event in right.seen(event="received")]
     assert without_gap(numbers(right))
     assert without_gap([int(words[1]) for words in heard])
-    restarted = appliance.audit(event="monitors restarted")
+    restarted = appliance.recorded(event="monitors restarted")
     assert [record["detail"]["monitors"] for record in restarted] == [["left"]]
     eventually(lambda: int(str(rows(appliance)["right"]["events"])) > 5, "the counters of the second relay")
     assert set(rows(appliance)) == {"left", "right"}
@@ -133,7 +133,7 @@ def test_loading_a_specification_that_joins_two_relays_moves_as_little_as_it_can
     for client in ("rospy", "roscpp"):
         said = listeners["right", client].wait_for(lambda event: "both" in event.get("data", ""))
         assert " right " in f" {said['data']}"
-    moved = appliance.audit(event="topics moved")[0]
+    moved = appliance.recorded(event="topics moved")[0]
     assert moved["detail"]["monitors"] == ["right"]
     assert moved["severity"] == "alarm"
     assert "right began anew" in done.stdout

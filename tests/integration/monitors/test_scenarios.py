@@ -189,7 +189,7 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
     for tilt, shots in ((0.2, 1), (-0.7, 1), (0.3, 2)):
         assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
         assert told(robot, "fire")["shots"] == shots
-    [dropped] = appliance.audit("--event", "message dropped", resource=TRIGGERED)
+    [dropped] = appliance.recorded("--event", "message dropped", resource=TRIGGERED)
     assert (dropped["caller_id"], dropped["host"]) == ("/ocu", "127.0.0.1")
     assert "safeTrigger" in json.dumps(dropped)
 
@@ -204,7 +204,7 @@ def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot
     assert again["x"] < 6.9
     back = told(robot, "drive", "-1.0", "0", "1")
     assert back["x"] < again["x"]
-    assert appliance.audit("--event", "message changed", resource=VELOCITY)
+    assert appliance.recorded("--event", "message changed", resource=VELOCITY)
 
 
 def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path
     told(robot, "aim", "0", "0.3")
     shots.append(told(robot, "fire")["shots"])
     assert len(set(shots)) == 1
-    verdicts = appliance.audit("--event", "monitor verdict")
+    verdicts = appliance.recorded("--event", "monitor verdict", count=3)
     assert [one["detail"]["category"] for one in reversed(verdicts)] == ["warned", "locked", "locked"]
     appliance.rosrv("monitor", "remove", "gun.rv")
     assert told(robot, "fire")["shots"] == shots[0] + 1

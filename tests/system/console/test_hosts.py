@@ -84,5 +84,5 @@ def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -
         expect(row).to_contain_text("revoked")
     listed = map(json.loads, appliance.rosrv("host", "list", "--json").stdout.splitlines())
     assert {one["name"]: one["state"] for one in listed} == {"ocu-1": "revoked", "ocu-2": "awaited"}
-    events = appliance.audit("--event", "host revoked")
+    events = appliance.recorded("--event", "host revoked")
     assert [one["detail"]["name"] for one in events] == ["ocu-1"]

@@ -37,7 +37,7 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
     switch.click()
     expect(switch).to_have_attribute("aria-checked", str(before).lower())
     assert state(appliance, "safeZone")["enabled"] is before
-    events = [one for one in appliance.audit("--event", "monitor *abled") if one["resource"] == "safeZone"]
+    events = [one for one in appliance.recorded("--event", "monitor *abled") if one["resource"] == "safeZone"]
     assert {one["detail"]["who"] for one in events} == {"first"}
 
 
