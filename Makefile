@@ -8,15 +8,16 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system package bench clean
+.PHONY: help setup demo check test test-system wheel package bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
 
-setup: ## install what is missing: Debian packages and .venv
+setup: ## install what is missing to develop: Debian packages and .venv
 	@scripts/setup
 
-demo: setup ## the appliance at work: a simulated robot, its operator and an attacker, in a minute or two
+demo: ## the appliance at work: a simulated robot, its operator and an attacker, in a minute or two
+	@scripts/setup --run
 	@$(BIN)/rosrv demo $(ARGS)
 
 check: setup ## format, lint, types, dependency directions, unit tests
@@ -32,6 +33,9 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
 	$(PYTEST) tests/system --quiet --durations=15
+
+wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl
+	$(BIN)/python -m hatchling build --target wheel
 
 package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package

@@ -144,7 +144,8 @@ def checkout_archive(path: Path) -> None:
 
 
 def _packages() -> tuple[str, ...]:
-    lines = (ROOT / "packages.txt").read_text().splitlines()
+    lists = ("packages.txt", "packages-develop.txt")
+    lines = [line for name in lists for line in (ROOT / name).read_text().splitlines()]
     named = [line.partition("#")[0].strip() for line in lines]
     kept = [name for name in named if name and name not in _COMPILERS and not name.endswith("-dev")]
     return (*kept, *_MACHINES_OWN)
