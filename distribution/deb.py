@@ -29,8 +29,13 @@ RUNS = (
 )  # fmt: skip
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
+import os
+
 from appliance.cli.main import main
 
+# Whoever is elsewhere means the appliance of this machine, too.
+if not os.path.exists("appliance.yaml"):
+    os.environ.setdefault("ROSRV_CONFIG", "/etc/rosrv/appliance.yaml")
 main()
 """
 
@@ -68,7 +73,13 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     make_environment(library, architecture, work)
     _make_virtual(library)
     _copy(ROOT / "appliance", library / "common/appliance")
-    _copy(ROOT / "examples", root / "usr/share/rosrv/examples")
+    shipped = root / "usr/share/rosrv"
+    for folder in ("examples", "monitors", "policies"):
+        _copy(ROOT / folder, shipped / folder)
+    (shipped / "scripts").mkdir()
+    shutil.copy(ROOT / "scripts/build-roscpp", shipped / "scripts")
+    # Where the program looks, as in any environment that the wheel was installed to.
+    (library / "share").symlink_to("../../share")
     (root / "usr/bin").mkdir(parents=True)
     launcher = root / "usr/bin/rosrv"
     launcher.write_text(_LAUNCHER)

@@ -1,6 +1,6 @@
 """The cast of the demonstration: a simulated LandShark, its operator, an attacker; each on a host of a lab.
 
-    with Lab("rosrv-demo") as lab, Stage(lab, examples) as stage:
+    with Lab("rosrv-demo") as lab, Stage(lab, SHIPPED) as stage:
         stage.start_appliance()
         stage.start_robot()
 
@@ -26,6 +26,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from appliance.cli.demo.doorway import Doorway
+from appliance.cli.shipped import IS_CHECKOUT
 from appliance.network.lab import Host, Lab
 
 NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
@@ -34,6 +35,7 @@ MASTER_URI = f"http://{APPLIANCE}:11311"
 CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
 START_SECONDS = 60.0  # an appliance or a node that is not there by then is not coming
 ATTACK_SECONDS = 60.0
+_NO_COMPILER = 3  # exit status of scripts/build-roscpp
 COMMAND_SECONDS = 120.0  # a drive through the yard and what starts before it
 
 Event = dict[str, Any]
@@ -141,13 +143,15 @@ class Actor:
 class Stage:
     """The hosts, and everybody on them; a context manager that ends all of it."""
 
-    def __init__(self, lab: Lab, examples: Path) -> None:
-        self.nodes = examples / "landshark" / "nodes"
-        self.monitors = examples.parent / "monitors"
-        self.policy = examples / "landshark" / "landshark-demo.ini"
+    def __init__(self, lab: Lab, shipped: Path) -> None:
+        self.shipped = shipped
+        self.nodes = shipped / "examples" / "landshark" / "nodes"
+        self.monitors = shipped / "monitors"
+        self.policy = shipped / "examples" / "landshark" / "landshark-demo.ini"
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-demo-"))
         self.directory.chmod(0o755)  # the appliance's processes run as other users
         self.state = self.directory / "state"
+        self._radar: Path | None = None
         self.appliance_host = lab.host("appliance", f"{APPLIANCE}/24")
         self.robot_host = lab.host("robot", f"{ROBOT}/24")
         self.operator_host = lab.host("ocu", f"{OPERATOR}/24")
@@ -174,7 +178,7 @@ class Stage:
         return self._start(self.appliance_host, "rosrv up", command).expect("ready")
 
     def start_robot(self) -> list[Actor]:
-        """The LandShark's drivers and sensors, five rospy nodes and one roscpp node."""
+        """The LandShark's drivers and sensors: five rospy nodes and, where it was made, one roscpp node."""
         python = {
             "base": ["base.py"],
             "turret": ["turret.py"],
@@ -186,10 +190,25 @@ class Stage:
             name: [NODE_PYTHON, str(self.nodes / file), *arguments]
             for name, (file, *arguments) in python.items()
         }
-        commands["radar"] = [str(self._radar())]
+        if self._radar is not None:
+            commands["radar"] = [str(self._radar)]
         return [
             self._start(self.robot_host, f"landshark_{name}", command) for name, command in commands.items()
         ]
+
+    def make_radar(self) -> bool:
+        """Compile the roscpp node; False where there is no compiler."""
+        # In a checkout it is compiled once; what is installed is not written to.
+        program = (self.shipped / "build" if IS_CHECKOUT else self.directory) / "landshark_radar"
+        build = self.shipped / "scripts" / "build-roscpp"
+        command = ["bash", str(build), str(self.nodes / "radar.cpp"), str(program)]
+        built = subprocess.run(command, capture_output=True, text=True, check=False)
+        if built.returncode == _NO_COMPILER:
+            return False
+        if built.returncode:
+            raise DemoError(f"the radar node could not be compiled:\n{built.stderr.strip()}")
+        self._radar = program
+        return True
 
     def protect_robot(self) -> None:
         """`rosrv protect` on the robot's machine: its nodes' own ports answer the appliance only."""
@@ -223,7 +242,7 @@ class Stage:
         command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
         done = subprocess.run(
             command,
-            cwd=self.nodes.parents[2],
+            cwd=self.shipped,
             capture_output=True,
             text=True,
             timeout=START_SECONDS,
@@ -285,19 +304,6 @@ class Stage:
         actor = Actor(host, name, command, environment, self.directory / f"{name.replace(' ', '-')}.log")
         self.actors.append(actor)
         return actor
-
-    def _radar(self) -> Path:
-        root = self.nodes.parents[2]
-        program = root / "build" / "landshark_radar"
-        built = subprocess.run(
-            [str(root / "scripts" / "build-roscpp"), str(self.nodes / "radar.cpp"), str(program)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if built.returncode:
-            raise DemoError(f"the radar node could not be compiled:\n{built.stderr.strip()}")
-        return program
 
     def __enter__(self) -> Self:
         return self

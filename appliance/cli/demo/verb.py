@@ -9,6 +9,7 @@ operator wanted and nothing else: scripts can rely on it.
 
 import shutil
 import signal
+import subprocess
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -35,6 +36,7 @@ from appliance.cli.demo.landshark import (
 from appliance.cli.demo.mistakes import Mistakes, Ways
 from appliance.cli.demo.results import Result
 from appliance.cli.output import say_json
+from appliance.cli.shipped import SHIPPED
 from appliance.network.lab import Lab
 from appliance.network.namespaces import NetworkError, has_privileges
 
@@ -58,7 +60,11 @@ GRANTED = (
     ("/ocu", "/landshark_control/base_velocity"),
     ("/ocu", "/landshark_control/trigger"),
 )
-EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+# What the demonstration's nodes import, and its ROS Master.
+_NODE_PACKAGES = (
+    "rosmaster", "rospy", "genpy", "rosnode", "rosservice", "rostopic",
+    "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs",
+)  # fmt: skip
 Record = dict[str, Any]
 
 
@@ -113,6 +119,8 @@ class Show:
         )
         self.say(f"token for it:      {ready['token']}")
         self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
+        if not self.stage.make_radar():
+            self.say("without its radar: the one roscpp node is compiled, with g++ and libroscpp-dev")
         self.robot = self.stage.start_robot()
         self.say(", ".join(actor.name for actor in self.robot))
         self.stage.protect_robot()
@@ -238,11 +246,12 @@ def require_everything() -> None:
             "the demonstration makes four hosts as network namespaces, which needs root: "
             "run it as root or with sudo, in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
         )
-    if not (EXAMPLES / "landshark").is_dir():
-        raise DemoError(f"the simulated robot is not at {EXAMPLES}: run `rosrv demo` from a checkout")
-    for program in ("/usr/bin/rosmaster", NODE_PYTHON):
-        if not Path(program).exists():
-            raise DemoError(f"{program} is missing: `make setup` installs what the demonstration needs")
+    if not (SHIPPED / "examples").is_dir():
+        raise DemoError(f"the simulated robot is not in {SHIPPED}: install rosrv anew")
+    imports = f"import {', '.join(_NODE_PACKAGES)}"
+    if subprocess.run([NODE_PYTHON, "-c", imports], capture_output=True, check=False).returncode:
+        packages = " ".join(f"python3-{name.replace('_', '-')}" for name in _NODE_PACKAGES)
+        raise DemoError(f"ROS 1 is missing for {NODE_PYTHON}: sudo apt-get install rosout {packages}")
 
 
 def demo(
@@ -269,7 +278,7 @@ def demo(
         require_everything()
         with ExitStack() as stack:
             lab = stack.enter_context(Lab("rosrv-demo"))
-            stage = stack.enter_context(Stage(lab, EXAMPLES))
+            stage = stack.enter_context(Stage(lab, SHIPPED))
             show = Show(stage, stack.enter_context(stage.console()), console)
             good = show.run()
             if as_json:

@@ -13,6 +13,7 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
+from appliance.cli.shipped import SHIPPED
 from appliance.config import Settings
 from appliance.hosts.declared import DeclaredHostsError, read_declared
 from appliance.policy import PolicyError, compile_policy, run_cases
@@ -38,6 +39,10 @@ def _policy(file: Path) -> Iterator[Found]:
         text = file.read_text(encoding="utf-8")
         policy = compile_policy(text, file=str(file))
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and file == Settings().policy.absolute():
+            first = SHIPPED / "policies" / "default.ini"
+            yield warn("policy", f"{file}: nobody has written one yet", f"to begin with: --policy {first}")
+            return
         yield fail(
             "policy",
             f"{file}: {error.strerror}",

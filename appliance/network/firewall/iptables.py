@@ -373,7 +373,8 @@ def _library() -> Any:
             import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
     except Exception as error:  # the library raises bare exceptions when a C library is not there
         raise BackendMissingError(
-            f"the firewall back end iptables needs libiptc and xtables: sudo apt install iptables ({error})"
+            f"the firewall back end iptables needs libiptc and xtables: "
+            f"sudo apt install iptables; a wheel, its extra [iptables] ({error})"
         ) from error
     return iptc
 

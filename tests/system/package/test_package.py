@@ -116,6 +116,10 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.run("dpkg", "--install", "old.deb", seconds=900)
     assert serves(machine)["version"] == "0.1.0"
     assert machine.run("rosrv", "policy", "check", "/etc/rosrv/policies/default.ini").status == 0
+    assert "/etc/rosrv/policies/default.ini" in machine.run("rosrv", "config", "show").output
+    assert (
+        machine.run("test", "-f", "/usr/lib/rosrv/share/rosrv/examples/landshark/nodes/base.py").status == 0
+    )
     processes = machine.run("ps", "-eo", "user:20,args").output
     for user in ("rosrv-relay", "rosrv-api", "rosrv-signer", "rosmaster"):
         assert f"{user} " in processes, processes

@@ -1,0 +1,82 @@
+"""The wheel in an environment of its own, far from a checkout and without a compiler: all of `rosrv` is there."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_root, needs
+
+ROOT = Path(__file__).parents[3]
+BIN = Path(sys.executable).parent
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(scope="module")
+def rosrv() -> Iterator[Path]:
+    """The command, as `pipx install --global` puts it: a fresh environment, nothing built, the lock's versions."""
+    folder = Path(tempfile.mkdtemp(prefix="rosrv-wheel-"))
+    folder.chmod(0o755)  # the appliance's processes run as other users
+    build = [str(BIN / "python"), "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    uv = str(BIN / "uv")
+    python = folder / "venv/bin/python"
+    subprocess.run([uv, "venv", "--quiet", "--python", "/usr/bin/python3", str(folder / "venv")], check=True)
+    subprocess.run(
+        [uv, "pip", "install", "--quiet", "--python", str(python), "--no-build",
+         "--constraints", str(ROOT / "requirements.lock"), str(next(folder.glob("*.whl")))],
+        check=True,
+    )  # fmt: skip
+    yield python.with_name("rosrv")
+    shutil.rmtree(folder)
+
+
+def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subprocess.CompletedProcess[str]:
+    """One command in an empty folder, with an environment that knows nothing of the checkout."""
+    environment = {
+        "PATH": f"{rosrv.parent}:/usr/sbin:/usr/bin:/sbin:/bin",
+        "HOME": str(folder),
+        "COLUMNS": "200",
+    }
+    command = [str(rosrv), *arguments]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=seconds, check=False
+    )
+
+
+def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
+    """Version and packages are those of the project and its lock; the verbs have their help."""
+    assert re.fullmatch(r"rosrv \d+\.\d+\.\d+\n", run(rosrv, "--version", folder=tmp_path).stdout)
+    facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
+    locked = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
+    del locked["python-iptables"]  # an extra, which is compiled
+    installed = {re.sub(r"[-_.]+", "-", name): version for name, version in facts["packages"].items()}
+    assert installed == locked | {"rosrv-appliance": facts["version"]}
+    assert "simulated robot" in run(rosrv, "demo", "--help", folder=tmp_path).stdout
+
+
+def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) -> None:
+    """Where nobody has configured anything, the advice is a file that is there and right."""
+    done = run(rosrv, "selftest", "--json", "--state", str(tmp_path / "none"), folder=tmp_path)
+    rows = {row["check"]: row for row in map(json.loads, done.stdout.splitlines())}
+    assert rows["policy"]["outcome"] == "warn", done.stdout + done.stderr
+    named = rows["policy"]["advice"].rpartition("--policy ")[2]
+    assert Path(named).is_relative_to(rosrv.parents[1])
+    assert run(rosrv, "policy", "check", named, folder=tmp_path).returncode == 0
+
+
+def test_its_demonstration_works(rosrv: Path, tmp_path: Path) -> None:
+    """Robot, operator and attacker come with it, and what it promises happens."""
+    need_root()
+    needs(has_ros(), "ROS 1 (run `make setup`)")
+    done = run(rosrv, "demo", "--json", "--picture", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert all(row["good"] for row in map(json.loads, done.stdout.splitlines()))
+    assert (tmp_path / "way.svg").read_text().startswith(("<svg", "<?xml"))

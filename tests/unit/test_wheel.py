@@ -1,0 +1,80 @@
+"""Tests of what the wheel says of itself: bounds, version, what it brings (installed: tests/system/package)."""
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from email import message_from_bytes
+from email.message import Message
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from appliance import __version__
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+RUNS = [Requirement(one) for one in (*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["iptables"])]
+LOCKED = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    return next(folder.glob("*.whl"))
+
+
+def metadata(wheel: Path) -> Message:
+    """Its METADATA."""
+    with zipfile.ZipFile(wheel) as archive:
+        name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return message_from_bytes(archive.read(name))
+
+
+@pytest.mark.parametrize("requirement", RUNS, ids=lambda one: one.name)
+def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
+    """The version that is tested is within them; none older than it is promised, and no major version ahead."""
+    locked = LOCKED[requirement.name]
+    major, minor = locked.split(".")[:2]
+    bounds = {one.operator: one.version for one in requirement.specifier}
+    assert bounds == {">=": f"{major}.{minor}", "<": str(int(major) + 1)}
+
+
+def test_it_says_what_it_is(wheel: Path) -> None:
+    """Name, version, licence, readme and interpreter are those of the project."""
+    says = metadata(wheel)
+    assert (says["Name"], says["Version"]) == ("rosrv-appliance", __version__)
+    assert (says["License-Expression"], says["Requires-Python"]) == ("Apache-2.0", ">=3.11")
+    assert says.get_payload() == (ROOT / "README.md").read_text()
+    assert {Requirement(one).name for one in says.get_all("Requires-Dist", [])} >= {one.name for one in RUNS}
+
+
+def test_it_brings_what_is_not_code(wheel: Path) -> None:
+    """Every policy, monitor, example and page, and every file of the console."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name.partition(".data/data/")[2] or name for name in archive.namelist()}
+    tracked = subprocess.run(
+        ["git", "-c", f"safe.directory={ROOT}", "ls-files", "examples", "monitors", "policies", "docs", "appliance"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    places = {"appliance": "", "docs": "share/doc/rosrv/", "": "share/rosrv/"}
+    expected = set()
+    for path in tracked:
+        top, _, rest = path.partition("/")
+        place = places.get(top, places[""])
+        expected.add(place + (rest if top == "docs" else path))
+    assert expected - names == set()
+
+
+def test_no_compiler_is_told_from_a_wrong_source(tmp_path: Path) -> None:
+    """`rosrv demo` goes on without its compiled node only where there is nothing to compile it with."""
+    source = tmp_path / "wrong.cpp"
+    source.write_text("int main() { return ")
+    build = ["/bin/bash", str(ROOT / "scripts/build-roscpp"), str(source), str(tmp_path / "made")]
+    bare = subprocess.run(build, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False)
+    assert (bare.returncode, "g++ and libroscpp-dev are needed" in bare.stderr) == (3, True)
