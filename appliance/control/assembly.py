@@ -92,6 +92,7 @@ class Parts:
     """The parts that control itself starts, restores and ends; `master` has what a call is performed with."""
 
     master: Master
+    revocation: Revocation
     places: Places
     delivery: Delivery
     reminders: Reminders
@@ -355,6 +356,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
     base.policies.changed = policy_changed
     return Parts(
         master=master,
+        revocation=revocation,
         places=reach.places,
         delivery=reach.delivery,
         reminders=reminders,

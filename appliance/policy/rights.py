@@ -88,6 +88,12 @@ def rights_of_call(
     return rights_of(request, touched)
 
 
+def rights_to_keep(request: Request, call: str, resource: str, *, namespace: bool) -> list[Right]:
+    """Everything that keeping what this call gave needs; `namespace`: a parameter that holds others."""
+    touch = _TOUCHES.get(call)
+    return rights_of(request, [] if touch is None else [Right(_of(request, touch, resource), namespace)])
+
+
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
     """Everything that a deed needs, with what it touches."""
     rights = [Right(request)]

@@ -95,11 +95,6 @@ class Gate:
             return denial
         return self._bound(caller, call, decision)
 
-    def may_have(self, call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> Decision:
-        """Decide again what a call gave: what is live, or seems to be."""
-        request = request_of(call, host, caller_id, resource)
-        return decide(self._policy(), rights_of_call(request, call, resource, tree=tree))
-
     def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree) -> Decision:
         key = None if call.resource is None else str(arguments[call.resource])
         value = cast(Value, arguments[1]) if call.touches is Category.WRITE and len(arguments) > 1 else None

@@ -17,6 +17,7 @@ from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.core import Master
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
 from appliance.master.reach.own_node import OWN, ROSOUT
+from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import TOPIC
@@ -41,6 +42,17 @@ class Revocation:
         self._master = master
         self._put_back = put_back
         self._last: asyncio.Task[None] | None = None
+
+    def live(self) -> list[Live]:
+        """What `redecide` decides: all that nodes have by the policy."""
+        return [
+            *(
+                self._registered(incarnation, registration.kind, registration.resource)
+                for incarnation, registration in self._registrations()
+                if not incarnation.own
+            ),
+            *(self._permitted(row) for row in self._master.relay.permissions() if not self._is_own(row)),
+        ]
 
     def redecide(self) -> int:
         """Take back what the running policy no longer allows; how much that was. What it grants again is put back."""
@@ -136,17 +148,24 @@ class Revocation:
         if incarnation.own:
             known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
-        return self._may_have(_GAVE[kind], incarnation.host, incarnation.name, resource)
+        return may_keep(self._master.policy(), self._registered(incarnation, kind, resource))
 
     def _decide_permission(self, row: PermissionRow) -> Decision:
-        holder = self._master.registry.holder(row.caller_id)
-        if row.kind == TOPIC and holder is not None and holder.own:
+        if self._is_own(row):
             return Decision(True, None, OWN)
-        call = "requestTopic" if row.kind == TOPIC else "lookupService"
-        return self._may_have(call, ipaddress.ip_address(row.host), row.caller_id, row.resource)
+        return may_keep(self._master.policy(), self._permitted(row))
 
-    def _may_have(self, call: str, host: Address, caller_id: str, resource: str) -> Decision:
-        return self._master.gate.may_have(call, host, caller_id, resource, self._master.parameters.tree)
+    def _is_own(self, row: PermissionRow) -> bool:
+        holder = self._master.registry.holder(row.caller_id)
+        return row.kind == TOPIC and holder is not None and holder.own
+
+    def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
+        tree = self._master.parameters.tree
+        return live_by(_GAVE[kind], incarnation.host, incarnation.name, resource, tree)
+
+    def _permitted(self, row: PermissionRow) -> Live:
+        call = "requestTopic" if row.kind == TOPIC else "lookupService"
+        return Live(ipaddress.ip_address(row.host), row.caller_id, call, row.resource)
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
         self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))
