@@ -91,6 +91,10 @@ class ChannelPeer:
             self._channel.send(message, descriptors)
         self._wake.send(b"x")
 
+    def send_bytes(self, data: bytes) -> None:
+        """Send what is no message."""
+        os.write(self._channel.fileno(), data)
+
     def wait_for(self, wanted: Callable[[Any], bool], seconds: float = 20.0, after: int = 0) -> Any:
         """The first message (from index `after` on) that fits; fails loudly when none comes."""
         deadline = time.monotonic() + seconds

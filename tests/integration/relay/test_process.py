@@ -1,6 +1,5 @@
 """The relay as a process: what the supervisor may expect of it."""
 
-import os
 import signal
 import socket
 from collections.abc import Iterator
@@ -61,7 +60,7 @@ def test_a_control_that_speaks_another_language_is_left_and_the_next_is_served(r
     """A message that is not of the link ends the link, not the relay."""
     first = relay.open_link()
     relay.ping(1)
-    os.write(first._channel.fileno(), b"\0\0\0\5wrong")
+    first.send_bytes(b"\0\0\0\5wrong")
     assert first.ended.wait(10)
     second = relay.open_link()
     second.send(StateEnded(1))

@@ -62,7 +62,7 @@ def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
     with pytest.raises(ValueError, match="travels with 1"):
         here.send(SocketKept("nothing"))
     body = msgspec.msgpack.encode(SocketKept("nothing"))
-    here._socket.send(struct.pack(">I", len(body)) + body)
+    os.write(here.fileno(), struct.pack(">I", len(body)) + body)
     with pytest.raises(msgspec.DecodeError, match="without its descriptors"):
         there.receive()
 
@@ -157,7 +157,7 @@ def test_an_attached_end_refuses_what_is_not_of_its_link(pair: Pair) -> None:
             refused.set()
 
         there.attach(asyncio.get_running_loop(), lambda *_message: None, lambda: told.append("end"), refuse)
-        here._socket.send(_frame(b"\xc1"))
+        os.write(here.fileno(), _frame(b"\xc1"))
         await asyncio.wait_for(refused.wait(), 10)
 
     asyncio.run(scene())

@@ -1,6 +1,8 @@
 """Tests of the revoked certificates: which are on the list, and that the list is never too long for charon."""
 
+import contextlib
 import itertools
+import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -58,10 +60,13 @@ def test_what_is_revoked_is_kept_over_restarts(tmp_path: Path) -> None:
     revoked = RevokedCertificates(first.hosts)
     revoked.add("a", "a1", now + DAY)
     revoked.add("a", "a2", now - 2 * DAY)
-    database = first.hosts._database  # what a version before has written
-    for serial, moment in (("b1", now - 10 * DAY), ("b2", now - 400 * DAY)):
-        database.submit("INSERT INTO revoked_certificate VALUES (?, ?)", (serial, moment))
     first.close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as database, database:
+        for serial, moment in (
+            ("b1", now - 10 * DAY),
+            ("b2", now - 400 * DAY),
+        ):  # as a version before has written
+            database.execute("INSERT INTO revoked_certificate VALUES (?, ?)", (serial, moment))
     second = StateStore(tmp_path, failed=pytest.fail)
     assert [row.serial for row in RevokedCertificates(second.hosts).listed({"a"})] == ["a1", "b1"]
     second.close()

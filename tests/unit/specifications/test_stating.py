@@ -85,16 +85,16 @@ class World:
 
     def __init__(self, home: Path) -> None:
         self.log = AuditLog(home / "audit.db")
-        recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
         self.records: list[tuple[str, str]] = []
-        happened = recorder.happened
+        happened = self.recorder.happened
 
         def noted(event: str, reason: str, **fields: Any) -> str:
             self.records.append((event, reason))
             return happened(event, reason, **fields)
 
-        recorder.happened = noted  # type: ignore[method-assign]  # listens in
-        self.stating = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+        self.recorder.happened = noted  # type: ignore[method-assign]  # listens in
+        self.stating = Stating(Allocation(2), self.recorder, "drop", lambda _name: True)
         self.fleet = Fleet(self.stating)
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
         self.stating.start(revision(1, **self.files), restarted=False, kept="")
@@ -311,8 +311,7 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    recorder = world.stating._recorder
-    after = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+    after = Stating(Allocation(2), world.recorder, "drop", lambda _name: True)
     after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)

@@ -11,15 +11,9 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.graph.reminders import Reminders
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
+from tests.support.stand_ins import NoJournal
 
 HOST = ipaddress.ip_address("10.0.0.5")
-
-
-class NoJournal:
-    """Nothing is written down."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_given: None
 
 
 class Told:

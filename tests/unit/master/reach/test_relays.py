@@ -19,20 +19,14 @@ from appliance.ros.uris import parse_node_uri
 from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
-from appliance.store.state import StateStore
+from appliance.store.state import PermissionRow, StateStore
+from tests.support.stand_ins import NoJournal
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
 
 
-class Nothing:
-    """Takes every call and does nothing: journal, store, recorder, delivery."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_given, **_named: None
-
-
-class Ports(Nothing):
+class Ports:
     """A socket for each port, told apart by its descriptor."""
 
     def __init__(self) -> None:
@@ -43,6 +37,24 @@ class Ports(Nothing):
         if port not in self.sockets:
             self.sockets[port] = socket.socket()
         return self.sockets[port]
+
+
+class NoPermissions:
+    """A store that keeps no grants."""
+
+    def permissions(self) -> list[PermissionRow]:
+        """As `StateStore`."""
+        return []
+
+    def save_permission(self, row: PermissionRow) -> None:
+        """As `StateStore`."""
+
+    def remove_permission(self, row: PermissionRow) -> None:
+        """As `StateStore`."""
+
+
+class NoDelivery:
+    """No node is called."""
 
 
 class Link:
@@ -79,7 +91,7 @@ class World:
 
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
-        self.registry = Registry(cast(Any, Nothing()))
+        self.registry = Registry(NoJournal())
         self.allocation = Allocation(2)
         self.policy = policy()
         self.put(left=0, right=1)
@@ -87,8 +99,8 @@ class World:
         self.relay = RelayControl(
             self.registry,
             cast(Places, self.ports),
-            cast(StateStore, Nothing()),
-            cast(Delivery, Nothing()),
+            cast(StateStore, NoPermissions()),
+            cast(Delivery, NoDelivery()),
             cast(Recorder, self),
             allocation=self.allocation,
             policy=lambda: self.policy,

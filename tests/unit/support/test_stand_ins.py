@@ -1,0 +1,118 @@
+"""How tests look at the product: by what it shows; stand-ins are typed and refuse what they do not stand for."""
+
+import ast
+from collections.abc import Iterator
+
+from tests.support.outside import TESTS
+
+# Names with an underscore that belong to a published interface.
+PUBLISHED = {
+    "_asdict": "of a named tuple",
+    "_replace": "of a named tuple",
+    "_exit": "of os: a process that ends as if it were killed",
+    "_create_unverified_context": "of ssl: a browser's user who clicks the warning away",
+    "_connection_header": "of rospy: how a node learns who sent a message",
+    "_marshaled_dispatch": "of xmlrpc.server: what its own request handler calls",
+}
+_LET_GO = "that nothing is kept of who is gone shows nowhere else"
+_TURN = "one turn of what goes round by itself"
+_BY_HAND = (
+    "what calls it is a process; here its parts are called by hand, in an order that hardly ever happens"
+)
+# What still reads private attributes, and why. Shorten this list: whoever gives the product a public name for it, or
+# looks at what it shows instead, takes the entry away.
+PRIVATE = {
+    "integration/supervisor/test_enclosure.py": "the firewall is asked while its enclosure is half made",
+    "support/control_parts.py": _TURN,
+    "support/root_host.py": "a laboratory gives its hosts away, not what they are plugged into",
+    "unit/api/test_streams.py": _LET_GO,
+    "unit/audit/test_budget.py": _LET_GO,
+    "unit/backup/test_taking.py": "a file changes between two looks of the backup",
+    "unit/cli/selftest/test_running.py": "one check of the self-test, without the others",
+    "unit/cli/test_status.py": "the screen, without an appliance to ask",
+    "unit/control/test_lifeline.py": "the end of control, which ends with its process",
+    "unit/control/test_rest_rights.py": "the table of rights itself: every request has a row",
+    "unit/master/graph/test_liveness.py": _TURN,
+    "unit/master/graph/test_reconcile.py": _TURN,
+    "unit/master/graph/test_reminders.py": _TURN,
+    "unit/master/reach/test_faces.py": _LET_GO,
+    "unit/master/reach/test_places.py": "which port is drawn next",
+    "unit/master/test_fallen_api.py": "a table of the state is damaged while control runs",
+    "unit/master/test_policies.py": "the end of control, which ends with its process",
+    "unit/policy/test_policy.py": _LET_GO,
+    "unit/relay/connections/test_flow.py": _LET_GO,
+    "unit/relay/monitors/test_middle.py": "whether a topic goes through the middle does not show from outside",
+    "unit/relay/monitors/test_passage.py": "the generated code is compared with the engine, message by message",
+    "unit/relay/monitors/test_telling.py": _TURN,
+    "unit/relay/test_engine.py": _LET_GO,
+    "unit/relay/test_shares.py": _LET_GO,
+    "unit/relay/world.py": _LET_GO,
+    "unit/rosmop/runtime/test_wire.py": "what is patched is shorter than what is encoded anew, with the same bytes",
+    "unit/rosmop/test_batch.py": _LET_GO,
+    "unit/rosmop/test_hostile.py": "the namespace of the generated code, which is what an attacker would reach for",
+    "unit/rpc/test_turns.py": _LET_GO,
+    "unit/supervisor/test_free_log.py": _BY_HAND,
+    "unit/supervisor/test_supervisor.py": _BY_HAND,
+}
+# Stand-ins that answer whatever they are asked. No more are added.
+ANYTHING = {
+    "support/control_parts.py": "the parts of control that a test of the graph does not look at",
+    "unit/master/calls/test_gate.py": "the registry's journal",
+    "unit/master/calls/test_lookups.py": "the registry's journal",
+    "unit/master/calls/test_pipeline.py": "the parts of control that a test of the pipeline does not look at",
+}
+
+
+def test_private_attributes_are_not_read() -> None:
+    """But where the list says why."""
+    found = {file for file, tree in trees() if any(private(tree))}
+    assert found <= set(PRIVATE)
+
+
+def test_no_stand_in_answers_whatever_it_is_asked() -> None:
+    """No `__getattr__`, no mock: what was renamed in the product fails in its tests."""
+    found = {file for file, tree in trees() if any(answers_anything(tree))}
+    assert found <= set(ANYTHING)
+
+
+def test_the_rule_finds_what_it_forbids() -> None:
+    """Reading, calling and setting; a class that answers everything; a mock, however it is imported."""
+    for text in ("x._y", "x.y._z()", "x._y = 1", "f()._y"):
+        assert list(private(ast.parse(text))), text
+    for text in ("self._y", "x.y", "x.__dict__", "t._replace(a=1)"):
+        assert not list(private(ast.parse(text))), text
+    for text in (
+        "def __getattr__(self, name): ...",
+        "from unittest.mock import Mock",
+        "x = mock.MagicMock()",
+    ):
+        assert list(answers_anything(ast.parse(text))), text
+    assert not list(answers_anything(ast.parse("from unittest import mock\nmock.patch('a.b', 1)")))
+
+
+def trees() -> Iterator[tuple[str, ast.Module]]:
+    """Every file of the tests, by its name in tests/, and its syntax tree."""
+    for path in sorted(TESTS.rglob("*.py")):
+        yield str(path.relative_to(TESTS)), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def private(tree: ast.Module) -> Iterator[str]:
+    """The attributes with an underscore that are not the object's own."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Attribute) or node.attr in PUBLISHED:
+            continue
+        own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+        if node.attr.startswith("_") and not node.attr.startswith("__") and not own:
+            yield ast.unparse(node)
+
+
+def answers_anything(tree: ast.Module) -> Iterator[str]:
+    """Classes that make up attributes, and the mocks of the standard library."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name="__getattr__" | "__getattribute__"):
+                yield node.name
+            case ast.ImportFrom(module="unittest.mock"):
+                yield "unittest.mock"
+            case ast.Attribute(attr=name) | ast.Name(id=name) if name.endswith("Mock"):
+                yield name
