@@ -5,8 +5,8 @@ Invariants:
 2. Order is kept: what was recorded first has the smaller sequence.
 3. Nothing is dropped silently: while the log cannot be written (`failed`), records wait, up to `queue_limit`;
    those past it are counted and the count is recorded when writing works again.
-4. A barrier (`flushed`, `wait_durable`) is answered when every record before it is on disk (fsync), or with
-   the reason why it is not; a denial that was folded is on disk as a count.
+4. Who waits (`wait_durable`) is answered when every record before is on disk (fsync), or with the reason why it is
+   not; a denial that was folded is on disk as a count.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ from appliance.audit.removing import Remover
 from appliance.audit.retention import Retention
 from appliance.audit.room import Room
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
-from appliance.audit.waiting import Barrier, Settled, Waiter, answer
+from appliance.audit.waiting import Waiter, answer
 from appliance.audit.writer import ChainWriter
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE
@@ -57,33 +57,6 @@ class Lag(NamedTuple):
 
     records: int
     seconds: float
-
-
-class _Signature(NamedTuple):
-    number: int
-    signature: bytes
-    public_key: bytes
-
-
-class _Refusal(NamedTuple):
-    number: int
-    reason: str
-
-
-class _RemovalApproved(NamedTuple):
-    number: int
-    text: bytes
-    signature: bytes
-    public_key: bytes
-
-
-class _RemovalRefused(NamedTuple):
-    number: int
-    reason: str
-
-
-class _AskSignatures(NamedTuple):
-    pass
 
 
 class AuditLog:
@@ -124,7 +97,7 @@ class AuditLog:
         self._room = Room(path, reserve, self.budget.room)
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
-        self._queue: deque[Any] = deque()
+        self._queue: deque[Record | Waiter | Callable[[], None]] = deque()
         self._held: list[Record] = []
         self._house = Housekeeping(
             path,
@@ -141,7 +114,7 @@ class AuditLog:
             make=self._own,
             hold=self._held.append,
         )
-        self._barriers: list[Barrier | Waiter] = []
+        self._waiting: list[Waiter] = []
         self._writer: ChainWriter | None = None
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
@@ -173,14 +146,6 @@ class AuditLog:
         self.budget.charge(record)
         self._put(record)
 
-    def flushed(self, settled: Settled) -> None:
-        """Call `settled(None)` when all that was recorded so far is on disk, else `settled(reason)`.
-
-        It is called on the log's thread.
-        """
-        self._put(Barrier(settled))
-        self._hurry.set()
-
     async def wait_durable(self) -> str | None:
         """Wait until all that was recorded so far is on disk; the reason when it cannot be written."""
         loop = asyncio.get_running_loop()
@@ -208,23 +173,26 @@ class AuditLog:
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
         """The signer's answer: kept if it is right and made with the pinned key, else recorded as refused."""
-        self._put(_Signature(number, signature, public_key))
+        keep = partial(self._house.keep_signature, number, signature, public_key)
+        self._put(partial(self._house.attempt, keep))
 
     def refused(self, number: int, reason: str) -> None:
         """The signer refused a checkpoint: recorded as an alarm."""
-        self._put(_Refusal(number, reason))
+        self._put(partial(self._house.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
         """The signer signed the removal of the records up to a checkpoint."""
-        self._put(_RemovalApproved(number, text, signature, public_key))
+        remove = partial(self._house.removal_approved, number, text, signature, public_key)
+        self._put(partial(self._house.attempt, remove))
 
     def removal_refused(self, number: int, reason: str) -> None:
         """The signer does not sign a removal; it is asked again later."""
-        self._put(_RemovalRefused(number, reason))
+        self._put(partial(self._house.remover.refused, number, reason))
 
     def request_signatures(self) -> None:
         """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
-        self._put(_AskSignatures())
+        self._put(partial(self._house.attempt, self._house.ask_signatures))
+        self._put(self._house.remover.ask_again)
 
     def close(self) -> str | None:
         """Write what waits, make a last checkpoint and close; the reason when that did not succeed."""
@@ -236,7 +204,8 @@ class AuditLog:
             return f"{self.path}: still being written after {_CLOSE_SECONDS:g} s"
         return self._unwritten
 
-    def _put(self, item: Any) -> None:
+    def _put(self, item: Record | Waiter | Callable[[], None]) -> None:
+        """A record to be written, somebody who waits, or what the log's thread is to do."""
         self._queue.append(item)
         # The writer sets `_idle` before it looks at the queue a last time: it sees the item or we see idle.
         if self._idle:
@@ -258,14 +227,14 @@ class AuditLog:
             self._failed = self._failed or f"{self.path}: the log is closed"
             self._ended = True
             self._opened.set()
-            self._answer_barriers()
+            self._answer_waiting()
             self._refuse_queued()
 
     def _refuse_queued(self) -> None:
         with contextlib.suppress(IndexError):
             while True:
                 item = self._queue.popleft()
-                if isinstance(item, Barrier | Waiter):
+                if isinstance(item, Waiter):
                     answer([item], self._failed)
 
     def _serve(self) -> None:
@@ -279,7 +248,7 @@ class AuditLog:
         self._house.unsealed += len(self._held)
         if self._attempt(self._write) and self._house.unsealed:
             self._house.attempt(self._house.seal)
-        self._answer_barriers()
+        self._answer_waiting()
         self._unwritten = self._failed
         if self._writer is not None:
             self._writer.close()
@@ -294,7 +263,7 @@ class AuditLog:
                 self.budget.summarised(due)
             self._look_for_room()
             written = self._attempt(self._write)
-            self._answer_barriers()
+            self._answer_waiting()
             self._house.after_batch(written=written)
             if not more or not written:
                 break
@@ -338,19 +307,10 @@ class AuditLog:
                 self._held.extend(written)
                 if not written or written[-1] is not item:
                     self.budget.folded(item)
-            elif isinstance(item, _Signature):
-                self._house.attempt(partial(self._house.keep_signature, *item))
-            elif isinstance(item, _Refusal):
-                self._house.refused(item.number, item.reason)
-            elif isinstance(item, _RemovalApproved):
-                self._house.attempt(partial(self._house.removal_approved, *item))
-            elif isinstance(item, _RemovalRefused):
-                self._house.remover.refused(*item)
-            elif isinstance(item, _AskSignatures):
-                self._house.attempt(self._house.ask_signatures)
-                self._house.remover.ask_again()
+            elif isinstance(item, Waiter):
+                self._waiting.append(item)
             else:
-                self._barriers.append(item)
+                item()
         return bool(queue)
 
     def _look_for_room(self) -> None:
@@ -437,10 +397,10 @@ class AuditLog:
         detail = {"since": self._failed_since, "until": self._clock()}
         return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
 
-    def _answer_barriers(self) -> None:
+    def _answer_waiting(self) -> None:
         result = self._failed if self._held or self._folder.touched else None
-        barriers, self._barriers = self._barriers, []
-        answer(barriers, result)
+        waiting, self._waiting = self._waiting, []
+        answer(waiting, result)
 
     def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> Record:
         return Record(

@@ -10,12 +10,17 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import msgspec
+from msgspec.structs import asdict
 
 from appliance.audit.moment import parse_moment
 from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference
 
 _SECOND = 1_000_000_000
 _NOT_THE_RECORDS = ("schema", "sequence", "chain")
+_OF_THE_RECORD = (
+    "event", "severity", "decision", "host", "caller_id", "category", "resource", "rule", "revision", "reason",
+    "duration_us", "detail",
+)  # fmt: skip
 
 
 class Entry(NamedTuple):
@@ -38,28 +43,16 @@ def rfc3339(time: int) -> str:
 def as_object(entry: Entry) -> dict[str, Any]:
     """The documented JSON object of a record; `decision` is absent where nothing was decided."""
     record = entry.record
-    rule = record.rule
-    shown: dict[str, Any] = {
+    fields = {name: getattr(record, name) for name in _OF_THE_RECORD}
+    if record.decision is None:
+        del fields["decision"]
+    head = {
         "schema": SCHEMA_VERSION,
         "id": record.id,
         "time": rfc3339(record.time),
         "sequence": entry.sequence,
-        "event": record.event,
-        "severity": record.severity.value,
     }
-    if record.decision is not None:
-        shown["decision"] = record.decision
-    return shown | {
-        "host": record.host,
-        "caller_id": record.caller_id,
-        "category": record.category,
-        "resource": record.resource,
-        "rule": rule and {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line},
-        "revision": record.revision,
-        "reason": record.reason,
-        "duration_us": record.duration_us,
-        "detail": record.detail,
-    }
+    return head | fields | {"severity": record.severity.value, "rule": record.rule and asdict(record.rule)}
 
 
 def entry_of(fields: Any) -> Entry:

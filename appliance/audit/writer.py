@@ -6,9 +6,11 @@ Invariants:
 3. The file is the same one all the time: removed or replaced under us, writing stops with an error.
 """
 
+import contextlib
 import fcntl
 import os
-from collections.abc import Iterable, Sequence
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -123,9 +125,7 @@ class ChainWriter:
     def append(self, records: Sequence[Record], folds: Iterable[tuple[bytes, FoldState | None]] = ()) -> None:
         """Write records and what is counted but not yet summarised, in one transaction, to the disk."""
         self._check_file()
-        execute = self._connection.execute
-        execute("BEGIN IMMEDIATE")
-        try:
+        with self._transaction() as execute:
             sequence, digest, last_id = self._insert(records)
             for key, state in folds:
                 if state is None:
@@ -134,10 +134,6 @@ class ChainWriter:
                     execute(
                         "INSERT OR REPLACE INTO open_fold VALUES (?, ?)", (key, msgspec.json.encode(state))
                     )
-            execute("COMMIT")
-        except BaseException:
-            self._roll_back()
-            raise
         self.sequence, self.hash, self.last_id = sequence, digest, last_id
 
     def _insert(self, records: Sequence[Record]) -> tuple[int, bytes, str]:
@@ -218,18 +214,13 @@ class ChainWriter:
             return False
         self._check_file()
         end = min(through + rows, self.sequence)
-        self._connection.execute("BEGIN IMMEDIATE")
-        try:
-            self._connection.execute(
+        with self._transaction() as execute:
+            execute(
                 f"INSERT INTO words (rowid, text) SELECT sequence, {database.TEXT_OF_RECORD} FROM record"  # noqa: S608  fixed names
                 " WHERE sequence > ? AND sequence <= ?",
                 (through, end),
             )
-            self._connection.execute("UPDATE indexed SET through = ?", (end,))
-            self._connection.execute("COMMIT")
-        except BaseException:
-            self._roll_back()
-            raise
+            execute("UPDATE indexed SET through = ?", (end,))
         self._text_through = end
         return bool(end < self.sequence)
 
@@ -290,9 +281,7 @@ class ChainWriter:
     def remove(self, gone: RemovedRange, report: Record, kept: Sequence[Record] = ()) -> None:
         """Remove records and their checkpoints, and append the record that says so and those that are kept, at once."""
         self._check_file()
-        execute = self._connection.execute
-        execute("BEGIN IMMEDIATE")
-        try:
+        with self._transaction() as execute:
             sequence, digest, last_id = self._insert([report, *kept])
             (through,) = execute("SELECT through FROM indexed").fetchone()
             execute(
@@ -303,21 +292,26 @@ class ChainWriter:
             execute("UPDATE indexed SET through = max(through, ?)", (gone.last_sequence,))
             execute("DELETE FROM record WHERE sequence <= ?", (gone.last_sequence,))
             execute("DELETE FROM checkpoint WHERE number <= ?", (gone.last_checkpoint,))
-            execute("COMMIT")
-        except BaseException:
-            self._roll_back()
-            raise
         self.sequence, self.hash, self.last_id = sequence, digest, last_id
         self._text_through = max(through, gone.last_sequence)
-        execute("PRAGMA incremental_vacuum(256)").fetchall()
+        self._connection.execute("PRAGMA incremental_vacuum(256)").fetchall()
 
     def _check_file(self) -> None:
         if _identity(self.path) != self._file:
             raise LogUnreadableError(f"{self.path}: {_REPLACED}")
 
-    def _roll_back(self) -> None:
-        if self._connection.in_transaction:
-            self._connection.execute("ROLLBACK")
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
+        """What is executed in the block is committed at its end, or not at all."""
+        execute = self._connection.execute
+        execute("BEGIN IMMEDIATE")
+        try:
+            yield execute
+            execute("COMMIT")
+        except BaseException:
+            if self._connection.in_transaction:
+                execute("ROLLBACK")
+            raise
 
     def close(self) -> None:
         """Close the database and let another writer have it."""

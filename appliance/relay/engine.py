@@ -189,7 +189,8 @@ class Engine:
         elif isinstance(message, PublicationWithdrawn):
             self._remove_topic(message.key, message.topic, "the topic is published no longer")
         elif isinstance(message, GrantRevoked):
-            self._revoke_grant(message)
+            for subscriber in self._connected_by(message):
+                subscriber.cut("its grant is revoked")
         elif isinstance(message, ServiceWithdrawn):
             self._cut_clients("the service is offered no longer", message.key, message.service)
             self._forget_services(message.key, message.service)
@@ -252,20 +253,21 @@ class Engine:
 
     def _limit_subscriber(self, message: GrantInstalled) -> None:
         """Those that are connected by this grant are limited so from now on."""
-        placed = self._topics.get((message.key, message.topic))
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
-        for member in placed[0].members if placed is not None else ():
-            if isinstance(member, Subscriber) and (member.host, member.caller_id) == (
-                message.host,
-                message.caller_id,
-            ):
-                member.flow = flow
+        for subscriber in self._connected_by(message):
+            subscriber.flow = flow
+
+    def _connected_by(self, grant: GrantInstalled | GrantRevoked) -> list[Subscriber]:
+        placed = self._topics.get((grant.key, grant.topic))
+        members = () if placed is None else placed[0].members
+        who = grant.host, grant.caller_id
+        return [one for one in members if isinstance(one, Subscriber) and (one.host, one.caller_id) == who]
 
     def _make_room(self, host: str, size: int) -> None:
         """A host wants to have a message latched: those that have more than it would have make room."""
         latched, share = self._memory.latched, self._memory.latched.of(host)
         while share.refusal(size):
-            greatest, held = max(latched.pool.holders(), key=lambda one: one[1], default=("", 0))
+            greatest, held = max(latched.holders(), key=lambda one: one[1], default=("", 0))
             of_greatest = (topic for topic, _publisher in self._topics.values() if topic.host == greatest)
             largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
             if held <= share.used + size or largest is None or not largest.latched:
@@ -329,17 +331,6 @@ class Engine:
         row = relayed.traffic()
         if row is not None:
             self._last_rows.append(row)
-
-    def _revoke_grant(self, message: GrantRevoked) -> None:
-        placed = self._topics.get((message.key, message.topic))
-        if placed is None:
-            return
-        for member in placed[0].members:
-            if isinstance(member, Subscriber) and (member.host, member.caller_id) == (
-                message.host,
-                message.caller_id,
-            ):
-                member.cut("its grant is revoked")
 
     def _upstream_found(self, message: UpstreamFound) -> None:
         placed = self._topics.get((message.key, message.topic))

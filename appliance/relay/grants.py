@@ -13,6 +13,7 @@ Invariants:
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from appliance.channel.messages import (
     ClientGranted,
@@ -31,6 +32,26 @@ from appliance.shares.pool import Standing
 
 Statement = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
 _Fact = tuple[str, ...]
+
+
+class _About(NamedTuple):
+    """A kind of facts: what states one, what withdraws it, and the fields of both that tell it from others."""
+
+    stated: type[Statement]
+    withdrawn: type[Message]
+    fields: tuple[str, ...]
+
+
+_ABOUT = {
+    "node": _About(NodePlaced, NodeWithdrawn, ("key",)),
+    "publication": _About(PublicationPlaced, PublicationWithdrawn, ("key", "topic")),
+    "service": _About(ServicePlaced, ServiceWithdrawn, ("key", "service")),
+    "grant": _About(GrantInstalled, GrantRevoked, ("key", "topic", "host", "caller_id")),
+    "client": _About(ClientGranted, ClientRevoked, ("key", "service", "host", "caller_id")),
+}
+_KINDS: dict[type, str] = {
+    type_: kind for kind, about in _ABOUT.items() for type_ in (about.stated, about.withdrawn)
+}
 
 
 @dataclass(frozen=True)
@@ -72,7 +93,7 @@ class StatedTable:
             return []
         gone = [fact for fact in self._facts if fact not in self._restated]
         self._restated = None
-        withdrawals = [_withdrawal(fact) for fact in gone]
+        withdrawals = [_ABOUT[kind].withdrawn(*about) for kind, *about in gone]
         for message in withdrawals:
             self.withdraw(message)
         return withdrawals
@@ -94,7 +115,7 @@ class StatedTable:
             for fact in [fact for fact in self._facts if fact[1] == message.key]:
                 self._forget(fact)
         else:
-            self._forget(_withdrawn_fact(message))
+            self._forget(_fact(message))
 
     def standing(self, host: str) -> Standing:
         """A host with a node or a grant has a registration; what the policy says of others is not known here."""
@@ -154,48 +175,14 @@ class StatedTable:
                 del self._clients[fact[:4]]
 
 
-def _fact(message: Statement) -> _Fact:
-    match message:
-        case NodePlaced(key=key):
-            return ("node", key)
-        case PublicationPlaced(key=key, topic=topic):
-            return ("publication", key, topic)
-        case ServicePlaced(key=key, service=service):
-            return ("service", key, service)
-        case GrantInstalled(key=key, topic=topic, host=host, caller_id=caller_id):
-            return ("grant", key, topic, host, caller_id)
-        case ClientGranted(key=key, service=service, host=host, caller_id=caller_id):
-            return ("client", key, service, host, caller_id)
+def _fact(message: Message) -> _Fact:
+    """What a statement, or its withdrawal, is about."""
+    kind = _KINDS.get(type(message))
+    if kind is None:
+        raise TypeError(f"{type(message).__name__} withdraws nothing")
+    return (kind, *(getattr(message, field) for field in _ABOUT[kind].fields))
 
 
 def _host(fact: _Fact, message: Message) -> str:
     """The host that a statement is about; empty where it names none of its own."""
     return message.host if isinstance(message, NodePlaced) else fact[3] if len(fact) > 3 else ""
-
-
-def _withdrawn_fact(message: Message) -> _Fact:
-    match message:
-        case PublicationWithdrawn(key=key, topic=topic):
-            return ("publication", key, topic)
-        case ServiceWithdrawn(key=key, service=service):
-            return ("service", key, service)
-        case GrantRevoked(key=key, topic=topic, host=host, caller_id=caller_id):
-            return ("grant", key, topic, host, caller_id)
-        case ClientRevoked(key=key, service=service, host=host, caller_id=caller_id):
-            return ("client", key, service, host, caller_id)
-    raise TypeError(f"{type(message).__name__} withdraws nothing")
-
-
-def _withdrawal(fact: _Fact) -> Message:
-    match fact:
-        case ("node", key):
-            return NodeWithdrawn(key)
-        case ("publication", key, topic):
-            return PublicationWithdrawn(key, topic)
-        case ("service", key, service):
-            return ServiceWithdrawn(key, service)
-        case ("grant", key, topic, host, caller_id):
-            return GrantRevoked(key, topic, host, caller_id)
-        case ("client", key, service, host, caller_id):
-            return ClientRevoked(key, service, host, caller_id)
-    raise TypeError(f"no withdrawal for {fact}")

@@ -61,12 +61,13 @@ class Bounds:
                 f"{self}: a host's share, or the strangers' with what is kept, is beyond the whole"
             )
 
-    def sized(self, whole: int, host: int) -> "Bounds":
-        """With another whole and another share of a host, as an operator has set them.
+    def sized(self, whole: int, host: int | None = None) -> "Bounds":
+        """With another whole and another share of a host (None: the same part), as an operator has set them.
 
         The strangers' share and what is kept are the same parts of the whole as before, rounded down; one at least for
         strangers that had a share, so that a small pool turns nobody away who is told why.
         """
+        host = self.host * whole // self.whole if host is None else host
         strangers = self.strangers * whole // self.whole
         if self.strangers and not strangers:
             strangers = 1

@@ -4,6 +4,10 @@ A statement is appended (one small write to the page cache, microseconds, no wai
 answered because of it. When the database has taken all of them the file is emptied. After a crash the statements that
 are still in it are carried out again: each is idempotent, and their order is kept.
 
+What that wins over a commit of each statement (`python -m benchmarks.state_writes`): the thread that answers everybody
+is held up for half as long by a registration (20 µs, not 45), and never by SQLite's one writer, which keeps a tree of
+parameters of 16 MiB for a third of a second.
+
 What this outlasts is the death of the process, not of the machine's power: as the database's own WAL without fsync.
 """
 

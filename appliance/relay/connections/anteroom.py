@@ -66,7 +66,7 @@ class Anteroom:
         why = share.refusal(more)
         while (
             why
-            and share.used + more <= self._headers.pool.bounds.host
+            and share.used + more <= self._headers.bounds.host
             and self._end_longest(self._with_long_headers, host, but=guest)
         ):
             why = share.refusal(more)

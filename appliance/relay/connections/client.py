@@ -110,9 +110,7 @@ class ServiceClient:
             count=traffic.count,
             judge=self._judge,
         )
-        self._client = Stream(
-            context.loop, sock, self._client_received, self._client_broken, drained=self._advance
-        )
+        self._client = Stream(context.loop, sock, self._client_received, self.cut, drained=self._advance)
         self._client.read(False)
 
     def start(self, rest: bytes) -> None:
@@ -137,7 +135,7 @@ class ServiceClient:
         if self._greeted:
             objection = self._context.middle.service_objection(self.service.service, self._header)
             if objection:
-                self._close(objection)
+                self.cut(objection)
 
     def look(self) -> None:
         """A second is over: one that keeps memory for a message that nothing comes of, or is not taken, is cut."""
@@ -147,13 +145,15 @@ class ServiceClient:
         patience = SMALL if any(one.share.exhausted for one in self._weights) else _PATIENT
         if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
-            self._close(
-                f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s"
-            )
+            self.cut(f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s")
 
     def cut(self, reason: str) -> None:
-        """Close both connections: what they stand on is gone."""
-        self._close(reason)
+        """Close both connections; empty for the client's own end."""
+        if self._live:
+            self._release()
+            self._client.close()
+            self._context.reporter.closed(self._number, reason)
+            self._ended()
 
     def _patience(self, seconds: float) -> None:
         """From now on the service has so long."""
@@ -211,7 +211,7 @@ class ServiceClient:
 
     def _client_received(self, data: bytes) -> None:
         if not data:
-            self._close("")
+            self.cut("")
         else:
             self._guard(self._exchange.from_client, data)
 
@@ -220,7 +220,7 @@ class ServiceClient:
         try:
             feed(data)
         except PeerError as error:
-            self._close(str(error))
+            self.cut(str(error))
             return
         self._advance()
 
@@ -230,7 +230,7 @@ class ServiceClient:
             return
         while self._live and not self._client.backlog:
             if self._exchange.done or self._server is None:
-                self._close("")
+                self.cut("")
                 return
             if not self._exchange.ready:
                 break
@@ -247,7 +247,7 @@ class ServiceClient:
         for weight, size in zip(self._weights, parts, strict=True):
             weight.set(size)
             if size > SMALL and weight.share.exhausted:
-                self._close("the relay has no memory left for messages of this host")
+                self.cut("the relay has no memory left for messages of this host")
                 return
 
     def _to_service(self, data: bytes) -> None:
@@ -256,9 +256,6 @@ class ServiceClient:
 
     def _to_client(self, data: bytes) -> None:
         self._client.send(data)
-
-    def _client_broken(self, reason: str) -> None:
-        self._close(reason)
 
     def _server_broken(self, reason: str) -> None:
         if self._greeted:
@@ -276,20 +273,13 @@ class ServiceClient:
         if self._client.backlog:
             self._client.read(False)
         else:
-            self._close("" if self._exchange.may_read or self._exchange.done else reason)
+            self.cut("" if self._exchange.may_read or self._exchange.done else reason)
 
     def _turn_away(self, reason: str) -> None:
         """The client gets the reason in a header of its own."""
         if self._live:
             self._release()
             self._refuse(self._client.take(), reason)
-
-    def _close(self, reason: str) -> None:
-        if self._live:
-            self._release()
-            self._client.close()
-            self._context.reporter.closed(self._number, reason)
-            self._ended()
 
     def _release(self) -> None:
         self._live = False

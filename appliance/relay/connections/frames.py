@@ -15,8 +15,8 @@ subscribers have been sent always ends with a frame.
 
 import mmap
 import struct
-from typing import Protocol
 
+from appliance.relay.connections.memory import HostShare
 from appliance.ros.errors import LimitExceededError
 
 SMALL = 4 << 10
@@ -30,21 +30,6 @@ _MANY = 4  # frames
 
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
-
-
-class Memory(Protocol):
-    """Where the bytes of one host that wait are counted."""
-
-    def add(self, size: int) -> None:
-        """So many bytes more are there; fewer, where `size` is below 0."""
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether nothing more should be kept."""
-
-    @property
-    def plenty(self) -> bool:
-        """Whether there is so much that memory may be kept for use again."""
 
 
 class Batch:
@@ -119,7 +104,7 @@ class Batch:
 class FrameReceiver:
     """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
 
-    def __init__(self, scratch: memoryview, limit: int, share: Memory) -> None:
+    def __init__(self, scratch: memoryview, limit: int, share: HostShare) -> None:
         self._scratch = scratch
         self._limit = limit
         self._share = share

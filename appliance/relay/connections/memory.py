@@ -14,7 +14,7 @@ Invariants, besides those of `Pool`:
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from appliance.relay.limits import Limits
 from appliance.shares.pool import Pool, Standing
@@ -64,15 +64,12 @@ class HostShare:
         return self._pool.total * 2 < self._pool.bounds.whole
 
 
-class HostShares:
-    """The share of each host in a pool."""
-
-    def __init__(self, pool: Pool[str]) -> None:
-        self.pool = pool
+class HostShares(Pool[str]):
+    """A pool of bytes, and the share of each host in it."""
 
     def of(self, host: str) -> HostShare:
         """The share of the host with this address."""
-        return HostShare(self.pool, host)
+        return HostShare(self, host)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +88,7 @@ class Memory:
         together = sum(row.bounds.whole for row in rows)
 
         def shares(row: Share, whole: int) -> HostShares:
-            noun = row.thing.partition(" in ")[0]
-            bounds = row.bounds.sized(whole, row.bounds.host * whole // row.bounds.whole)
-            return HostShares(Pool(noun, bounds, standing))
+            return HostShares(row.thing.partition(" in ")[0], row.bounds.sized(whole), standing)
 
         frames, queues, latched = (
             shares(row, row.bounds.whole * limits.memory_bytes // together) for row in rows
@@ -102,12 +97,7 @@ class Memory:
 
     def held(self) -> dict[str, int]:
         """The bytes in each pool."""
-        return {
-            "frames": self.frames.pool.total,
-            "queues": self.queues.pool.total,
-            "latched": self.latched.pool.total,
-            "headers": self.headers.pool.total,
-        }
+        return {pool.name: getattr(self, pool.name).total for pool in fields(self)}
 
 
 class Weight:

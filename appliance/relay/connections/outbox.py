@@ -11,7 +11,8 @@ Invariants:
 
 from collections import deque
 
-from appliance.relay.connections.frames import Memory, boundary_at
+from appliance.relay.connections.frames import boundary_at
+from appliance.relay.connections.memory import HostShare
 from appliance.relay.limits import Limits
 
 _VECTORS = 64
@@ -21,7 +22,7 @@ _BEHIND = 1 << 20
 class Outbox:
     """Frames on their way to one subscriber."""
 
-    def __init__(self, limits: Limits, share: Memory) -> None:
+    def __init__(self, limits: Limits, share: HostShare) -> None:
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
         self._share = share

@@ -77,7 +77,7 @@ class Subscriber:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self._close(f"cannot be written to: {error.strerror}")
+            self.cut(f"cannot be written to: {error.strerror}")
             return False
         if sent < len(data):
             self._outbox.begin(memoryview(data)[sent:])
@@ -106,7 +106,7 @@ class Subscriber:
             except BlockingIOError:
                 sent = 0
             except OSError as error:
-                self._close(f"cannot be written to: {error.strerror}")
+                self.cut(f"cannot be written to: {error.strerror}")
                 return 0
             if sent == len(view):
                 return 0
@@ -147,13 +147,17 @@ class Subscriber:
         """A second is over: beyond its host's share, one that takes nothing of a message that has begun is cut."""
         begun = self._outbox.begun if self._outbox.short else 0
         if self._stall.seen(begun, self._loop.clock()):
-            self._close(
-                "its host has no memory left in the relay, and it does not take the rest of a message"
-            )
+            self.cut("its host has no memory left in the relay, and it does not take the rest of a message")
 
     def cut(self, reason: str) -> None:
-        """Close the connection: what it stands on is gone."""
-        self._close(reason)
+        """Close the connection; empty for the subscriber's own end."""
+        if self._live:
+            self._live = False
+            self._loop.discard(self._socket)
+            self._outbox.clear()
+            self.topic.leave(self)
+            self._reporter.closed(self._number, reason)
+            self._ended()
 
     def _ready(self, events: int) -> None:
         if events & WRITE:
@@ -168,7 +172,7 @@ class Subscriber:
         except BlockingIOError:
             return
         except OSError as error:
-            self._close(f"cannot be written to: {error.strerror}")
+            self.cut(f"cannot be written to: {error.strerror}")
             return
         outbox.advance(sent)
         if not outbox:
@@ -182,26 +186,17 @@ class Subscriber:
         except BlockingIOError:
             return
         except OSError as error:
-            self._close(f"broke: {error.strerror}")
+            self.cut(f"broke: {error.strerror}")
             return
         if not data:
-            self._close("")
+            self.cut("")
             return
         reason = (
             "sent data after its header; a connection is for one topic, ask for another on another connection"
         )
         asked = ("topic", self.topic.topic)
         self._reporter.refused(self.topic.key, asked, self.host, self.caller_id, reason)
-        self._close(reason)
-
-    def _close(self, reason: str) -> None:
-        if self._live:
-            self._live = False
-            self._loop.discard(self._socket)
-            self._outbox.clear()
-            self.topic.leave(self)
-            self._reporter.closed(self._number, reason)
-            self._ended()
+        self.cut(reason)
 
 
 def describe_mismatch(wanted: Mapping[str, str], offered: Mapping[str, str]) -> str:

@@ -48,7 +48,7 @@ class Visitor:
         self._anteroom = anteroom
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
-        self._stream = Stream(context.loop, sock, self._received, self._broken)
+        self._stream = Stream(context.loop, sock, self._received, lambda _reason: failed(self, ""))
         self._received_bytes = 0
         anteroom.enter(self, host)
 
@@ -92,9 +92,6 @@ class Visitor:
             self.fields, self.rest = fields, self._parser.rest
             self._introduced(self)
 
-    def _broken(self, _reason: str) -> None:
-        self._failed(self, "")
-
     def _late(self) -> None:
         self._failed(self, f"it did not send a connection header within {self._limits.header_seconds:g} s")
 
@@ -113,7 +110,7 @@ class Farewell:
         self.live = True
         self._ended = ended
         self._timer = loop.after(seconds, self.close)
-        self._stream = Stream(loop, sock, self._received, self._broken, drained=self._told)
+        self._stream = Stream(loop, sock, self._received, lambda _reason: self.close(), drained=self._told)
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
             self._told()
@@ -136,6 +133,3 @@ class Farewell:
     def _received(self, data: bytes) -> None:
         if not data:
             self.close()
-
-    def _broken(self, _reason: str) -> None:
-        self.close()

@@ -5,7 +5,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -55,22 +54,6 @@ def test_batched_is_on_disk_soon_without_being_asked(make_log: MakeLog, path: Pa
     log = make_log()
     log.record(decision(log))
     eventually(lambda: search(path, Filter(event="decision")).entries, "it is on disk")
-
-
-def test_flushed_calls_back(make_log: MakeLog) -> None:
-    """`flushed` calls its function with None once the records are on disk."""
-    log = make_log()
-    called: list[str | None] = []
-    done = threading.Event()
-    log.record(decision(log))
-
-    def heard(reason: str | None) -> None:
-        called.append(reason)
-        done.set()
-
-    log.flushed(heard)
-    assert done.wait(_LIMIT_SECONDS)
-    assert called == [None]
 
 
 def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:

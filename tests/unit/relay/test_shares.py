@@ -165,7 +165,7 @@ def test_headers_of_strangers_leave_room_for_the_robots(world: World) -> None:
     ours = world.connect(encode_header(ASK | {"filler": "x" * 30_000}))
     world.upstream()
     assert world.gets_header(ours)["callerid"] == "/talker"
-    pool = world.engine._memory.headers.pool
+    pool = world.engine._memory.headers
     assert 0 < pool.total <= MIB // 4 + len(unfinished)
 
 

@@ -2,7 +2,7 @@
 
 from appliance.relay.connections.anteroom import Anteroom
 from appliance.relay.connections.memory import HostShares
-from appliance.shares.pool import Pool, Standing
+from appliance.shares.pool import Standing
 from appliance.shares.table import RELAY_HEADERS
 
 
@@ -12,8 +12,8 @@ class World:
     def __init__(self) -> None:
         self.now = 0.0
         self.granted: set[str] = set()
-        self.held: Pool[str] = Pool("bytes", RELAY_HEADERS.bounds, self.standing)
-        self.room = Anteroom(lambda: self.now, self.standing, HostShares(self.held))
+        self.held = HostShares("bytes", RELAY_HEADERS.bounds, self.standing)
+        self.room = Anteroom(lambda: self.now, self.standing, self.held)
 
     def standing(self, host: str) -> Standing:
         """A host with a grant is known."""

@@ -2,12 +2,12 @@
 
 from appliance.relay.connections.memory import HostShares, Memory, Stall
 from appliance.relay.limits import Limits
-from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.shares.pool import Bounds, Standing
 
 
 def shares(whole: int) -> HostShares:
     """The shares of registered hosts, any of which may have all."""
-    return HostShares(Pool("bytes", Bounds(whole, whole, 0, 0), lambda _host: Standing.REGISTERED))
+    return HostShares("bytes", Bounds(whole, whole, 0, 0), lambda _host: Standing.REGISTERED)
 
 
 def take_all(pool: HostShares, host: str, step: int = 1) -> int:
@@ -42,13 +42,13 @@ def test_however_many_hosts_take_all_they_can_the_next_finds_room() -> None:
                 share.add(256)
     robot = pool.of("robot")
     assert not robot.refusal((1 << 20) // 820)
-    assert pool.pool.total <= 1 << 20
+    assert pool.total <= 1 << 20
 
 
 def test_the_memory_of_a_relay_is_parted_as_the_table_says() -> None:
     """Whatever its size, queues and latched messages leave half for messages on their way."""
     memory = Memory.of(Limits(memory_bytes=1 << 28), lambda _host: Standing.REGISTERED)
-    wholes = [one.pool.bounds.whole >> 20 for one in (memory.frames, memory.queues, memory.latched)]
+    wholes = [one.bounds.whole >> 20 for one in (memory.frames, memory.queues, memory.latched)]
     assert wholes == [128, 64, 64]
     assert take_all(memory.latched, "a", 1 << 20) == 32 << 20
     assert memory.held() == {"frames": 0, "queues": 0, "latched": 32 << 20, "headers": 0}
@@ -59,7 +59,7 @@ def test_a_host_that_is_gone_leaves_nothing() -> None:
     pool = shares(100)
     pool.of("a").add(5)
     pool.of("a").add(-5)
-    assert list(pool.pool.holders()) == []
+    assert list(pool.holders()) == []
 
 
 def test_a_stall_is_what_does_not_change() -> None:

@@ -1,0 +1,108 @@
+"""What the log in front of the state's database wins: python -m benchmarks.state_writes [--rate 500] [--seconds 10]
+
+A robot's nodes register at a rate; each registration must outlast control before it is answered, and is kept by the
+thread that answers everybody. Every second the tree of parameters is kept, too, by another thread. Shown is how long
+the answering thread is held up by one registration, in microseconds:
+
+- `ahead`: as the program does it, a line in `state.ahead` and a statement in the queue of the writer's thread.
+- `commit`: the statement is committed to SQLite's own log (WAL, `synchronous=NORMAL`) by the answering thread. It waits
+  while the other thread writes the tree, and when it is its turn to bring SQLite's log into the database.
+"""
+
+import argparse
+import sqlite3
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from appliance.store.state import RegistrationRow, StateStore
+
+Keep = Callable[[RegistrationRow], None]
+
+
+def main() -> None:
+    """Show both, with trees of parameters as small robots and large ones have them."""
+    arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    arguments.add_argument("--rate", type=int, default=500, help="registrations a second")
+    arguments.add_argument("--seconds", type=float, default=10)
+    given = arguments.parse_args()
+    table = Table("tree of parameters", "way", "median", "99 %", "longest", title="µs of one registration")
+    for kib in (0, 100, 1024, 16_384):
+        for way in (ahead, commit):
+            with tempfile.TemporaryDirectory(dir=".") as folder:
+                held_up = way(Path(folder), b"p" * (kib << 10), given.rate, given.seconds)
+            cuts = statistics.quantiles(held_up, n=100)
+            shown = (f"{1e6 * one:,.0f}" for one in (cuts[49], cuts[98], max(held_up)))
+            table.add_row(f"{kib} KiB" if kib else "none", way.__name__, *shown)
+    Console().print(table)
+
+
+def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
+    """As the program does it."""
+    store = StateStore(folder, failed=print)
+    try:
+        return _registering(
+            store.save_registration, lambda: store.save_parameters({"p": tree}), tree, rate, seconds
+        )
+    finally:
+        store.close()
+
+
+def commit(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
+    """Each statement committed where it is made."""
+    StateStore(folder, failed=print).close()
+    registrations, parameters = _opened(folder), _opened(folder)
+
+    def keep(row: RegistrationRow) -> None:
+        registrations.execute("INSERT OR REPLACE INTO registration VALUES (?, ?, ?, ?, ?)", row)
+
+    def keep_tree() -> None:
+        parameters.execute("INSERT OR REPLACE INTO parameters VALUES (1, ?)", (tree,))
+
+    try:
+        return _registering(keep, keep_tree, tree, rate, seconds)
+    finally:
+        registrations.close()
+        parameters.close()
+
+
+def _opened(folder: Path) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        folder / "state.db", isolation_level=None, timeout=60, check_same_thread=False
+    )
+    connection.execute("PRAGMA synchronous=NORMAL")
+    return connection
+
+
+def _registering(
+    keep: Keep, keep_tree: Callable[[], None], tree: bytes, rate: int, seconds: float
+) -> list[float]:
+    """Seconds that each registration took."""
+    over = threading.Event()
+
+    def keep_trees() -> None:
+        while not over.wait(1.0):
+            keep_tree()
+
+    others = threading.Thread(target=keep_trees if tree else lambda: None)
+    others.start()
+    held_up = []
+    for number in range(int(rate * seconds)):
+        row = RegistrationRow(f"node{number % 100}", "topic", f"/robot/{number}", "std_msgs/String", number)
+        began = time.perf_counter()
+        keep(row)
+        held_up.append(time.perf_counter() - began)
+        over.wait(1 / rate)
+    over.set()
+    others.join()
+    return held_up
+
+
+if __name__ == "__main__":
+    main()
