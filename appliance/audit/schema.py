@@ -1,16 +1,11 @@
-"""The documented form of a record as a JSON schema, and the tables of the reviewer's page, made from the code.
+"""The documented form of a record as a JSON schema."""
 
-`python -m appliance.audit.schema` prints the generated part of docs/audit.md; a test holds the page against it.
-"""
-
-import json
-import sys
 from typing import Any
 
 from appliance.audit.record import SCHEMA_VERSION, Severity
 
 _TEXT_OR_NULL = {"type": ["string", "null"]}
-_FIELDS: dict[str, tuple[dict[str, Any], str]] = {
+FIELDS: dict[str, tuple[dict[str, Any], str]] = {
     "schema": ({"const": SCHEMA_VERSION}, "version of this schema"),
     "id": ({"type": "string", "pattern": "^[0-9a-f]{20}$"}, "unique; sorted as text it is sorted by time"),
     "time": ({"type": "string", "format": "date-time"}, "RFC 3339, UTC, nanoseconds"),
@@ -43,69 +38,13 @@ _FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-_HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
-_CHAIN = {
-    "type": "object",
-    "description": "in an export: the place in the hash chain, as far as a signed checkpoint",
-    "properties": {
-        "previous": _HASH | {"description": "hash of the record before"},
-        "hash": _HASH | {"description": "hash of this record"},
-        "then": {
-            "type": ["array", "null"],
-            "items": _HASH,
-            "description": "content hashes of the records after it that are left out; null: version 0.1.0 wrote them",
-        },
-        "checkpoint": {
-            "type": ["object", "null"],
-            "description": "the signed checkpoint that seals what is up to here, as `rosrv audit checkpoints` gives it",
-        },
-    },
-    "required": ["previous", "hash", "then"],
-    "additionalProperties": False,
-}
-
-
 def json_schema() -> dict[str, Any]:
     """The JSON schema (2020-12) of a record as CLI, REST and export give it."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"ROSRV audit record, version {SCHEMA_VERSION}",
         "type": "object",
-        "properties": {name: form | {"description": text} for name, (form, text) in _FIELDS.items()},
-        "required": [name for name in _FIELDS if name != "decision"],
+        "properties": {name: form | {"description": text} for name, (form, text) in FIELDS.items()},
+        "required": [name for name in FIELDS if name != "decision"],
         "additionalProperties": False,
     }
-
-
-def export_schema() -> dict[str, Any]:
-    """The JSON schema of a line of an export: a record and its place in the hash chain."""
-    record = json_schema()
-    return record | {
-        "title": f"ROSRV audit record with its place in the chain, version {SCHEMA_VERSION}",
-        "properties": record["properties"] | {"chain": _CHAIN},
-        "required": [*record["required"], "chain"],
-    }
-
-
-def markdown() -> str:
-    """The generated part of the reviewer's page."""
-    lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
-    lines += [f"| `{name}` | {text} |" for name, (_form, text) in _FIELDS.items()]
-    lines += [
-        "",
-        "The names of `event`, each with its fields of `detail`: [audit-events.md](audit-events.md).",
-    ]
-    lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
-    lines += [
-        "A line of an export has one field more, `chain`:",
-        "",
-        "```json",
-        json.dumps(_CHAIN, indent=2),
-        "```",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(markdown())

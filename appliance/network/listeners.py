@@ -4,40 +4,50 @@ import ipaddress
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 _TCP_LISTEN = "0A"
 
 
 def listening_addresses(port: int) -> tuple[str, ...]:
     """Return the addresses on which someone listens on a TCP port."""
-    return tuple(sorted({address for address, number in _listeners() if number == port}))
+    return tuple(sorted({_address(row.address) for row in _listeners() if row.port == port}))
 
 
 def listening_ports() -> set[int]:
     """Return the TCP ports on which someone listens, on whatever address."""
-    return {number for _, number in _listeners()}
+    return {row.port for row in _listeners()}
+
+
+def listening_inodes(port: int) -> set[str]:
+    """Return the inodes of the sockets that listen on a TCP port."""
+    return {row.inode for row in _listeners() if row.port == port}
 
 
 def udp_ports_in_use() -> set[int]:
     """Return the UDP ports that someone has bound, on whatever address."""
-    found = set()
-    for name in ("udp", "udp6"):
+    return {row.port for row in _rows("udp", "udp6")}
+
+
+class _Row(NamedTuple):
+    address: str
+    port: int
+    state: str
+    inode: str
+
+
+def _listeners() -> Iterator[_Row]:
+    return (row for row in _rows("tcp", "tcp6") if row.state == _TCP_LISTEN)
+
+
+def _rows(*names: str) -> Iterator[_Row]:
+    for name in names:
         table = Path("/proc/thread-self/net", name)
         if table.exists():
             for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                found.add(int(line.split()[1].rpartition(":")[2], 16))
-    return found
-
-
-def _listeners() -> Iterator[tuple[str, int]]:
-    for name in ("tcp", "tcp6"):
-        table = Path("/proc/thread-self/net", name)
-        if table.exists():
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                _, local, _, state, *_ = line.split()
-                address, _, number = local.partition(":")
-                if state == _TCP_LISTEN:
-                    yield _address(address), int(number, 16)
+                fields = line.split()
+                address, _, port = fields[1].partition(":")
+                yield _Row(address, int(port, 16), fields[3], fields[9])
 
 
 def _address(text: str) -> str:

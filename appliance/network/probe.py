@@ -8,14 +8,14 @@ reached from outside loopback at all.
 
 import ipaddress
 import json
-import subprocess
 import sys
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 from appliance.network.listeners import listening_addresses
 from appliance.network.namespaces import Namespace, NetworkError
-from appliance.network.progress import communicate
+from appliance.network.progress import run
 
 PROBE_UID = 61099  # nobody's: neither root nor one of the appliance's users
 _CONNECT_SECONDS = 1.0
@@ -105,32 +105,19 @@ def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeRe
 
 def _run_child(namespace: Namespace, port: int, uid: int) -> str:
     arguments = [sys.executable, "-I", "-S", "-c", _CHILD, str(port), str(_CONNECT_SECONDS)]
+    child = partial(namespace.popen, arguments, user=uid, group=uid, extra_groups=[], cwd="/", env={})
     try:
-        process = namespace.popen(
-            arguments,
-            user=uid,
-            group=uid,
-            extra_groups=[],
-            cwd="/",
-            env={},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        status, output, errors = run(child, "", f"the probe of port {port}")
+    except TimeoutError as error:
+        raise NetworkError(str(error)) from None
     except OSError as error:
         raise NetworkError(
             f"the probe cannot be run as uid {uid}: {error.strerror} ({sys.executable} must be executable by "
             "all users, and CAP_SETUID and CAP_SETGID are needed)"
         ) from error
-    with process:
-        try:
-            output, errors = communicate(process, "", f"the probe of port {port}")
-        except TimeoutError as error:
-            raise NetworkError(str(error)) from None
-    if process.returncode != 0:
+    if status != 0:
         raise NetworkError(f"the probe of port {port} as uid {uid} failed: {errors.strip()[-300:]}")
-    return str(output)
+    return output
 
 
 def _attempt(address: str, outcome: str) -> Attempt:

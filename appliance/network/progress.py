@@ -8,6 +8,7 @@ processor time, and does not wait for a processor or a disk either.
 import logging
 import subprocess
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -20,6 +21,8 @@ _STATE, _MAJOR_FAULTS, _TIMES = (
     9,
     slice(11, 13),
 )  # in /proc/PID/stat, behind the name: see proc_pid_stat(5)
+
+Start = Callable[..., "subprocess.Popen[str]"]
 
 log = logging.getLogger("rosrv")
 
@@ -45,15 +48,26 @@ class Progress:
         return now - self._since
 
 
+def run(program: Start, text: str, what: str) -> tuple[int, str, str]:
+    """Start a program, give it its input and wait for its end: exit status, output, errors.
+
+    `program` is given the pipes, as `subprocess.Popen` has them. Raises: TimeoutError, as `communicate`, and what
+    starting it raises.
+    """
+    pipe = subprocess.PIPE
+    with program(stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        said, complained = communicate(process, text, what)
+    return process.returncode, said, complained
+
+
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
     """Give a program its input and wait for its end; what it said. Every now and then says that `what` is waited for.
 
     Raises: TimeoutError, with words, when it hangs; it is killed then.
     """
     began, progress, said = time.monotonic(), Progress(process.pid), _SAY_SECONDS
-    with ThreadPoolExecutor(
-        1, "communicate"
-    ) as pool:  # a second `communicate` would not go on with the input
+    # A second `communicate` would not go on with the input.
+    with ThreadPoolExecutor(1, "communicate") as pool:
         talk = pool.submit(process.communicate, text)
         while not wait((talk,), _LOOK_SECONDS).done:
             waited, still = time.monotonic() - began, progress.still_seconds()

@@ -20,12 +20,13 @@ import re
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from appliance.network.firewall.rules import PortRange
 from appliance.network.namespaces import NetworkError
-from appliance.network.progress import communicate
+from appliance.network.progress import run
 
 TABLE = "rosrv_protect"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
@@ -159,15 +160,13 @@ def _service(text: str) -> Service:
 
 
 def _nft(arguments: list[str], text: str) -> str:
-    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     try:
-        with subprocess.Popen(["nft", *arguments], text=True, **pipes) as process:
-            said, complaint = communicate(process, text, "nft")
+        status, said, complaint = run(partial(subprocess.Popen, ["nft", *arguments]), text, "nft")
     except FileNotFoundError:
         raise NetworkError("the program `nft` is not here: sudo apt install nftables") from None
     except TimeoutError as error:
         raise NetworkError(str(error)) from None
-    if process.returncode != 0:
+    if status != 0:
         reason = " ".join(complaint.split())[:400]
         hint = " (run it as root: sudo rosrv protect …)" if "not permitted" in reason else ""
         raise NetworkError(f"nft: {reason}{hint}")

@@ -1,9 +1,9 @@
 """Every finite thing that hosts can use up: how much there is, each one's share, and what happens at the limit.
 
-`SHARES` is the one list that docs/shares.md is generated from (`python -m appliance.shares`). Each row names the tests
-that attack it; `tests/unit/shares/test_table.py` holds that they exist. A row has a name here, and whoever makes the
-pool takes its bounds from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot differ
-from the code.
+`SHARES` is the one list that docs/shares.md is generated from (`python -m distribution.shares_page`). Each row names
+the tests that attack it; `tests/unit/shares/test_table.py` holds that they exist. A row has a name here, and whoever
+makes the pool takes its bounds from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot
+differ from the code.
 """
 
 from typing import NamedTuple
@@ -12,164 +12,155 @@ from appliance.shares.pool import Bounds
 
 
 class Share(NamedTuple):
-    """One row of the table."""
+    """One row of the table.
+
+    `thing` is what is finite, where, with its unit: "connections to RVMaster". `bounds` are as they are by default;
+    `setting` says where an operator changes them ("limits.connections" of appliance.yaml), or is "" where nobody does.
+    `at_limit` is what the host that is beyond its share sees, and what the others see; `alarm` the audit event and the
+    metric that tell of it. `shown_by` are the tests that use it up, as paths below tests/.
+    """
 
     thing: str
-    """What is finite, where, with its unit: "connections to RVMaster"."""
-
     bounds: Bounds
-    """As they are by default."""
-
     setting: str
-    """Where an operator changes them ("limits.connections" of appliance.yaml), or "" where nobody does."""
-
     at_limit: str
-    """What the host that is beyond its share sees, and what the others see."""
-
     alarm: str
-    """The audit event and the metric that tell of it."""
-
     shown_by: tuple[str, ...]
-    """The tests that use it up, as paths below tests/: `integration/master/test_shares.py::test_…`."""
 
 
 RVMASTER_CONNECTIONS = Share(
-    thing="connections to RVMaster and the nodes' faces",
-    bounds=Bounds(whole=4096, host=512, strangers=512, kept=1024),
-    setting="limits.connections",
-    at_limit="503 with the reason; a host within its share gets the place of an idle or unfinished connection of hosts"
+    "connections to RVMaster and the nodes' faces",
+    Bounds(whole=4096, host=512, strangers=512, kept=1024),
+    "limits.connections",
+    "503 with the reason; a host within its share gets the place of an idle or unfinished connection of hosts"
     " that have no more rights to it, strangers first",
-    alarm="`limit exceeded`",
-    shown_by=("integration/master/test_shares.py::test_connections_of_two_hundred_addresses",),
+    "`limit exceeded`",
+    ("integration/master/test_shares.py::test_connections_of_two_hundred_addresses",),
 )
 RVMASTER_BYTES = Share(
-    thing="bytes of requests and answers under way, RVMaster and faces",
-    bounds=Bounds(whole=512 << 20, host=64 << 20, strangers=1 << 20, kept=192 << 20),
-    setting="",
-    at_limit="503 with the reason; the request that holds most of a host that holds more makes room",
-    alarm="`limit exceeded`",
-    shown_by=(
+    "bytes of requests and answers under way, RVMaster and faces",
+    Bounds(whole=512 << 20, host=64 << 20, strangers=1 << 20, kept=192 << 20),
+    "",
+    "503 with the reason; the request that holds most of a host that holds more makes room",
+    "`limit exceeded`",
+    (
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_visitors.py::test_bytes_are_freed_by_the_host_that_holds_most",
     ),
 )
 RVMASTER_FAREWELLS = Share(
-    thing="connections that RVMaster tells that they are too many",
-    bounds=Bounds(whole=256, host=8, strangers=64, kept=64),
-    setting="",
-    at_limit="closed without a word",
-    alarm="`limit exceeded`",
-    shown_by=("unit/rpc/test_visitors.py::test_connections_turned_away_in_all",),
+    "connections that RVMaster tells that they are too many",
+    Bounds(whole=256, host=8, strangers=64, kept=64),
+    "",
+    "closed without a word",
+    "`limit exceeded`",
+    ("unit/rpc/test_visitors.py::test_connections_turned_away_in_all",),
 )
 RVMASTER_REQUESTS = Share(
-    thing="requests that RVMaster and faces serve at once",
-    bounds=Bounds(whole=64, host=16, strangers=8, kept=52),
-    setting="",
-    at_limit="the request waits for its host's turn; hosts that the policy names as one network take turns as one, and"
+    "requests that RVMaster and faces serve at once",
+    Bounds(whole=64, host=16, strangers=8, kept=52),
+    "",
+    "the request waits for its host's turn; hosts that the policy names as one network take turns as one, and"
     " have half of the whole together",
-    alarm="none: nothing is refused",
-    shown_by=(
+    "none: nothing is refused",
+    (
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_turns.py::test_requests_of_many_guests_leave_slots_for_the_robot",
     ),
 )
-LARGE_WRITES = Share(
-    thing="large values on their way to ROSMaster",
-    bounds=Bounds(whole=2, host=1, strangers=1, kept=1),
-    setting="",
-    at_limit="the value waits for its host's turn; small calls go between",
-    alarm="none: nothing is refused",
-    shown_by=("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
-)
-PROBES = Share(
-    thing="nodes that are asked at once whether they are there",
-    bounds=Bounds(whole=64, host=16, strangers=8, kept=24),
-    setting="",
-    at_limit="the node is asked when it is its host's turn",
-    alarm="none: nothing is refused",
-    shown_by=("unit/master/graph/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
-)
-NODE_CALLS_UNDER_WAY = Share(
-    thing="calls that are being made to nodes for ROSMaster",
-    bounds=Bounds(whole=512, host=128, strangers=64, kept=192),
-    setting="",
-    at_limit="the node is told when it is its host's turn",
-    alarm="none: nothing is refused",
-    shown_by=("unit/master/graph/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
-)
-QUEUED_NODE_CALLS = Share(
-    thing="bytes of calls that wait for nodes",
-    bounds=Bounds(whole=96 << 20, host=64 << 20, strangers=0, kept=0),
-    setting="",
-    at_limit="the host that has most loses the oldest call to the node that has most of it; the node is told how things"
-    " are once it answers",
-    alarm="the process log; the node is looked at",
-    shown_by=("unit/master/graph/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
-)
-RELAY_CONNECTIONS = Share(
-    thing="connections to one relay",
-    bounds=Bounds(whole=16_384, host=8192, strangers=2048, kept=14_336),
-    setting="relay.connections",
-    at_limit="closed; a stranger here is a host without a grant, and the longest waiting one makes room for a newcomer;"
-    " a host with grants gets the place of a connection of the host that has most, while it has fewer",
-    alarm="`connection refused`",
-    shown_by=("integration/master/test_shares.py::test_connections_to_the_relay",),
-)
 PARAMETER_BYTES = Share(
-    thing="bytes of parameters",
-    bounds=Bounds(whole=64 << 20, host=32 << 20, strangers=8 << 20, kept=24 << 20),
-    setting="limits.parameter_bytes (the parts are as large in proportion)",
-    at_limit="the value is refused, with the reason; one that takes no more than the value in its place is never"
+    "bytes of parameters",
+    Bounds(whole=64 << 20, host=32 << 20, strangers=8 << 20, kept=24 << 20),
+    "limits.parameter_bytes (the parts are as large in proportion)",
+    "the value is refused, with the reason; one that takes no more than the value in its place is never"
     " refused, and stays charged to the host that had set that one",
-    alarm="`limit exceeded`",
-    shown_by=(
+    "`limit exceeded`",
+    (
         "integration/master/test_shares.py::test_parameters_of_two_hundred_addresses",
         "unit/master/calls/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
     ),
 )
-
-_MIB = 1 << 20
-_RELAY = "unit/relay/test_shares.py::"
-
+LARGE_WRITES = Share(
+    "large values on their way to ROSMaster",
+    Bounds(whole=2, host=1, strangers=1, kept=1),
+    "",
+    "the value waits for its host's turn; small calls go between",
+    "none: nothing is refused",
+    ("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
+)
+PROBES = Share(
+    "nodes that are asked at once whether they are there",
+    Bounds(whole=64, host=16, strangers=8, kept=24),
+    "",
+    "the node is asked when it is its host's turn",
+    "none: nothing is refused",
+    ("unit/master/graph/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
+)
+NODE_CALLS_UNDER_WAY = Share(
+    "calls that are being made to nodes for ROSMaster",
+    Bounds(whole=512, host=128, strangers=64, kept=192),
+    "",
+    "the node is told when it is its host's turn",
+    "none: nothing is refused",
+    ("unit/master/graph/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
+)
+QUEUED_NODE_CALLS = Share(
+    "bytes of calls that wait for nodes",
+    Bounds(whole=96 << 20, host=64 << 20, strangers=0, kept=0),
+    "",
+    "the host that has most loses the oldest call to the node that has most of it; the node is told how things"
+    " are once it answers",
+    "the process log; the node is looked at",
+    ("unit/master/graph/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
+)
 RELAY_FRAMES = Share(
     "bytes of unfinished messages in one relay",
-    Bounds(512 * _MIB, 256 * _MIB, 0, 0),
+    Bounds(512 << 20, 256 << 20, 0, 0),
     "relay.memory_bytes (half of it)",
     "a host gets no more than is left for all others: its publisher or client that sends more is cut and may come back;"
     " up to 4 KiB of a connection are never refused",
     "`limit exceeded`, `connection closed`; `rosrv_relay_memory_bytes`",
-    (f"{_RELAY}test_unfinished_messages_of_a_guest_stop_nobody_else",),
+    ("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_nobody_else",),
 )
 RELAY_QUEUES = Share(
     "bytes that wait for subscribers and clients in one relay",
-    Bounds(256 * _MIB, 128 * _MIB, 0, 0),
+    Bounds(256 << 20, 128 << 20, 0, 0),
     "relay.memory_bytes (a quarter of it)",
     "a host gets no more than is left for all others: messages for its slow subscribers are dropped, and one that"
     " takes nothing of a message for ten seconds is cut",
     "`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
-    (f"{_RELAY}test_subscribers_of_a_guest_that_never_read_stop_nobody_else",),
+    ("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_nobody_else",),
 )
 RELAY_LATCHED = Share(
     "bytes of latched messages in one relay",
-    Bounds(256 * _MIB, 128 * _MIB, 0, 0),
+    Bounds(256 << 20, 128 << 20, 0, 0),
     "relay.memory_bytes (a quarter of it)",
     "a host gets no more than is left for all others, and who has most makes room for who has less: a message"
     " that is not kept is passed on; a later subscriber gets it from the publisher once there is room again",
     "`limit exceeded`; `rosrv_relay_memory_bytes`",
     (
-        f"{_RELAY}test_latched_messages_of_a_guest_stop_nobody_else",
-        f"{_RELAY}test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
+        "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_nobody_else",
+        "unit/relay/test_shares.py::test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
     ),
+)
+RELAY_CONNECTIONS = Share(
+    "connections to one relay",
+    Bounds(whole=16_384, host=8192, strangers=2048, kept=14_336),
+    "relay.connections",
+    "closed; a stranger here is a host without a grant, and the longest waiting one makes room for a newcomer;"
+    " a host with grants gets the place of a connection of the host that has most, while it has fewer",
+    "`connection refused`",
+    ("integration/master/test_shares.py::test_connections_to_the_relay",),
 )
 RELAY_HEADERS = Share(
     "bytes of unfinished connection headers in one relay, beyond 4 KiB each",
-    Bounds(64 * _MIB, 16 * _MIB, 16 * _MIB, 32 * _MIB),
+    Bounds(64 << 20, 16 << 20, 16 << 20, 32 << 20),
     "",
     "the long header that waits longest makes room, strangers' first; a peer whose header is beyond its share is turned"
     " away",
     "`connection refused`; `rosrv_relay_memory_bytes`",
     (
-        f"{_RELAY}test_headers_of_strangers_leave_room_for_the_robots",
+        "unit/relay/test_shares.py::test_headers_of_strangers_leave_room_for_the_robots",
         "unit/relay/connections/test_anteroom.py::test_long_headers_make_room_for_short_ones",
     ),
 )
@@ -215,46 +206,46 @@ REST_EXPORTS = Share(
     _STREAMS_SHOWN_BY,
 )
 AUDIT_KINDS = Share(
-    thing="kinds of folded denials in the audit log",
-    bounds=Bounds(whole=8192, host=256, strangers=64, kept=0),
-    setting="",
-    at_limit="further denials are counted as one kind of that host; those of strangers as one kind of all strangers",
-    alarm="`denials folded` with `scope` host or strangers",
-    shown_by=(
+    "kinds of folded denials in the audit log",
+    Bounds(whole=8192, host=256, strangers=64, kept=0),
+    "",
+    "further denials are counted as one kind of that host; those of strangers as one kind of all strangers",
+    "`denials folded` with `scope` host or strangers",
+    (
         "unit/audit/test_folding.py::test_strangers_with_reasons_of_their_own_take_no_kind_of_a_named_host",
         "unit/audit/test_folding.py::test_many_named_hosts_keep_a_line_each",
         "integration/master/test_audit_shares.py::test_strangers_push_no_denial_of_a_named_host_out",
     ),
 )
 AUDIT_READ_KINDS = Share(
-    thing="kinds of folded reads in the audit log",
-    bounds=Bounds(whole=8192, host=512, strangers=0, kept=0),
-    setting="",
-    at_limit="further reads are recorded in full and count as bytes of the host",
-    alarm="none",
-    shown_by=("unit/audit/test_folding.py::test_reads_beyond_the_share_are_recorded_in_full",),
+    "kinds of folded reads in the audit log",
+    Bounds(whole=8192, host=512, strangers=0, kept=0),
+    "",
+    "further reads are recorded in full and count as bytes of the host",
+    "none",
+    ("unit/audit/test_folding.py::test_reads_beyond_the_share_are_recorded_in_full",),
 )
 AUDIT_BYTES = Share(
-    thing="bytes of audit records to pay off; time pays 64 KiB a second of each host's",
-    bounds=Bounds(whole=1 << 40, host=8 << 20, strangers=0, kept=1 << 39),
-    setting="",
-    at_limit="the host's calls wait, one of many parts is refused in words; strangers are served nothing, and what is"
+    "bytes of audit records to pay off; time pays 64 KiB a second of each host's",
+    Bounds(whole=1 << 40, host=8 << 20, strangers=0, kept=1 << 39),
+    "",
+    "the host's calls wait, one of many parts is refused in words; strangers are served nothing, and what is"
     " recorded of that is folded",
-    alarm="`limit exceeded`",
-    shown_by=(
+    "`limit exceeded`",
+    (
         "unit/audit/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_share",
         "unit/audit/test_budget.py::test_who_owes_too_much_waits_until_it_is_paid",
         "integration/master/test_audit_shares.py::test_reads_with_long_keys_fill_no_disk",
     ),
 )
 AUDIT_RESERVE = Share(
-    thing="bytes of the disk that are kept for the audit log",
-    bounds=Bounds(whole=64 << 20, host=1 << 20, strangers=0, kept=16 << 20),
-    setting="audit.reserve_bytes",
-    at_limit="below it a host pays off 8 KiB a second, and its calls wait for that; of the last quarter only hosts with"
+    "bytes of the disk that are kept for the audit log",
+    Bounds(whole=64 << 20, host=1 << 20, strangers=0, kept=16 << 20),
+    "audit.reserve_bytes",
+    "below it a host pays off 8 KiB a second, and its calls wait for that; of the last quarter only hosts with"
     " a registration have any, the others are refused in words; on a full disk nothing is granted until there is room",
-    alarm="`disk nearly full`; `rosrv status`",
-    shown_by=(
+    "`disk nearly full`; `rosrv status`",
+    (
         "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_hosts_with_a_registration",
         "unit/audit/test_room.py::test_a_disk_that_fills_is_told_before_it_is_full",
     ),
@@ -309,32 +300,5 @@ DESCRIPTORS = Share(
     ("unit/shares/test_descriptors.py::test_all_shares_together_fit_the_descriptors",),
 )
 
-SHARES: tuple[Share, ...] = (
-    RVMASTER_CONNECTIONS,
-    RVMASTER_BYTES,
-    RVMASTER_FAREWELLS,
-    RVMASTER_REQUESTS,
-    PARAMETER_BYTES,
-    LARGE_WRITES,
-    PROBES,
-    NODE_CALLS_UNDER_WAY,
-    QUEUED_NODE_CALLS,
-    RELAY_FRAMES,
-    RELAY_QUEUES,
-    RELAY_LATCHED,
-    RELAY_CONNECTIONS,
-    RELAY_HEADERS,
-    REST_CONNECTIONS,
-    REST_STREAMS,
-    REST_STREAM_PEERS,
-    REST_EXPORTS,
-    AUDIT_KINDS,
-    AUDIT_READ_KINDS,
-    AUDIT_BYTES,
-    AUDIT_RESERVE,
-    NODE_PORTS,
-    NAMES,
-    GRANTS,
-    IKE_HANDSHAKES,
-    DESCRIPTORS,
-)
+SHARES: tuple[Share, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Share))
+"""Every row above, in the order of the page."""

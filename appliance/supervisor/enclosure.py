@@ -17,7 +17,6 @@ import ipaddress
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import structlog
@@ -32,6 +31,7 @@ from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNod
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
+from appliance.network.protect import local_port_range
 from appliance.network.shared import bridges, is_contained, lives_on_the_machines_network
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
@@ -242,13 +242,12 @@ class Contained(Enclosure):
 
     def probe(self) -> str | None:
         """Try to reach ROSMaster and the inner face as another local user."""
-        found = [self._probe("ROSMaster", self._ports.rosmaster)]
-        for what, port in (
-            ("the inner node face", self._ports.inner),
-            ("the own nodes' master", self._ports.own),
-        ):
-            if port is not None:
-                found.append(self._probe(what, port))
+        ports = {
+            "ROSMaster": self._ports.rosmaster,
+            "the inner node face": self._ports.inner,
+            "the own nodes' master": self._ports.own,
+        }
+        found = (self._probe(what, port) for what, port in ports.items() if port is not None)
         return "; ".join(filter(None, found)) or None
 
     def _probe(self, what: str, port: int) -> str | None:
@@ -278,7 +277,7 @@ class Contained(Enclosure):
             ),
             master_port=self._ports.master,
             node_ports=PortRange(nodes.start, nodes.stop - 1),
-            client_ports=self._namespace.run(client_ports),
+            client_ports=self._namespace.run(local_port_range),
             api_port=self._ports.api,
             api_networks=self._api_networks(),
             neighbours=self._neighbours(),
@@ -423,9 +422,3 @@ def _require_own_network() -> None:
             "isolation container, and no container: the firewall is this machine's. That is right where it is the "
             "appliance's alone (a virtual machine); else use --isolation netns"
         )
-
-
-def client_ports() -> PortRange:
-    """The ports that the kernel of this namespace gives to sockets that do not choose."""
-    first, last = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()
-    return PortRange(int(first), int(last))

@@ -3,8 +3,10 @@
 import errno
 import socket
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from appliance.network.listeners import listening_inodes
 from appliance.supervisor.errors import StartError
 
 
@@ -68,40 +70,21 @@ def require_free(host: str, port: int) -> None:
 
 
 def _by_whom(port: int) -> str:
-    inodes = _listening_inodes(port)
+    inodes = {f"socket:[{inode}]" for inode in listening_inodes(port)}
     for process in Path("/proc").iterdir():
         if process.name.isdigit() and inodes & _socket_inodes(process):
-            try:
-                title = (
-                    (process / "cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace").strip()
-                )
-            except OSError:
-                title = ""
+            title = ""
+            with suppress(OSError):
+                words = (process / "cmdline").read_bytes().replace(b"\0", b" ")
+                title = words.decode("utf-8", "replace").strip()
             return f" by process {process.name} ({title[:120]})"
     return ""
 
 
-def _listening_inodes(port: int) -> set[str]:
-    found = set()
-    for name in ("tcp", "tcp6"):
-        try:
-            rows = Path("/proc/net", name).read_text().splitlines()[1:]
-        except OSError:
-            continue
-        for fields in map(str.split, rows):
-            if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
-                found.add(f"socket:[{fields[9]}]")
-    return found
-
-
 def _socket_inodes(process: Path) -> set[str]:
     found = set()
-    try:
+    with suppress(OSError):
         for descriptor in (process / "fd").iterdir():
-            try:
+            with suppress(OSError):
                 found.add(str(descriptor.readlink()))
-            except OSError:
-                continue
-    except OSError:
-        pass
     return found

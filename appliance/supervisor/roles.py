@@ -7,6 +7,7 @@ is given the lifeline) or somebody else's (`program`: what is executed, and its 
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from appliance.supervisor.errors import StartError
@@ -95,24 +96,19 @@ def roles_of(
 
     Raises `StartError` when a program is missing.
     """
-    _find(rosmaster, "python3-rosmaster")
-    _find(rosout, "rosout")
+    for program, package in ((rosmaster, "python3-rosmaster"), (rosout, "rosout")):
+        if shutil.which(program) is None:
+            raise StartError(f"{program} is not there: install it with `apt install {package}`")
+    # Most of ours read the configuration and talk to control.
+    ours = partial(Role, path=lambda facts: facts.config, links=("control",))
     roles = (
         Role(
-            name="rosmaster",
-            user="rosmaster",
-            part="rosmaster",
+            "rosmaster", "rosmaster", "rosmaster",
             program=lambda facts: Program(
                 (str(SYSTEM_PYTHON), "-s", str(rosmaster), "--core", "-p", str(facts.rosmaster_port)),
-                {
-                    "ROS_IP": "127.0.0.1",  # rosmaster binds loopback only because of this
-                    "ROS_MASTER_URI": f"http://127.0.0.1:{facts.rosmaster_port}",
-                    "ROS_LOG_DIR": str(facts.part("rosmaster") / "log"),
-                },
+                _of_ros(facts, "rosmaster", f"http://127.0.0.1:{facts.rosmaster_port}"),
             ),
-            asks=True,
-            outlives_control=True,
-            files=8192,
+            asks=True, outlives_control=True, files=8192,
             walls=lambda facts: Walls(
                 families=ROUTES,
                 programs=runnable(SYSTEM_PYTHON),
@@ -120,54 +116,28 @@ def roles_of(
                 reaches=None,  # the inner faces: the firewall knows their port
             ),
         ),
-        Role(
-            name="signer",
-            user="rosrv-signer",
-            part="signer",
-            entry="appliance.ipsec.signer:main",
-            path=lambda facts: facts.config,
-            secret=lambda facts: facts.ca_passphrase_file,
-            links=("control",),
-            network=False,
-            outlives_control=True,
+        ours(
+            "signer", "rosrv-signer", "signer", "appliance.ipsec.signer:main",
+            secret=lambda facts: facts.ca_passphrase_file, network=False, outlives_control=True,
         ),
-        Role(
-            name="relay",
-            user="rosrv-relay",
-            part="relay",
-            entry="appliance.supervisor.relay_entry:main",
-            ended_early=300,
-            indexed=True,
-            path=lambda facts: facts.config,
-            links=("control",),
-            files=65_536,
+        ours(
+            "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
+            ended_early=300, indexed=True, files=65_536,
             walls=lambda _facts: Walls(listed=True, families=NETWORK, reaches=None),
         ),
-        Role(
-            name="control",
-            user="rosrv",
-            part="control",
-            entry="appliance.control.process:main",
-            ended_early=100,
-            path=lambda facts: facts.config,
-            links=("relay", "signer", "api", "charon", "syslog"),
-            files=65_536,
+        ours(
+            "control", "rosrv", "control", "appliance.control.process:main",
+            ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog"),
             readable_by="rosrv-api",
             walls=lambda facts: Walls(
                 listed=True, families=ROUTES, reads=around(*facts.control_reads), binds=None, reaches=None
             ),
         ),
         Role(
-            name="rosout",
-            user="rosrv-rosout",
-            part="rosout",
+            "rosout", "rosrv-rosout", "rosout",
             program=lambda facts: Program(
                 (str(rosout), *_messages_at(facts.rosout_ports)),
-                {
-                    "ROS_IP": "127.0.0.1",
-                    "ROS_MASTER_URI": str(facts.rosout_master),
-                    "ROS_LOG_DIR": str(facts.part("rosout") / "log"),
-                },
+                _of_ros(facts, "rosout", str(facts.rosout_master)),
             ),
             after="control",
             walls=lambda _facts: Walls(
@@ -177,29 +147,14 @@ def roles_of(
                 reaches=None,
             ),
         ),
-        Role(
-            name="api",
-            user="rosrv-api",
-            part="api",
-            entry="appliance.api.process:main",
-            ended_early=800,
-            path=lambda facts: facts.config,
-            links=("control",),
-            after="control",
-            listens=True,
-            dispensable=True,
-            files=4096,
+        ours(
+            "api", "rosrv-api", "api", "appliance.api.process:main",
+            ended_early=800, files=4096, after="control", listens=True, dispensable=True,
             walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
         ),
-        Role(
-            name="charon",
-            user="rosrv-ipsec",
-            part="ipsec",
-            entry="appliance.ipsec.process:main",
-            path=lambda facts: facts.part("ipsec"),
-            links=("control",),
-            dispensable=True,
-            on_demand=True,
+        ours(
+            "charon", "rosrv-ipsec", "ipsec", "appliance.ipsec.process:main",
+            path=lambda facts: facts.part("ipsec"), dispensable=True, on_demand=True,
             capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
             walls=lambda _facts: Walls(
                 families=ROUTES,
@@ -207,17 +162,9 @@ def roles_of(
                 writes=("/dev/net", "/proc/sys/net"),
             ),
         ),
-        Role(
-            name="syslog",
-            user="rosrv-syslog",
-            part="syslog",
-            entry="appliance.forwarding.process:main",
-            ended_early=600,
-            path=lambda facts: facts.config,
-            links=("control",),
-            after="control",
-            dispensable=True,
-            group="rosrv-api",
+        ours(
+            "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
+            ended_early=600, after="control", dispensable=True, group="rosrv-api",
             walls=lambda facts: Walls(
                 listed=True,
                 families=ROUTES,
@@ -225,9 +172,15 @@ def roles_of(
                 reaches=None if facts.syslog_port is None else (facts.syslog_port,),
             ),
         ),
-    )
-    left_out = {name for name, wanted in (("api", api), ("syslog", syslog)) if not wanted}
-    return tuple(role for role in roles if role.name not in left_out)
+    )  # fmt: skip
+    wanted = {"api": api, "syslog": syslog}
+    return tuple(role for role in roles if wanted.get(role.name, True))
+
+
+def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
+    """The environment of a program of ROS; rosmaster binds loopback only because of ROS_IP."""
+    log = str(facts.part(part) / "log")
+    return {"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": master, "ROS_LOG_DIR": log}
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:
@@ -236,8 +189,3 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
     A life that ended may have left connections behind, which keep its port for a minute.
     """
     return () if ports is None else (f"__tcpros_server_port:={first_free(ports)}",)
-
-
-def _find(program: Path, package: str) -> None:
-    if shutil.which(program) is None:
-        raise StartError(f"{program} is not there: install it with `apt install {package}`")

@@ -10,8 +10,9 @@ import structlog
 
 from appliance.config import Settings
 from appliance.network.firewall.iptables import load_modules
+from appliance.network.protect import local_port_range
 from appliance.supervisor import signals
-from appliance.supervisor.enclosure import Enclosure, Ports, client_ports, enclosure_of
+from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
@@ -100,7 +101,7 @@ def _run(
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
     """Where rosout serves messages: known to the firewall before it starts, and not among those the kernel chooses."""
-    chosen = client_ports()
+    chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
     return spare_ports(

@@ -5,7 +5,6 @@ Order of use: `install` before ROSMaster starts, `update` when a port becomes kn
 `remove` when the appliance stops. Installing replaces whatever an earlier life left, of either back end.
 """
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
@@ -61,12 +60,11 @@ class Firewall:
         Raises: PrivilegeError; FirewallError when no back end works, with the reason of each.
         """
         require_network_admin("the firewall")
-        rules = appliance_rules(settings)
         if self._backend is None:
-            self._backend = self._choose(rules)
+            rules = appliance_rules(settings)
+            self._backend, self._rules = self._choose(rules), rules
         else:
-            self._backend.install(rules)
-        self._rules = rules
+            self.update(settings)
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
@@ -74,9 +72,10 @@ class Firewall:
 
         Raises: FirewallError, also when `install` was not called before.
         """
-        backend = self._installed()
+        if self._backend is None:
+            raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
-        backend.install(rules)
+        self._backend.install(rules)
         self._rules = rules
 
     def remove(self) -> None:
@@ -90,21 +89,11 @@ class Firewall:
 
     def report(self) -> FirewallReport:
         """Say which rules are in force, with their counters."""
-        backend = self._backend
+        backend, not_used = self._backend, tuple(self._not_used)
         if backend is None:
-            return FirewallReport(
-                backend=None, rules=statuses(self._rules, ()), not_used=tuple(self._not_used)
-            )
-        return FirewallReport(
-            backend=backend.name,
-            rules=statuses(self._rules, backend.counters(), backend.families),
-            not_used=tuple(self._not_used),
-        )
-
-    def _installed(self) -> Backend:
-        if self._backend is None:
-            raise FirewallError("the firewall is not installed yet: call install first")
-        return self._backend
+            return FirewallReport(None, statuses(self._rules, ()), not_used)
+        rules = statuses(self._rules, backend.counters(), backend.families)
+        return FirewallReport(backend.name, rules, not_used)
 
     def _all(self) -> tuple[Backend, ...]:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
@@ -148,22 +137,15 @@ def statuses(
     A rule is in force when the kernel has it at least once for each family it is for (or once for both), of those
     that the kernel has at all (`families`).
     """
-    present: Counter[tuple[str, str]] = Counter()
-    packets: Counter[tuple[str, str]] = Counter()
-    octets: Counter[tuple[str, str]] = Counter()
+    of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:
-        key = (counter.chain, counter.purpose)
-        present[key] += 2 if counter.family is None else 1
-        packets[key] += counter.packets
-        octets[key] += counter.octets
-    return tuple(
-        RuleStatus(
-            chain=rule.chain.value,
-            purpose=rule.purpose,
-            rule=rule.describe(),
-            packets=packets[(rule.chain.value, rule.purpose)],
-            octets=octets[(rule.chain.value, rule.purpose)],
-            in_force=present[(rule.chain.value, rule.purpose)] >= len({*rule.families()} & {*families}),
-        )
-        for rule in rules
-    )
+        of_rule.setdefault((counter.chain, counter.purpose), []).append(counter)
+    found = []
+    for rule in rules:
+        chain, purpose = rule.chain.value, rule.purpose
+        seen = of_rule.get((chain, purpose), ())
+        packets, octets = sum(one.packets for one in seen), sum(one.octets for one in seen)
+        present = sum(2 if one.family is None else 1 for one in seen)
+        in_force = present >= len({*rule.families()} & {*families})
+        found.append(RuleStatus(chain, purpose, rule.describe(), packets, octets, in_force))
+    return tuple(found)

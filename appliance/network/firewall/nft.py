@@ -10,8 +10,8 @@ of going without a limit. (iptables drops what finds its table full.)
 """
 
 import json
-import subprocess
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
@@ -29,7 +29,7 @@ from appliance.network.firewall.rules import (
     Verdict,
 )
 from appliance.network.namespaces import Namespace
-from appliance.network.progress import communicate
+from appliance.network.progress import run
 
 TABLE = "rosrv"
 _FAMILY = "inet"
@@ -98,29 +98,21 @@ class NftBackend:
             raise FirewallError(f"nft {' '.join(arguments)}: {reason}") from error
 
     def _nft(self, arguments: list[str], text: str) -> str:
+        nft = partial(self._namespace.popen, ["nft", "-j", *arguments])
         try:
-            process = self._namespace.popen(
-                ["nft", "-j", *arguments],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
+            status, out, err = run(nft, text, "nft")
         except FileNotFoundError:
             raise BackendMissingError(
                 "the firewall back end nft needs the program `nft`: sudo apt install nftables"
             ) from None
+        except TimeoutError as error:
+            raise FirewallError(str(error)) from None
         except OSError as error:
             raise FirewallError(f"nft cannot be run: {error.strerror}") from error
-        with process:
-            try:
-                out, err = communicate(process, text, "nft")
-            except TimeoutError as error:
-                raise FirewallError(str(error)) from None
-        if process.returncode != 0:
+        if status != 0:
             reason = _first_lines(err or out)
             raise FirewallError(f"nft refused the rules in {self._namespace.name}: {reason}")
-        return str(out)
+        return out
 
 
 def render(rules: tuple[Rule, ...]) -> list[Json]:

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from appliance.audit.catalogue import ELSEWHERE, markdown, uses
 from appliance.audit.events import EVENTS
+from distribution.audit_events_page import ELSEWHERE, markdown, uses
 
 PAGE = Path(__file__).parents[3] / "docs" / "audit-events.md"
 
 
 def test_the_page_is_what_the_program_records() -> None:
-    """docs/audit-events.md is current (python -m appliance.audit.catalogue > docs/audit-events.md)."""
+    """docs/audit-events.md is current (python -m distribution.audit_events_page > docs/audit-events.md)."""
     assert PAGE.read_text() == markdown()
 
 

@@ -1,7 +1,7 @@
 """Tests of the registry of events against the program."""
 
-from appliance.audit.catalogue import uses
 from appliance.audit.events import EVENTS
+from distribution.audit_events_page import uses
 
 
 def test_whatever_is_recorded_is_in_the_registry() -> None:

@@ -3,8 +3,8 @@
 import ast
 from pathlib import Path
 
-from appliance.shares.__main__ import page
 from appliance.shares.table import SHARES
+from distribution.shares_page import page
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[3]
@@ -12,7 +12,7 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_the_page_is_the_tables() -> None:
-    """docs/shares.md is what `python -m appliance.shares` writes."""
+    """docs/shares.md is what `python -m distribution.shares_page` writes."""
     assert (ROOT / "docs/shares.md").read_text() == page()
 
 

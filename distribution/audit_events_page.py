@@ -1,7 +1,7 @@
 """The page of audit events, made from the registry and from what the program really records.
 
-`python -m appliance.audit.catalogue` prints docs/audit-events.md; a test holds the page against it. Severities and the
-fields of `detail` are read off the calls that record an event, so they cannot be forgotten; what is recorded under
+`python -m distribution.audit_events_page` prints docs/audit-events.md; a test holds the page against it. Severities and
+the fields of `detail` are read off the calls that record an event, so they cannot be forgotten; what is recorded under
 names that are computed (the log's own records, what monitors did) is in `ELSEWHERE`.
 """
 

@@ -1,0 +1,55 @@
+"""The tables of the reviewer's page, made from the code.
+
+`python -m distribution.audit_record_page` prints the generated part of docs/audit.md; a test holds the page against it.
+"""
+
+import json
+import sys
+from typing import Any
+
+from appliance.audit.schema import FIELDS, json_schema
+
+_HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
+CHAIN: dict[str, Any] = {
+    "type": "object",
+    "description": "in an export: the place in the hash chain, as far as a signed checkpoint",
+    "properties": {
+        "previous": _HASH | {"description": "hash of the record before"},
+        "hash": _HASH | {"description": "hash of this record"},
+        "then": {
+            "type": ["array", "null"],
+            "items": _HASH,
+            "description": "content hashes of the records after it that are left out; null: version 0.1.0 wrote them",
+        },
+        "checkpoint": {
+            "type": ["object", "null"],
+            "description": "the signed checkpoint that seals what is up to here, as `rosrv audit checkpoints` gives it",
+        },
+    },
+    "required": ["previous", "hash", "then"],
+    "additionalProperties": False,
+}
+
+
+def markdown() -> str:
+    """The generated part of the reviewer's page."""
+    lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
+    lines += [f"| `{name}` | {text} |" for name, (_form, text) in FIELDS.items()]
+    lines += [
+        "",
+        "The names of `event`, each with its fields of `detail`: [audit-events.md](audit-events.md).",
+    ]
+    lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
+    lines += [
+        "A line of an export has one field more, `chain`:",
+        "",
+        "```json",
+        json.dumps(CHAIN, indent=2),
+        "```",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())
