@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.record import Record, Severity
@@ -30,11 +30,8 @@ _HOUSE_SECONDS = 10.0
 _ASK_AGAIN_SECONDS = 30.0
 
 
-class MakeRecord(Protocol):
-    """Makes a record of the log's own."""
-
-    def __call__(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> Record:
-        """The record, with an id and the time."""
+MakeRecord = Callable[[str, Severity, str, dict[str, Any]], Record]
+"""Makes a record of the log's own, of event, severity, reason and detail, with an id and the time."""
 
 
 @dataclass(frozen=True)

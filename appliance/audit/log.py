@@ -31,7 +31,7 @@ from appliance.audit.folding import Folder, FoldSettings
 from appliance.audit.holders import holders
 from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
-from appliance.audit.kinds import Key, summary
+from appliance.audit.kinds import summary
 from appliance.audit.lost import Lost
 from appliance.audit.record import Record, Severity
 from appliance.audit.removing import Remover
@@ -377,7 +377,9 @@ class AuditLog:
             batch = self._held[:_LARGEST_BATCH]
             touched = tuple(self._folder.touched)
             report = self._report_of_failure()
-            writer.append(batch + report, [(_fold_key(key), self._folder.state(key)) for key in touched])
+            writer.append(
+                batch + report, [(msgspec.json.encode(key), self._folder.state(key)) for key in touched]
+            )
             self._continued = (writer.log_id, writer.sequence)
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
@@ -411,7 +413,3 @@ class AuditLog:
             reason=reason,
             detail=detail,
         )
-
-
-def _fold_key(key: Key) -> bytes:
-    return msgspec.json.encode(key)

@@ -3,22 +3,19 @@
 import asyncio
 from typing import TypeVar
 
+from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.channel.messages import (
-    AuthorityStated,
-    AuthorityWanted,
-    CertificateMade,
-    CertificateRefused,
-    CertificateWanted,
-    Message,
-    RevocationsMade,
-    RevocationsWanted,
-    RevokedCertificate,
-)
 
 _SECONDS = 5.0
+_Question = messages.AuthorityWanted | messages.CertificateWanted | messages.RevocationsWanted
+_Answer = (
+    messages.AuthorityStated
+    | messages.CertificateMade
+    | messages.CertificateRefused
+    | messages.RevocationsMade
+)
 
-M = TypeVar("M", AuthorityStated, CertificateMade, RevocationsMade)
+M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.RevocationsMade)
 
 
 class AuthorityError(Exception):
@@ -34,7 +31,7 @@ class Authority:
 
     def __init__(self) -> None:
         self._link: Channel | None = None
-        self._waiting: dict[int, asyncio.Future[Message]] = {}
+        self._waiting: dict[int, asyncio.Future[messages.Message]] = {}
         self._number = 0
 
     def attach(self, link: Channel | None) -> None:
@@ -43,49 +40,42 @@ class Authority:
 
     def received(self, message: object) -> bool:
         """Take an answer of the signer; False when it is none of ours."""
-        match message:
-            case AuthorityStated(number) | CertificateMade(number) | CertificateRefused(number):
-                self._answer(number, message)
-            case RevocationsMade(number):
-                self._answer(number, message)
-            case _:
-                return False
+        if not isinstance(message, _Answer):
+            return False
+        future = self._waiting.get(message.number)
+        if future is not None and not future.done():
+            future.set_result(message)
         return True
 
     async def certificate(self) -> bytes:
         """The authority's own certificate, in PEM."""
-        return (await self._ask(AuthorityWanted(self._next()), AuthorityStated)).certificate
+        return (await self._ask(messages.AuthorityWanted(self._next()), messages.AuthorityStated)).certificate
 
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
-    ) -> CertificateMade:
+    ) -> messages.CertificateMade:
         """A certificate in this name for the key of a signing request.
 
         `proof`: the request's signature by the key of the certificate `former` (PEM), without which none is made.
         """
-        wanted = CertificateWanted(self._next(), request, name, days, proof, former)
-        return await self._ask(wanted, CertificateMade)
+        wanted = messages.CertificateWanted(self._next(), request, name, days, proof, former)
+        return await self._ask(wanted, messages.CertificateMade)
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
         """The signed list (PEM) of these: serial number and moment."""
-        rows = [RevokedCertificate(serial, moment) for serial, moment in revoked]
-        return (await self._ask(RevocationsWanted(self._next(), rows), RevocationsMade)).revocations
+        rows = [messages.RevokedCertificate(serial, moment) for serial, moment in revoked]
+        return (
+            await self._ask(messages.RevocationsWanted(self._next(), rows), messages.RevocationsMade)
+        ).revocations
 
     def _next(self) -> int:
         self._number += 1
         return self._number
 
-    def _answer(self, number: int, message: Message) -> None:
-        future = self._waiting.get(number)
-        if future is not None and not future.done():
-            future.set_result(message)
-
-    async def _ask(
-        self, question: "AuthorityWanted | CertificateWanted | RevocationsWanted", kind: type[M]
-    ) -> M:
+    async def _ask(self, question: _Question, kind: type[M]) -> M:
         if self._link is None:
             raise AuthorityError("the signer is away; it is started again within seconds: try again")
-        future: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+        future: asyncio.Future[messages.Message] = asyncio.get_running_loop().create_future()
         self._waiting[question.number] = future
         try:
             self._link.send(question)
@@ -94,7 +84,7 @@ class Authority:
             raise AuthorityError("the signer did not answer: try again") from error
         finally:
             del self._waiting[question.number]
-        if isinstance(answer, CertificateRefused):
+        if isinstance(answer, messages.CertificateRefused):
             raise AuthorityError(answer.reason, refused=True)
         if not isinstance(answer, kind):
             raise AuthorityError("the signer answered something else")

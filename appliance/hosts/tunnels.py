@@ -17,22 +17,8 @@ from collections.abc import Callable
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.channel.messages import (
-    APPLIANCE_NAME,
-    CertificateNeeded,
-    CharonStarted,
-    Esp,
-    Message,
-    TunnelChanged,
-    TunnelHost,
-    TunnelRefused,
-    TunnelSeen,
-    TunnelsEnclosed,
-    TunnelsReported,
-    TunnelsStated,
-    TunnelsWanted,
-)
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.revocation_list import RevocationList
 from appliance.hosts.table import HostRefusedError, HostTable
@@ -57,7 +43,7 @@ class Tunnels:
         authority: Authority,
         *,
         listen: tuple[str, int],
-        say: Callable[[Message], None],
+        say: Callable[[messages.Message], None],
     ) -> None:
         self._table = table
         self._recorder = recorder
@@ -65,11 +51,11 @@ class Tunnels:
         self._listen = listen
         self._say = say
         self.revocations = RevocationList(table, authority)
-        self.seen: dict[str, TunnelSeen] = {}
+        self.seen: dict[str, messages.TunnelSeen] = {}
         self.last: dict[str, float] = {}
-        self.charon: CharonStarted | None = None
+        self.charon: messages.CharonStarted | None = None
         self.each_hour: Callable[[], None] = lambda: None
-        self._enclosed: TunnelsEnclosed | None = None
+        self._enclosed: messages.TunnelsEnclosed | None = None
         self._answered = asyncio.Event()
         self._opening = asyncio.Lock()
         self._link: Channel | None = None
@@ -89,7 +75,7 @@ class Tunnels:
         return self.esp is not None
 
     @property
-    def esp(self) -> Esp | None:
+    def esp(self) -> messages.Esp | None:
         """Where ESP runs; None: no tunnels are open."""
         return None if self._enclosed is None else self._enclosed.esp
 
@@ -98,7 +84,7 @@ class Tunnels:
         """Why no tunnels are open."""
         return self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
 
-    def answered(self, message: TunnelsEnclosed) -> None:
+    def answered(self, message: messages.TunnelsEnclosed) -> None:
         """The supervisor's answer to `open`."""
         self._enclosed = message
         self._answered.set()
@@ -115,7 +101,7 @@ class Tunnels:
                     f" {self._listen[0]} only: set `listen: 0.0.0.0:{self._listen[1]}`"
                 )
             self._answered.clear()
-            self._say(TunnelsWanted(str(self._table.pool), own))
+            self._say(messages.TunnelsWanted(str(self._table.pool), own))
             try:
                 await asyncio.wait_for(self._answered.wait(), _OPEN_SECONDS)
             except TimeoutError:
@@ -179,12 +165,12 @@ class Tunnels:
         revocations = await self.revocations.signed()
         now = time.time()
         hosts = [
-            TunnelHost(row.name, row.address, row.serial)
+            messages.TunnelHost(row.name, row.address, row.serial)
             for row in self._table.admitted()
             if row.expires > now
         ]
         self._number += 1
-        message = TunnelsStated(
+        message = messages.TunnelsStated(
             self._number, esp, self._table.own_address, authority, certificate, revocations, hosts
         )
         try:
@@ -194,13 +180,13 @@ class Tunnels:
 
     def _received(self, message: object) -> None:
         match message:
-            case CertificateNeeded(request):
+            case messages.CertificateNeeded(request):
                 self._spawn(request)
-            case CharonStarted():
+            case messages.CharonStarted():
                 self.charon = message
-            case TunnelChanged(name, up, remote):
+            case messages.TunnelChanged(name, up, remote):
                 self._changed(name, up, remote)
-            case TunnelRefused(remote, reason, packets) if packets:
+            case messages.TunnelRefused(remote, reason, packets) if packets:
                 self._recorder.happened(
                     "packets refused",
                     reason,
@@ -209,11 +195,11 @@ class Tunnels:
                     host=remote,
                     packets=packets,
                 )
-            case TunnelRefused(remote, reason):
+            case messages.TunnelRefused(remote, reason):
                 self._recorder.happened(
                     "tunnel refused", reason, severity=Severity.WARNING, decision="deny", host=remote
                 )
-            case TunnelsReported(taken, rows):
+            case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
                 self._taken_number = taken
                 self._wake.set()
@@ -227,7 +213,7 @@ class Tunnels:
         link = self._link
         while link is self._link:
             try:
-                made = await self._authority.issue(request, APPLIANCE_NAME, _APPLIANCE_DAYS)
+                made = await self._authority.issue(request, messages.APPLIANCE_NAME, _APPLIANCE_DAYS)
             except AuthorityError as error:
                 _log.warning("charon waits for its certificate", reason=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
@@ -252,7 +238,7 @@ class Tunnels:
         if not up:
             self._went_down(name, "closed")
         elif name not in self.seen:
-            self.seen[name] = TunnelSeen(name, remote, 0, 0, 0)
+            self.seen[name] = messages.TunnelSeen(name, remote, 0, 0, 0)
             self.last[name] = time.time()
             self._recorder.happened(
                 "tunnel up",
@@ -263,7 +249,7 @@ class Tunnels:
                 remote=remote,
             )
 
-    def _reported(self, rows: list[TunnelSeen]) -> None:
+    def _reported(self, rows: list[messages.TunnelSeen]) -> None:
         now = time.time()
         standing = {row.name: row for row in rows if row.name in self._table.rows}
         for name in set(self.seen) - set(standing):
@@ -275,7 +261,7 @@ class Tunnels:
                 self.last[name] = now
             self.seen[name] = row
 
-    def _look_where(self, row: TunnelSeen) -> None:
+    def _look_where(self, row: messages.TunnelSeen) -> None:
         """A host that moves keeps its tunnel; a copy of its kit elsewhere would look like this, too."""
         before = self.seen[row.name].remote
         if row.remote != before:

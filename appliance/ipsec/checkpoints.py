@@ -20,6 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from appliance.ipsec.files import write_whole
+
 MOST_LOGS = 64
 _HASH = 32
 _NUMBER = 8
@@ -74,8 +76,8 @@ class SignedCheckpoints:
             self._room_for_another()
             self._may_be_removed(wanted)
             number, now = wanted.number.to_bytes(_NUMBER, "big"), self._clock().to_bytes(_NUMBER, "big")
-            _write_whole(self._path(wanted.log, "times"), number + now)
-            _write_whole(path, number + wanted.digest)
+            write_whole(self._path(wanted.log, "times"), number + now, 0o600)
+            write_whole(path, number + wanted.digest, 0o600)
             return
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
@@ -110,7 +112,7 @@ class SignedCheckpoints:
 
     def remember_removed(self, log: str, sequence: int) -> None:
         """The removal of the records up to this one was approved."""
-        _write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"))
+        write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
     def _may_be_removed(self, wanted: CheckpointText) -> None:
         approved = self.removed(wanted.log)
@@ -133,7 +135,7 @@ class SignedCheckpoints:
     def _note_time(self, wanted: CheckpointText, first: int) -> None:
         path = self._path(wanted.log, "times")
         if not path.exists():
-            _write_whole(path, wanted.number.to_bytes(_NUMBER, "big"))
+            write_whole(path, wanted.number.to_bytes(_NUMBER, "big"), 0o600)
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             begun = int.from_bytes(os.pread(descriptor, _NUMBER, 0), "big")
@@ -178,12 +180,3 @@ def _is_known(descriptor: int, wanted: CheckpointText, first: int, count: int) -
             f"checkpoint {wanted.number} does not carry the hash of the one signed before it"
         )
     return False
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    making = path.with_name(path.name + ".new")
-    with making.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    making.rename(path)

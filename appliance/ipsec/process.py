@@ -27,23 +27,9 @@ from typing import Any, TypeVar
 
 import structlog
 
+from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
-from appliance.channel.messages import (
-    APPLIANCE_NAME,
-    CertificateNeeded,
-    CharonStarted,
-    Failed,
-    Lifeline,
-    Message,
-    Ready,
-    TunnelChanged,
-    TunnelLink,
-    TunnelRefused,
-    TunnelSeen,
-    TunnelsReported,
-    TunnelsStated,
-)
 from appliance.ipsec.charon import PROGRAM, CharonError, Material, Vici
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 from appliance.ipsec.leftovers import clear_leftovers
@@ -67,11 +53,11 @@ class TunnelProcess:
     """Serves one lifeline and the link to control until it is told to stop or charon has died."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
-        self._child = Child(lifeline, TunnelLink, said=self._control_said, linked=self._linked)
+        self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._linked)
         self._directory = directory
         self._key = key
         self._ended = self._child.ended
-        self._wanted: TunnelsStated | None = None
+        self._wanted: messages.TunnelsStated | None = None
         self._changed = asyncio.Event()
         self._taken = 0
         self._charon: asyncio.subprocess.Process | None = None
@@ -87,7 +73,7 @@ class TunnelProcess:
     async def run(self) -> None:
         """Serve until the end; `failed` says that it was no orderly one."""
         self._loop = asyncio.get_running_loop()
-        self._child.attach(Ready())
+        self._child.attach(messages.Ready())
         self._spawn(self._provision())
         self._spawn(self._report())
         self._spawn(self._renew())
@@ -106,14 +92,14 @@ class TunnelProcess:
             self._say_what_it_is(self._vici)
 
     def _control_said(self, message: Any) -> None:
-        if isinstance(message, TunnelsStated):
+        if isinstance(message, messages.TunnelsStated):
             self._wanted = message
             self._changed.set()
 
     def _ask(self) -> None:
-        self._tell(CertificateNeeded(signing_request(self._key, APPLIANCE_NAME)))
+        self._tell(messages.CertificateNeeded(signing_request(self._key, messages.APPLIANCE_NAME)))
 
-    def _tell(self, message: Message) -> None:
+    def _tell(self, message: messages.Message) -> None:
         self._child.tell(message)
 
     # --- charon ---
@@ -133,7 +119,7 @@ class TunnelProcess:
             self._taken = wanted.number
             await self._say_how_it_stands(vici)
 
-    async def _start(self, wanted: TunnelsStated) -> Vici:
+    async def _start(self, wanted: messages.TunnelsStated) -> Vici:
         if wanted.esp == "kernel":
             await asyncio.to_thread(clear_leftovers, wanted.address)
         conf, sock = self._directory / "strongswan.conf", self._directory / "vici.sock"
@@ -161,7 +147,7 @@ class TunnelProcess:
             return await asyncio.to_thread(call)
 
     def _say_what_it_is(self, vici: Vici) -> None:
-        self._tell(CharonStarted(self._version, vici.proposals.key_exchange))
+        self._tell(messages.CharonStarted(self._version, vici.proposals.key_exchange))
 
     async def _connect(self, path: Path) -> Vici:
         deadline = time.monotonic() + _START_SECONDS
@@ -175,7 +161,7 @@ class TunnelProcess:
 
     def _listen(self, vici: Vici) -> None:
         for host, up, remote in vici.listen():
-            self._loop.call_soon_threadsafe(self._tell, TunnelChanged(host, up, remote))
+            self._loop.call_soon_threadsafe(self._tell, messages.TunnelChanged(host, up, remote))
 
     async def _read_log(self, charon: asyncio.subprocess.Process) -> None:
         assert charon.stderr is not None  # noqa: S101  a pipe was asked for
@@ -186,7 +172,7 @@ class TunnelProcess:
             if refusal is not None and refusal.packet:
                 self._count_packet(refusal)
             elif refusal is not None and self._may_tell():
-                self._tell(TunnelRefused(refusal.remote, refusal.reason))
+                self._tell(messages.TunnelRefused(refusal.remote, refusal.reason))
         status = await charon.wait()
         raise CharonError(f"charon ended (status {status}), last it said: {last}")
 
@@ -196,7 +182,7 @@ class TunnelProcess:
 
     def _tell_packets(self) -> None:
         for refusal, count in self._packets.items():
-            self._tell(TunnelRefused(refusal.remote, refusal.reason, count))
+            self._tell(messages.TunnelRefused(refusal.remote, refusal.reason, count))
         self._packets.clear()
 
     def _may_tell(self) -> bool:
@@ -214,9 +200,12 @@ class TunnelProcess:
     async def _say_how_it_stands(self, vici: Vici) -> None:
         rows = await self._in_turn(vici.seen)
         self._tell(
-            TunnelsReported(
+            messages.TunnelsReported(
                 self._taken,
-                [TunnelSeen(one.name, one.remote, one.seconds, one.bytes_in, one.bytes_out) for one in rows],
+                [
+                    messages.TunnelSeen(one.name, one.remote, one.seconds, one.bytes_in, one.bytes_out)
+                    for one in rows
+                ],
             )
         )
 
@@ -244,11 +233,11 @@ class TunnelProcess:
 
 def main(lifeline_fd: int, directory: Path) -> None:
     """Be this process: `lifeline_fd` is the lifeline's descriptor, `directory` its own."""
-    lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
+    lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         key = _own_key(directory / KEY_FILE)
     except (SignerKeyError, OSError) as error:
-        lifeline.send(Failed(f"the tunnels cannot use the appliance's key: {error}"))
+        lifeline.send(messages.Failed(f"the tunnels cannot use the appliance's key: {error}"))
         sys.exit(1)
     process = TunnelProcess(lifeline, directory, key)
     asyncio.run(process.run())

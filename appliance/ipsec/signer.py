@@ -27,28 +27,9 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
-from appliance.channel.messages import (
-    AuthorityStated,
-    AuthorityWanted,
-    CertificateMade,
-    CertificateRefused,
-    CertificateWanted,
-    Failed,
-    Lifeline,
-    Message,
-    Ready,
-    RemovalApproved,
-    RemovalRefused,
-    RemovalWanted,
-    RevocationsMade,
-    RevocationsWanted,
-    SignatureMade,
-    SignatureRefused,
-    SignatureWanted,
-    SignerLink,
-)
 from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
@@ -96,7 +77,7 @@ class Signer:
     def __init__(
         self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority, kept: Kept
     ) -> None:
-        self._child = Child(lifeline, SignerLink, said=self._control_said)
+        self._child = Child(lifeline, messages.SignerLink, said=self._control_said)
         self._authority = authority
         self._signed = SignedCheckpoints(directory)
         self._removals = Removals(self._signed, kept)
@@ -105,7 +86,7 @@ class Signer:
 
     async def run(self) -> None:
         """Serve until `Stop` arrives or the supervisor is gone."""
-        self._child.attach(Ready(detail={"public_key": self._public_key.hex()}))
+        self._child.attach(messages.Ready(detail={"public_key": self._public_key.hex()}))
         await self._child.ended.wait()
         self._child.close()
 
@@ -114,48 +95,48 @@ class Signer:
         if answer is not None:
             self._child.tell(answer)
 
-    def _answer(self, message: Any) -> Message | None:
+    def _answer(self, message: Any) -> messages.Message | None:
         match message:
-            case SignatureWanted(number, text):
+            case messages.SignatureWanted(number, text):
                 return self._sign(number, text)
-            case RemovalWanted(number, checkpoint, newest):
+            case messages.RemovalWanted(number, checkpoint, newest):
                 return self._approve_removal(number, checkpoint, newest)
-            case AuthorityWanted(number):
-                return AuthorityStated(number, self._authority.certificate)
-            case CertificateWanted():
+            case messages.AuthorityWanted(number):
+                return messages.AuthorityStated(number, self._authority.certificate)
+            case messages.CertificateWanted():
                 return self._issue(message)
-            case RevocationsWanted(number, revoked):
+            case messages.RevocationsWanted(number, revoked):
                 rows = [(one.serial, one.moment) for one in revoked]
-                return RevocationsMade(number, self._authority.revocations(rows))
+                return messages.RevocationsMade(number, self._authority.revocations(rows))
             case _:
                 return None
 
-    def _sign(self, number: int, text: bytes) -> Message:
+    def _sign(self, number: int, text: bytes) -> messages.Message:
         try:
             self._signed.approve(text)
         except (CheckpointRefusedError, OSError) as error:
-            return SignatureRefused(number, str(error))
-        return SignatureMade(number, self._key.sign(text), self._public_key)
+            return messages.SignatureRefused(number, str(error))
+        return messages.SignatureMade(number, self._key.sign(text), self._public_key)
 
-    def _approve_removal(self, number: int, checkpoint: bytes, newest: bytes) -> Message:
+    def _approve_removal(self, number: int, checkpoint: bytes, newest: bytes) -> messages.Message:
         try:
             text = self._removals.approve(checkpoint, newest)
         except (RemovalRefusedError, CheckpointRefusedError, OSError) as error:
-            return RemovalRefused(number, str(error))
-        return RemovalApproved(number, text, self._key.sign(text), self._public_key)
+            return messages.RemovalRefused(number, str(error))
+        return messages.RemovalApproved(number, text, self._key.sign(text), self._public_key)
 
-    def _issue(self, wanted: CertificateWanted) -> Message:
+    def _issue(self, wanted: messages.CertificateWanted) -> messages.Message:
         try:
             issued = self._authority.issue(
                 wanted.request, wanted.name, wanted.days, proof=wanted.proof, former=wanted.former
             )
         except RequestRefusedError as error:
-            return CertificateRefused(wanted.number, str(error))
+            return messages.CertificateRefused(wanted.number, str(error))
         except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever they do to the parser, it is answered
-            return CertificateRefused(
+            return messages.CertificateRefused(
                 wanted.number, f"the signing request cannot be used: {type(error).__name__}: {error}"
             )
-        return CertificateMade(wanted.number, issued.certificate, issued.serial, issued.expires)
+        return messages.CertificateMade(wanted.number, issued.certificate, issued.serial, issued.expires)
 
 
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
@@ -174,12 +155,12 @@ def serve(
     kept: Kept = Kept(),  # noqa: B008  frozen
 ) -> None:
     """The same, with the directory of the keys, the kind of the authority's, and how long records are kept."""
-    lifeline = Channel(socket.socket(fileno=lifeline_fd), Lifeline)
+    lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         os.umask(0o077)
         secret = read_passphrase(passphrase) if passphrase is not None else None
         key, authority = load_or_create_key(directory), Authority(directory, kind, secret)
     except (SignerKeyError, OSError) as error:
-        lifeline.send(Failed(f"the signer cannot use its key: {error}"))
+        lifeline.send(messages.Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)
     asyncio.run(Signer(lifeline, directory, key, authority, kept).run())

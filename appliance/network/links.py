@@ -106,13 +106,9 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 
     def delete(route: Any) -> None:
         for index in route.link_lookup(ifname=name):
-            held = [
-                f"{one.get_attr('IFA_ADDRESS')}/{one['prefixlen']}" for one in route.get_addr(index=index)
-            ]
-            if str(interface) in held:
-                route.addr(
-                    "del", index=index, address=str(interface.ip), prefixlen=interface.network.prefixlen
-                )
+            if str(interface) in _held(route, index=index):
+                length = interface.network.prefixlen
+                route.addr("del", index=index, address=str(interface.ip), prefixlen=length)
 
     _netlink(namespace, f"taking {address} from {name}", delete)
 
@@ -120,9 +116,8 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
     """Route `destination` (a network, or "default") through the address `via`."""
     family = _family(via)
-    where = (
-        ("::/0" if family == socket.AF_INET6 else "0.0.0.0/0") if destination == "default" else destination
-    )
+    everywhere = "::/0" if family == socket.AF_INET6 else "0.0.0.0/0"
+    where = everywhere if destination == "default" else destination
     _netlink(
         namespace,
         f"routing {destination} via {via}",
@@ -150,28 +145,19 @@ def add_near_route(namespace: Namespace, name: str, destination: str, *, source:
 
 def links(namespace: Namespace) -> list[str]:
     """Return the names of the interfaces."""
-    found = _netlink(
-        namespace,
-        "listing interfaces",
-        lambda route: [link.get_attr("IFLA_IFNAME") for link in route.get_links()],
-    )
-    return [str(name) for name in found]
+    return _netlink(namespace, "listing interfaces", lambda route: list(_names(route).values()))
 
 
 def addresses(namespace: Namespace) -> list[str]:
     """Return every address of every interface, with its prefix length; link-local ones included."""
-
-    def read(route: Any) -> list[str]:
-        return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr()]
-
-    return _netlink(namespace, "listing addresses", read)
+    return _netlink(namespace, "listing addresses", _held)
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
     """Return the addresses of each interface, with their prefix lengths."""
 
     def read(route: Any) -> dict[str, list[str]]:
-        names = {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
+        names = _names(route)
         held: dict[str, list[str]] = {name: [] for name in names.values()}
         for entry in route.get_addr():
             # Of a point-to-point link IFA_ADDRESS is the other end's; IPv6 has IFA_LOCAL there only.
@@ -196,7 +182,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
     def read(route: Any) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
-        names = {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
+        names = _names(route)
         found = [
             entry
             for entry in route.get_routes(family=family, table=_MAIN_TABLE)
@@ -222,8 +208,7 @@ def networks(namespace: Namespace) -> list[str]:
             for entry in route.get_routes()
             if entry["dst_len"]
         ]
-        held = [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr()]
-        return [str(ipaddress.ip_interface(text).network) for text in routes + held]
+        return [str(ipaddress.ip_interface(text).network) for text in routes + _held(route)]
 
     return sorted(set(_netlink(namespace, "listing routes", read)))
 
@@ -257,6 +242,16 @@ def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
     except NetlinkError as error:
         hint = ": needs root (CAP_NET_ADMIN); run it with sudo" if error.code in (1, 13) else ""
         raise NetworkError(f"{what} in {namespace.name}: {os.strerror(error.code)}{hint}") from error
+
+
+def _names(route: Any) -> dict[int, str]:
+    """The names of the interfaces by index."""
+    return {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
+
+
+def _held(route: Any, **of: int) -> list[str]:
+    """The addresses (`of` an interface), with their prefix lengths."""
+    return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr(**of)]
 
 
 def _index(route: Any, name: str) -> int:

@@ -16,27 +16,7 @@ import socket
 from collections import deque
 from collections.abc import Iterator, Mapping
 
-from appliance.channel.messages import (
-    ClientRevoked,
-    GrantInstalled,
-    GrantRevoked,
-    Message,
-    MonitorResumed,
-    MonitorSwitched,
-    NodePlaced,
-    NodeWithdrawn,
-    OwnHeaderStated,
-    OwnPublished,
-    PublicationPlaced,
-    PublicationWithdrawn,
-    ServiceWithdrawn,
-    SpecificationsStated,
-    StateBegan,
-    StateEnded,
-    TopicTraffic,
-    UpstreamFound,
-    UpstreamRefused,
-)
+from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.anteroom import Anteroom
 from appliance.relay.connections.client import ServiceClient, ServiceTraffic
@@ -94,9 +74,9 @@ class Engine:
         self._waiting: dict[str, set[Visitor]] = {}
         self._farewells: set[Farewell] = set()
         self._link: Link | None = None
-        self._last_rows: list[TopicTraffic] = []
+        self._last_rows: list[messages.TopicTraffic] = []
         self._flows = Flows(loop.clock)
-        self._later: deque[tuple[Message, tuple[int, ...]]] = deque()
+        self._later: deque[tuple[messages.Message, tuple[int, ...]]] = deque()
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: Link | None) -> None:
@@ -104,33 +84,33 @@ class Engine:
         self._link = link
         self._reporter.attach(link)
 
-    def take(self, message: Message, descriptors: tuple[int, ...]) -> None:
+    def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         """Carry out one message of control."""
         if self._middle.preparing or self._later:
             self._later.append((message, descriptors))
         else:
             self._carry_out(message, descriptors)
 
-    def _carry_out(self, message: Message, descriptors: tuple[int, ...]) -> None:
-        if isinstance(message, StateBegan):
+    def _carry_out(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, messages.StateBegan):
             self._table.begin(message.epoch)
-        elif isinstance(message, StateEnded):
+        elif isinstance(message, messages.StateEnded):
             self._restated(message.epoch)
         elif isinstance(message, Statement):
             self._state(message, descriptors)
-        elif isinstance(message, UpstreamFound):
+        elif isinstance(message, messages.UpstreamFound):
             self._upstream_found(message)
-        elif isinstance(message, UpstreamRefused):
+        elif isinstance(message, messages.UpstreamRefused):
             self._upstream_refused(message)
-        elif isinstance(message, SpecificationsStated):
+        elif isinstance(message, messages.SpecificationsStated):
             self._middle.state(message)
-        elif isinstance(message, MonitorSwitched):
+        elif isinstance(message, messages.MonitorSwitched):
             self._middle.switch(message.name, message.enabled)
-        elif isinstance(message, MonitorResumed):
+        elif isinstance(message, messages.MonitorResumed):
             self._ask_for_latched(self._middle.resume(message.name))
-        elif isinstance(message, OwnHeaderStated):
+        elif isinstance(message, messages.OwnHeaderStated):
             self._state_header(message)
-        elif isinstance(message, OwnPublished):
+        elif isinstance(message, messages.OwnPublished):
             self._publish(message.topic, message.data)
         else:
             self._table.withdraw(message)
@@ -158,12 +138,12 @@ class Engine:
 
     def _state(self, message: Statement, descriptors: tuple[int, ...]) -> None:
         self._table.state(message)
-        if isinstance(message, NodePlaced):
+        if isinstance(message, messages.NodePlaced):
             self._ports.open(message.key, descriptors[0])
-        elif isinstance(message, PublicationPlaced):
+        elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
-        elif isinstance(message, GrantInstalled):
+        elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self._waiting and message.key in self._waiting:
             self._judge_waiting(message.key)
@@ -177,8 +157,8 @@ class Engine:
             topic.repeat()
         self._middle.observations.repeat()
 
-    def _withdrawn(self, message: Message) -> None:
-        if isinstance(message, NodeWithdrawn):
+    def _withdrawn(self, message: messages.Message) -> None:
+        if isinstance(message, messages.NodeWithdrawn):
             self._ports.close(message.key)
             for key, topic in [one for one in self._topics if one[0] == message.key]:
                 self._remove_topic(key, topic, "the publisher's node is gone")
@@ -186,15 +166,15 @@ class Engine:
                 self._visitor_failed(visitor, "")
             self._cut_clients("the service's node is gone", message.key)
             self._forget_services(message.key)
-        elif isinstance(message, PublicationWithdrawn):
+        elif isinstance(message, messages.PublicationWithdrawn):
             self._remove_topic(message.key, message.topic, "the topic is published no longer")
-        elif isinstance(message, GrantRevoked):
+        elif isinstance(message, messages.GrantRevoked):
             for subscriber in self._connected_by(message):
                 subscriber.cut("its grant is revoked")
-        elif isinstance(message, ServiceWithdrawn):
+        elif isinstance(message, messages.ServiceWithdrawn):
             self._cut_clients("the service is offered no longer", message.key, message.service)
             self._forget_services(message.key, message.service)
-        elif isinstance(message, ClientRevoked):
+        elif isinstance(message, messages.ClientRevoked):
             client = message.host, message.caller_id
             self._cut_clients("its grant is revoked", message.key, message.service, client)
 
@@ -246,18 +226,18 @@ class Engine:
             self._let_monitor(relayed)
         self._topics[key, topic] = (relayed, publisher)
 
-    def _limit_topic(self, message: PublicationPlaced) -> None:
+    def _limit_topic(self, message: messages.PublicationPlaced) -> None:
         relayed, _publisher = self._topics[message.key, message.topic]
         together = self._flows.of(message.together, message.topic)
         relayed.flow.set(message.limit, together, self._loop.clock())
 
-    def _limit_subscriber(self, message: GrantInstalled) -> None:
+    def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
         """Those that are connected by this grant are limited so from now on."""
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
         for subscriber in self._connected_by(message):
             subscriber.flow = flow
 
-    def _connected_by(self, grant: GrantInstalled | GrantRevoked) -> list[Subscriber]:
+    def _connected_by(self, grant: messages.GrantInstalled | messages.GrantRevoked) -> list[Subscriber]:
         placed = self._topics.get((grant.key, grant.topic))
         members = () if placed is None else placed[0].members
         who = grant.host, grant.caller_id
@@ -302,7 +282,7 @@ class Engine:
             if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
                 publisher.give_again()
 
-    def _state_header(self, message: OwnHeaderStated) -> None:
+    def _state_header(self, message: messages.OwnHeaderStated) -> None:
         self._own_headers[message.topic] = {
             "type": message.type,
             "md5sum": message.md5sum,
@@ -332,12 +312,12 @@ class Engine:
         if row is not None:
             self._last_rows.append(row)
 
-    def _upstream_found(self, message: UpstreamFound) -> None:
+    def _upstream_found(self, message: messages.UpstreamFound) -> None:
         placed = self._topics.get((message.key, message.topic))
         if placed is not None:
             placed[1].found(message.host, message.port)
 
-    def _upstream_refused(self, message: UpstreamRefused) -> None:
+    def _upstream_refused(self, message: messages.UpstreamRefused) -> None:
         placed = self._topics.get((message.key, message.topic))
         if placed is not None:
             placed[1].refused()
@@ -496,7 +476,7 @@ class Engine:
             self._farewells.add(farewell)
             self._anteroom.enter(farewell, visitor.host)
 
-    def _rows(self) -> list[TopicTraffic]:
+    def _rows(self) -> list[messages.TopicTraffic]:
         """What went through since the last call."""
         rows = [row for topic, _publisher in self._topics.values() if (row := topic.traffic()) is not None]
         rows += [

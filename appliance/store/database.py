@@ -94,7 +94,11 @@ class Database:
             if not done.done():
                 done.set_result(None)
 
-        self._queue.put(lambda: _call_back(loop, tell))
+        def call_back() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
+                loop.call_soon_threadsafe(tell)
+
+        self._queue.put(call_back)
         self._hurry.set()
         await done
 
@@ -155,8 +159,3 @@ def _advice(error: sqlite3.Error) -> str:
     if type(error) is sqlite3.DatabaseError:
         return "move the file away to start with an empty state"
     return "make room there and let it be written, or name another directory with --state DIR"
-
-
-def _call_back(loop: asyncio.AbstractEventLoop, tell: Callable[[], None]) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
-        loop.call_soon_threadsafe(tell)

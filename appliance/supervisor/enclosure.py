@@ -23,6 +23,7 @@ import structlog
 
 from appliance.channel.own_node import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
+from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
@@ -36,7 +37,6 @@ from appliance.network.shared import bridges, is_contained, lives_on_the_machine
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
-TUNNEL_INTERFACE = "ipsec0"  # charon's, when ESP runs in user space
 _PATIENCE_SECONDS = 5.0  # of an end with a call that hangs
 
 log = structlog.get_logger()
@@ -218,7 +218,7 @@ class Contained(Enclosure):
 
     def endpoint(self) -> Endpoint:
         """The only address here, if there is but one: of several, the right one is known outside only."""
-        found = only_address(self._namespace, without=("lo", TUNNEL_INTERFACE))
+        found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: from outside its machine it may be another"
             return replace(found, reason=reason)
@@ -283,7 +283,9 @@ class Contained(Enclosure):
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarder=self._forwarder(),
-            tunnel_interface=TUNNEL_INTERFACE if self._tunnels and self._tunnels[1] == "user space" else None,
+            tunnel_interface=USER_SPACE_INTERFACE
+            if self._tunnels and self._tunnels[1] == "user space"
+            else None,
         )
 
     def _api_networks(self) -> tuple[str, ...]:

@@ -16,14 +16,7 @@ from typing import TypeVar
 
 import structlog
 
-from appliance.channel.messages import (
-    EndpointFound,
-    FirewallReported,
-    Message,
-    ProbeFailed,
-    ProbePassed,
-    TunnelsEnclosed,
-)
+from appliance.channel import messages
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure
@@ -40,17 +33,17 @@ class Guard:
     """The enclosure as the supervisor sees it; `tell` gives a message to control."""
 
     def __init__(
-        self, enclosure: Enclosure, tell: Callable[[Message], None], *, every: float = PROBE_SECONDS
+        self, enclosure: Enclosure, tell: Callable[[messages.Message], None], *, every: float = PROBE_SECONDS
     ) -> None:
         self.enclosure = enclosure
         self._tell = tell
         self._every = every
         self._one_at_a_time = asyncio.Lock()
         self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # routes are only looked up
-        self._probe: Message | None = None
-        self._report = FirewallReported(isolation=enclosure.kind, report={})
+        self._probe: messages.Message | None = None
+        self._report = messages.FirewallReported(isolation=enclosure.kind, report={})
 
-    def news(self) -> list[Message]:
+    def news(self) -> list[messages.Message]:
         """What a new control has to know."""
         return [self._report] if self._probe is None else [self._report, self._probe]
 
@@ -65,9 +58,9 @@ class Guard:
         """Keep what was found, and tell control."""
         if reason is not None:
             log.critical("the appliance must not serve", reason=reason)
-            self._probe = ProbeFailed(reason)
+            self._probe = messages.ProbeFailed(reason)
         elif self.enclosure.probes:
-            self._probe = ProbePassed()
+            self._probe = messages.ProbePassed()
         for message in self.news():
             self._tell(message)
 
@@ -82,18 +75,18 @@ class Guard:
             return reason
         return await self.look()
 
-    async def open_tunnels(self, pool: str, address: str) -> TunnelsEnclosed:
+    async def open_tunnels(self, pool: str, address: str) -> messages.TunnelsEnclosed:
         """Close a pool of addresses to clear text; where ESP runs, or why there can be no tunnels."""
         try:
             async with self._one_at_a_time:
                 esp = await in_thread(lambda: self.enclosure.open_tunnels(pool, address))
                 report = await in_thread(self.enclosure.report)
         except Exception as error:  # noqa: BLE001  see the invariant
-            return TunnelsEnclosed(None, _words(error))
-        self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
+            return messages.TunnelsEnclosed(None, _words(error))
+        self._report = messages.FirewallReported(isolation=self.enclosure.kind, report=report)
         self._tell(self._report)
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
-        return TunnelsEnclosed(esp)
+        return messages.TunnelsEnclosed(esp)
 
     async def route_to(self, host: str) -> str | None:
         """The machine's address by which `host` reaches the appliance; None when its own route is right."""
@@ -104,13 +97,13 @@ class Guard:
             log.warning("no route to a host", host=host, error=_words(error))
             return None
 
-    async def endpoint(self) -> EndpointFound:
+    async def endpoint(self) -> messages.EndpointFound:
         """Where hosts of other networks reach the appliance, or why that cannot be told."""
         try:
             found = await in_thread(self.enclosure.endpoint)
         except Exception as error:  # noqa: BLE001  see the invariant
-            return EndpointFound(None, _words(error))
-        return EndpointFound(found.address, found.reason)
+            return messages.EndpointFound(None, _words(error))
+        return messages.EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
         """Look every minute."""
@@ -121,7 +114,7 @@ class Guard:
     async def _find_fault(self) -> str | None:
         try:
             report = await in_thread(self.enclosure.report)
-            self._report = FirewallReported(isolation=self.enclosure.kind, report=report)
+            self._report = messages.FirewallReported(isolation=self.enclosure.kind, report=report)
             return await in_thread(self.enclosure.probe)
         except Exception as error:  # noqa: BLE001  see the invariant
             return f"the state of the firewall cannot be told: {_words(error)}"

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,10 +71,11 @@ class Life:
         self._reports = reports
         self._loop = asyncio.get_running_loop()
         self._process = subprocess.Popen(
+            # -s: its home is a part of the state, no place to take code from
             [
                 sys.executable,
                 "-P",
-                "-s",  # its home is a part of the state: no place to take code from
+                "-s",
                 "-m",
                 "appliance.supervisor.child",
                 role,
@@ -90,7 +92,9 @@ class Life:
         self._pidfd = os.pidfd_open(self.pid)
         self._loop.add_reader(self._pidfd, self._dead)
         self._channel: Channel | None = Channel(lifeline, Lifeline, longest=1 << 20)
-        self._channel.attach(self._loop, self._received, self._lifeline_closed, self._refused)
+        self._channel.attach(
+            self._loop, partial(reports.received, self), self._lifeline_closed, self._refused
+        )
 
     @property
     def alive(self) -> bool:
@@ -152,9 +156,6 @@ class Life:
             return
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._pidfd, number)
-
-    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        self._reports.received(self, message, descriptors)
 
     def _refused(self, reason: str) -> None:
         self._channel = None

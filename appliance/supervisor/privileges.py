@@ -17,6 +17,7 @@ import os
 import resource
 import signal
 from collections.abc import Sequence
+from typing import Any
 
 from appliance.supervisor.users import Account
 
@@ -69,9 +70,7 @@ def be_ended_early(score: int) -> None:
 
 def leave_network() -> None:
     """Move this process into an empty network namespace of its own. Raises `OSError` when refused."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.unshare(_CLONE_NEWNET) != 0:
-        raise _last_error("unshare(CLONE_NEWNET)")
+    _call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
 # What the supervisor itself does with each; all others are given up before it starts anything.
@@ -98,15 +97,12 @@ def keep_supervisors() -> None:
         return
     kept = sum(1 << number for number in SUPERVISORS.values())
     _empty_bounding_set(but=kept)
-    libc = ctypes.CDLL(None, use_errno=True)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then the same of the upper 32 numbers
-    if libc.capget(header, sets) != 0:
-        raise _last_error("capget")
+    _call("capget", header, sets)
     for index, word in ((0, kept), (1, kept), (2, 0), (3, kept >> 32), (4, kept >> 32), (5, 0)):
         sets[index] &= word & 0xFFFFFFFF
-    if libc.capset(header, sets) != 0:
-        raise _last_error("capset")
+    _call("capset", header, sets)
 
 
 def drop(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
@@ -145,11 +141,9 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 def _reduce_capabilities(kept: int) -> None:
     """Have exactly the capabilities of this bit set, and let them pass to programs that are executed."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
-    libc = ctypes.CDLL(None, use_errno=True)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
-    if libc.capset(header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high)) != 0:
-        raise _last_error("capset")
+    _call("capset", header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high))
     for capability in SUPERVISORS.values():
         if kept >> capability & 1:
             prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_RAISE, capability)
@@ -157,12 +151,12 @@ def _reduce_capabilities(kept: int) -> None:
 
 def prctl(option: int, first: int, second: int = 0) -> None:
     """`prctl(2)`. Raises `OSError`."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    zero = ctypes.c_ulong(0)
-    if libc.prctl(ctypes.c_int(option), ctypes.c_ulong(first), ctypes.c_ulong(second), zero, zero) != 0:
-        raise _last_error(f"prctl({option})")
+    _call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
-def _last_error(call: str) -> OSError:
-    number = ctypes.get_errno()
-    return OSError(number, f"{call}: {os.strerror(number)}")
+def _call(what: str, *arguments: Any) -> None:
+    """A call of the C library, `what` as the error says it: `name(option)`. Raises `OSError`."""
+    function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
+    if function(*arguments) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, f"{what}: {os.strerror(number)}")

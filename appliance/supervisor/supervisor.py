@@ -26,28 +26,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from appliance.channel.messages import (
-    Announced,
-    ApplianceStopRequested,
-    EndpointWanted,
-    Failed,
-    LogHeld,
-    Message,
-    PolicyReloadRequested,
-    Pong,
-    ProcessesChanged,
-    ProcessInfo,
-    Ready,
-    RouteFound,
-    RouteWanted,
-    SocketDropped,
-    SocketKept,
-    SocketRestored,
-    SocketsRestored,
-    TunnelsEnclosed,
-    TunnelsWanted,
-    Walled,
-)
+from appliance.channel import messages
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health, signals
 from appliance.supervisor.enclosure import Enclosure
@@ -73,15 +52,20 @@ _START_SECONDS = 180.0  # without any progress
 _LOOK_SECONDS = 10.0
 _MOST_UNANSWERED = 4096  # hosts of which control asks the way
 
-_FROM_ANY: tuple[type[Message], ...] = (Walled, Pong, Ready, Failed)
-_FROM_CONTROL: tuple[type[Message], ...] = (
-    SocketKept,
-    SocketDropped,
-    RouteWanted,
-    EndpointWanted,
-    ApplianceStopRequested,
-    LogHeld,
-    TunnelsWanted,
+_FROM_ANY: tuple[type[messages.Message], ...] = (
+    messages.Walled,
+    messages.Pong,
+    messages.Ready,
+    messages.Failed,
+)
+_FROM_CONTROL: tuple[type[messages.Message], ...] = (
+    messages.SocketKept,
+    messages.SocketDropped,
+    messages.RouteWanted,
+    messages.EndpointWanted,
+    messages.ApplianceStopRequested,
+    messages.LogHeld,
+    messages.TunnelsWanted,
 )
 
 log = structlog.get_logger()
@@ -144,7 +128,7 @@ class Supervisor:
         loop.set_exception_handler(_log_fault)
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
-        loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(PolicyReloadRequested()))
+        loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(messages.PolicyReloadRequested()))
         with signals.heard():
             await self._serve()
         if self._failure is not None:
@@ -240,14 +224,16 @@ class Supervisor:
         if post.role.name == "control":
             self._equip_control(post.life)
         if post.role.listens:
-            post.life.send(SocketRestored(post.role.name), (self._listeners[post.role.name].fileno(),))
+            post.life.send(
+                messages.SocketRestored(post.role.name), (self._listeners[post.role.name].fileno(),)
+            )
         self._link(post)
         self._tell_processes()
 
     def _equip_control(self, life: Life) -> None:
         for name, descriptor in self._kept:
-            life.send(SocketRestored(name), (descriptor,))
-        life.send(SocketsRestored(len(self._kept), self._is_ready))
+            life.send(messages.SocketRestored(name), (descriptor,))
+        life.send(messages.SocketsRestored(len(self._kept), self._is_ready))
         for message in self._guard.news():
             life.send(message)
 
@@ -266,18 +252,18 @@ class Supervisor:
             self._violated(life, f"sent {type(message).__name__}, which it may not send")
             return
         match message:
-            case Walled():
+            case messages.Walled():
                 self._walled(life, message)
-            case Pong():
+            case messages.Pong():
                 life.heard()
-            case Ready(detail):
+            case messages.Ready(detail):
                 self._child_ready(life, detail)
-            case Failed(said):
+            case messages.Failed(said):
                 self._cannot_serve(life, _printable(said))
             case _:
                 self._control_said(life, message, descriptors)
 
-    def _walled(self, life: Life, walls: Walled) -> None:
+    def _walled(self, life: Life, walls: messages.Walled) -> None:
         """What it is enclosed in, by its own first word: what it says later is not believed."""
         if life.walls is not None:
             self._violated(life, "told twice what walls it is in")
@@ -298,22 +284,22 @@ class Supervisor:
         else:
             self.stop(reason)  # which says it, as the last line
 
-    def _control_said(self, life: Life, message: Message, descriptors: tuple[int, ...]) -> None:
+    def _control_said(self, life: Life, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         match message:
-            case SocketKept(name):
+            case messages.SocketKept(name):
                 self._keep(life, name, descriptors[0])
-            case SocketDropped(name):
+            case messages.SocketDropped(name):
                 if name != ADMIN:
                     self._kept.drop(name)
-            case RouteWanted(host):
+            case messages.RouteWanted(host):
                 self._answer(life, self._route(life, host))
-            case EndpointWanted():
+            case messages.EndpointWanted():
                 self._answer(life, self._tell_endpoint(life))
-            case TunnelsWanted(pool, address):
+            case messages.TunnelsWanted(pool, address):
                 self._answer(life, self._open_tunnels(life, pool, address))
-            case LogHeld(processes):
+            case messages.LogHeld(processes):
                 self._free_log(processes)
-            case ApplianceStopRequested(reason):
+            case messages.ApplianceStopRequested(reason):
                 log.warning("control asks to end the appliance", reason=reason)
                 self.stop()
 
@@ -370,7 +356,7 @@ class Supervisor:
                 self.stop(str(error))
                 return
             self._is_ready = True
-            life.send(Announced())
+            life.send(messages.Announced())
 
     def _answer(self, life: Life, work: Coroutine[Any, Any, None]) -> None:
         """Work that ends with an answer to control, which may wait for many, but not for any number."""
@@ -385,7 +371,7 @@ class Supervisor:
         self._unanswered -= 1
 
     async def _route(self, life: Life, host: str) -> None:
-        life.send(RouteFound(host, await self._guard.route_to(host)))
+        life.send(messages.RouteFound(host, await self._guard.route_to(host)))
 
     async def _tell_endpoint(self, life: Life) -> None:
         life.send(await self._guard.endpoint())
@@ -393,7 +379,7 @@ class Supervisor:
     async def _open_tunnels(self, life: Life, pool: str, address: str) -> None:
         if not CHARON.exists():
             reason = f"{CHARON} is not there: apt install charon-systemd strongswan-swanctl libcharon-extra-plugins"
-            life.send(TunnelsEnclosed(None, reason))
+            life.send(messages.TunnelsEnclosed(None, reason))
             return
         answer = await self._guard.open_tunnels(pool, address)
         if answer.esp is not None:
@@ -474,14 +460,14 @@ class Supervisor:
 
     def _tell_processes(self) -> None:
         rows = [
-            ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed)
+            messages.ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed)
             for post in self._posts
             if (life := post.life) is not None
         ]
-        own = ProcessInfo("supervisor", os.getpid(), self._since, 0)
-        self._tell_control(ProcessesChanged([own, *rows]))
+        own = messages.ProcessInfo("supervisor", os.getpid(), self._since, 0)
+        self._tell_control(messages.ProcessesChanged([own, *rows]))
 
-    def _tell_control(self, message: Message) -> None:
+    def _tell_control(self, message: messages.Message) -> None:
         for post in self._posts:
             if post.role.name == "control" and post.life is not None:
                 post.life.send(message)

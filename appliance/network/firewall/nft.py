@@ -62,7 +62,8 @@ class NftBackend:
 
     def counters(self) -> tuple[RuleCounter, ...]:
         """Read the rules of the table back from the kernel."""
-        if not any(_is_ours(table) for table in self._list("table", "list", "tables")):
+        tables = self._list("table", "list", "tables")
+        if (_FAMILY, TABLE) not in [(table.get("family"), table.get("name")) for table in tables]:
             return ()
         rules = self._list("rule", "list", "table", _FAMILY, TABLE)
         hooked = {jump for rule in rules for jump in _jumps(rule)}
@@ -256,13 +257,7 @@ def _meter(rule: Rule, family: int) -> str:
 
 def _meter_set(name: str) -> Json:
     kind = "ipv6_addr" if name.startswith("new-ipv6") else "ipv4_addr"
-    return {
-        "name": name,
-        "type": kind,
-        "flags": ["timeout"],
-        "timeout": _METER_SECONDS,
-        "size": _METER_SIZE,
-    }
+    return {"name": name, "type": kind, "flags": ["timeout"], "timeout": _METER_SECONDS, "size": _METER_SIZE}
 
 
 def _hook(chain: Chain, hook: Hook) -> list[Json]:
@@ -320,10 +315,6 @@ def _network(network: str) -> object:
 
 def _ports(ports: PortRange) -> object:
     return ports.first if ports.first == ports.last else {"range": [ports.first, ports.last]}
-
-
-def _is_ours(table: Json) -> bool:
-    return table.get("family") == _FAMILY and table.get("name") == TABLE
 
 
 def _translates_source(rule: Json) -> bool:

@@ -1,7 +1,6 @@
 """The files that every process reads, and those a program needs to run at all."""
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,16 +14,18 @@ _LOADERS = (("/lib", "ld-linux-*"), ("/lib64", "ld-linux-*"))
 
 def furnished(walls: Walls, home: str, run: str) -> Walls:
     """Walls with the system, Python, our code and the resolved configuration in `run` to read, and `home` to write."""
+    code = {sys.prefix, sys.base_prefix, str(Path(appliance.__file__).parent.parent)}
     return replace(
         walls,
-        reads=(*walls.reads, *_SYSTEM, str(_RESOLVER.resolve().parent), *_code(), run),
+        reads=(*walls.reads, *_SYSTEM, str(_RESOLVER.resolve().parent), *code, run),
         writes=(*walls.writes, home, "/dev/null"),
     )
 
 
 def runnable(program: Path) -> tuple[str, ...]:
     """What must be executable so that this program runs: itself, without links, and the loader of its libraries."""
-    return (str(program.resolve()), *(str(one.resolve()) for one in _loaders()))
+    loaders = (loader for folder, name in _LOADERS for loader in Path(folder).glob(name))
+    return (str(program.resolve()), *(str(loader.resolve()) for loader in loaders))
 
 
 def around(*files: Path | None) -> tuple[str, ...]:
@@ -32,12 +33,3 @@ def around(*files: Path | None) -> tuple[str, ...]:
     given = [one for one in files if one is not None]
     found = [str(place.parent) for one in given for place in (one.absolute(), one.resolve())]
     return tuple(dict.fromkeys(found))
-
-
-def _code() -> Iterator[str]:
-    yield from {sys.prefix, sys.base_prefix, str(Path(appliance.__file__).parent.parent)}
-
-
-def _loaders() -> Iterator[Path]:
-    for folder, name in _LOADERS:
-        yield from Path(folder).glob(name)

@@ -20,14 +20,7 @@ _ASK_VERSION = 1
 _BENEATH, _PORT = 1, 2
 _BIND, _CONNECT = 1 << 0, 1 << 1
 _SCOPES = 0b11  # abstract Unix sockets, signals
-_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _TRUNCATE, _IOCTL = (
-    1 << 0,
-    1 << 1,
-    1 << 2,
-    1 << 3,
-    1 << 14,
-    1 << 15,
-)
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _TRUNCATE, _IOCTL = (1 << bit for bit in (0, 1, 2, 3, 14, 15))
 _OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _IOCTL
 _READ = _READ_FILE | _READ_DIR
 _PR_SET_NO_NEW_PRIVS = 38
