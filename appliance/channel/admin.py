@@ -66,7 +66,9 @@ class PolicyRevisions(AdminRequest, frozen=True, tag="policy revisions"):
 
 
 class RegistrationsWanted(AdminRequest, frozen=True, tag="registrations"):
-    """What is live now and a change of the policy may end, as rows of `appliance.policy.Live`."""
+    """What is live now (publications, subscriptions, services, calls, parameters), as rows of requests:
+    host, caller_id, category, resource.
+    """
 
 
 class GraphWanted(AdminRequest, frozen=True, tag="graph"):

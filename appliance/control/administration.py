@@ -13,6 +13,7 @@ import msgspec
 
 import appliance
 from appliance.channel import admin
+from appliance.control.assembly import Parts
 from appliance.control.measures import measures_of
 from appliance.control.monitor_orders import change_monitors, monitors_body, monitors_status
 from appliance.control.overview import graph_of
@@ -27,15 +28,21 @@ from appliance.hosts.table import (
     HostsChangedError,
     UnknownHostError,
 )
-from appliance.master.core import Master
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.policies import Loaded, Policies, PolicyRefusedError, RevisionChangedError
-from appliance.policy import Known, Live
+from appliance.specifications.allocation import TOPIC
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import MonitorsChangedError, UnknownMonitorError
 from appliance.store.state import RevisionRow, StateStore
 from appliance.store.tokens import TokenRow
 
+# What is live, and the requests that it needs: the category, and the resource where it is another than its own.
+_LIVE: dict[Kind, tuple[tuple[str, str], ...]] = {
+    Kind.PUBLICATION: (("publish", ""),),
+    Kind.SUBSCRIPTION: (("subscribe", ""),),
+    Kind.SERVICE: (("offer", ""),),
+    Kind.PARAMETER: (("read", ""), ("command", "subscribeParam")),
+}
 _View = (
     admin.StatusWanted
     | admin.PolicyRevisions
@@ -55,13 +62,12 @@ class UnknownThingError(Exception):
 class Administration:
     """Carries out requests; `lag()` is the audit log's, in records and seconds.
 
-    `forwarded()` is how its forwarding to a syslog receiver stands; None when it is not forwarded. `live()` is what a
-    change of the policy may end.
+    `forwarded()` is how its forwarding to a syslog receiver stands; None when it is not forwarded.
     """
 
     def __init__(
         self,
-        master: Master,
+        parts: Parts,
         policies: Policies,
         tokens: Tokens,
         store: StateStore,
@@ -74,9 +80,8 @@ class Administration:
         audit_degraded: Callable[[], str | None],
         queued_deliveries: Callable[[], int],
         forwarded: Callable[[], dict[str, Any] | None],
-        live: Callable[[], list[Live]],
     ) -> None:
-        self._master = master
+        self._parts = parts
         self._policies = policies
         self._tokens = tokens
         self._store = store
@@ -88,7 +93,6 @@ class Administration:
         self._audit_degraded = audit_degraded
         self._queued_deliveries = queued_deliveries
         self._forwarded = forwarded
-        self._live = live
         self._started = time.time()
         self._changing = asyncio.Lock()
 
@@ -100,7 +104,7 @@ class Administration:
             text = f"the policy was refused; revision {self._policies.revision} stays in force"
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
         except SpecificationsRefusedError as error:
-            text = f"refused; revision {self._master.monitors.revision} of the specifications stays in force"
+            text = f"refused; revision {self._parts.monitors.revision} of the specifications stays in force"
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
         except (RevisionChangedError, MonitorsChangedError, HostsChangedError) as error:
             body = {"tag": error.tag} if isinstance(error, MonitorsChangedError) else {}
@@ -129,9 +133,9 @@ class Administration:
                 | admin.MonitorSwitch()
                 | admin.MonitorResume()
             ):
-                return await change_monitors(self._master.monitors, request, who)
+                return await change_monitors(self._parts.monitors, request, who)
             case admin.PolicyWanted(revision):
-                return await asyncio.to_thread(self._policy, revision, self._policies.known)
+                return await asyncio.to_thread(self._policy, revision)
             case _:
                 return self._look(request)
 
@@ -142,17 +146,17 @@ class Administration:
             case admin.PolicyRevisions():
                 return {"revisions": [self._revision(row) for row in self._policies.revisions()]}
             case admin.RegistrationsWanted():
-                return {"registrations": [live.fields() for live in self._live()]}
+                return {"registrations": self._registrations()}
             case admin.GraphWanted():
-                return graph_of(self._master)
+                return graph_of(self._parts)
             case admin.MonitorsWanted(texts):
-                return monitors_body(self._master, texts=texts)
+                return monitors_body(self._parts, texts=texts)
             case admin.MetricsWanted():
                 return {
                     "status": self._status(),
                     "queued_deliveries": self._queued_deliveries(),
                     "hosts": self._hosts.rows(),
-                    **measures_of(self._master),
+                    **measures_of(self._parts),
                 }
 
     async def _manage_tokens(self, request: _TokenRequest) -> dict[str, Any]:
@@ -184,7 +188,7 @@ class Administration:
                 )
                 return _loaded(await loading)
 
-    def _policy(self, revision: int | None, known: Known) -> dict[str, Any]:
+    def _policy(self, revision: int | None) -> dict[str, Any]:
         row = self._policies.revision_row(revision)
         if row is None:
             raise UnknownThingError(f"there is no revision {revision}")
@@ -195,8 +199,22 @@ class Administration:
             "policy_file": str(self._policies.file),
             "confirm_by": self._policies.confirm_by,
             "warnings": [str(one) for one in self._policies.current.warnings],
-            **self._policies.with_cases(known).fields(),
+            "robot": [str(one) for one in self._policies.robot],
+            "hosts": {name: str(address) for name, address in self._policies.hosts.items()},
+            "cases_file": str(self._policies.cases_file),
+            **self._cases(),
         }
+
+    def _cases(self) -> dict[str, str | None]:
+        """The tests of the policy; `cases_error` when there are some that cannot be read."""
+        try:
+            return {
+                "cases": self._policies.cases_file.read_text(encoding="utf-8"), "cases_error": None,
+            }  # fmt: skip
+        except FileNotFoundError:
+            return {"cases": None, "cases_error": None}
+        except (OSError, UnicodeDecodeError) as error:
+            return {"cases": None, "cases_error": f"the policy's tests cannot be read: {error}"}
 
     def _revision(self, row: RevisionRow) -> dict[str, Any]:
         return {
@@ -211,7 +229,7 @@ class Administration:
     # --- what is there ---
 
     def _status(self) -> dict[str, Any]:
-        registry, relay = self._master.registry, self._master.relay
+        registry, relay = self._parts.registry, self._parts.relay
         lives = [one.life for one in registry.all()]
         lag_records, lag_seconds = self._lag()
         return {
@@ -220,8 +238,8 @@ class Administration:
             "master": self._surroundings.master,
             "processes": msgspec.to_builtins(self._surroundings.processes),
             "isolation": self._surroundings.firewall.isolation,
-            "relaying": "all" if self._master.mediation.relay_all else "monitored",
-            "mediation": "full" if self._master.mediation.stand_ins else "monitored",
+            "relaying": "all" if self._parts.mediation.relay_all else "monitored",
+            "mediation": "full" if self._parts.mediation.stand_ins else "monitored",
             "firewall": self._surroundings.firewall.report,
             "probe": self._surroundings.probe,
             "policy": {
@@ -234,8 +252,8 @@ class Administration:
                 "confirm_by": self._policies.confirm_by,
             },
             "ipsec": self._hosts.status(),
-            "monitors": monitors_status(self._master.monitors),
-            "rosmaster": "reachable" if self._master.rosmaster.reachable else "being rebuilt",
+            "monitors": monitors_status(self._parts.monitors),
+            "rosmaster": "reachable" if self._parts.rosmaster.reachable else "being rebuilt",
             "relay": relay.presence,
             "nodes": lives.count(Life.LIVE),
             "shadows": lives.count(Life.SHADOW),
@@ -255,6 +273,22 @@ class Administration:
                 "forwarding": self._forwarded(),
             },
         }
+
+    def _registrations(self) -> list[dict[str, Any]]:
+        """Everything live that a policy may end, as the requests that it was granted by."""
+        rows = [
+            (str(incarnation.host), incarnation.name, category, resource or registration.resource)
+            for incarnation, registration in self._parts.registry.in_order()
+            if not incarnation.own
+            for category, resource in _LIVE[registration.kind]
+        ]
+        rows += [
+            (row.host, row.caller_id, "call", row.resource)
+            for row in self._parts.relay.permissions()
+            if row.kind != TOPIC  # a subscription is one already
+        ]
+        names = ("host", "caller_id", "category", "resource")
+        return [dict(zip(names, row, strict=True)) for row in dict.fromkeys(rows)]
 
 
 def _trouble(error: TokenRefusedError | HostRefusedError) -> admin.Trouble:

@@ -8,7 +8,7 @@ through `Wires`, the one place where the circles are.
 import asyncio
 import socket
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import structlog
@@ -19,38 +19,46 @@ from appliance.control.doors import Doors, value_limits
 from appliance.control.lifeline import ControlLifeline
 from appliance.hosts.hosts import Hosts
 from appliance.master import rosout
+from appliance.master.calls.call import Table, served
+from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
-from appliance.master.calls.parameter_charges import ParameterCharges
-from appliance.master.calls.parameters import ParameterMirror, may_be_told
+from appliance.master.calls.lookups import LookupCalls
+from appliance.master.calls.monitor_calls import MonitorCalls
+from appliance.master.calls.multicall import Multicall
+from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.calls.parameter_search import ParameterSearch
+from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
-from appliance.master.calls.registration import withdraw_lost
-from appliance.master.core import Master
+from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.calls.table import MASTER_CALLS, master_table
 from appliance.master.graph.delivery import Delivery, NodeCall
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.liveness import Liveness, LivenessSettings
 from appliance.master.graph.publisher import OwnPublisher
 from appliance.master.graph.reconcile import Reconciler
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.graph.registrar import Registrar
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.graph.reminders import Reminders
 from appliance.master.graph.revocation import Revocation
 from appliance.master.later import Later
+from appliance.master.parameter_charges import ParameterCharges
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.policies import Policies
 from appliance.master.reach.addresses import Addresses
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.inner import InnerFace
 from appliance.master.reach.mediation import Mediation
 from appliance.master.reach.moving import Moving
-from appliance.master.reach.node_calls import NODE_CALLS
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.master.standing import HostStanding
 from appliance.policy import Policy
-from appliance.policy.model import Address
 from appliance.recorder import Recorder
 from appliance.ros.standard import standard_definitions
-from appliance.ros.xmlrpc import Value
+from appliance.rpc.bulk import bulk_turns
 from appliance.rpc.server import Handler
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
@@ -88,23 +96,8 @@ class Foundation:
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
-    """The parts that control itself starts, restores and ends; `master` has what a call is performed with."""
-
-    master: Master
-    revocation: Revocation
-    places: Places
-    delivery: Delivery
-    reminders: Reminders
-    reconciler: Reconciler
-    publisher: OwnPublisher
-    pipeline: Pipeline
-    inner: InnerFace
-
-
-@dataclass(frozen=True, slots=True)
 class _Reach:
-    """How nodes are known, found, told and carried."""
+    """How nodes are known, found, told and carried; and what the policy lets them be told of parameters."""
 
     registry: Registry
     places: Places
@@ -113,6 +106,45 @@ class _Reach:
     relay: RelayControl
     mediation: Mediation
     graph: Graph
+    rights: ParameterRights
+
+
+@dataclass(frozen=True, slots=True)
+class _Books:
+    """What holds ROSMaster, the registry and the policy together."""
+
+    rosmaster: RosMaster
+    registrar: Registrar
+    faces: Faces
+    mirror: ParameterMirror
+    reconciler: Reconciler
+    revocation: Revocation
+    liveness: Liveness
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The parts that control itself starts, asks, restores and ends; `table` is the Master API."""
+
+    registry: Registry
+    recorder: Recorder
+    monitors: Monitors
+    places: Places
+    delivery: Delivery
+    relay: RelayControl
+    mediation: Mediation
+    graph: Graph
+    rosmaster: RosMaster
+    faces: Faces
+    parameters: ParameterMirror
+    liveness: Liveness
+    reminders: Reminders
+    reconciler: Reconciler
+    publisher: OwnPublisher
+    monitor_calls: MonitorCalls
+    table: Table
+    pipeline: Pipeline
+    inner: InnerFace
 
 
 class _Wires:
@@ -122,9 +154,9 @@ class _Wires:
         self.liveness: Later[Liveness] = Later("liveness")
         self.faces: Later[Faces] = Later("faces")
         self.reconciler: Later[Reconciler] = Later("the reconcile loop")
-        self.pipeline: Later[Pipeline] = Later("the pipeline")
-        self.master: Later[Master] = Later("the master")
+        self.node_handler: Later[Callable[[Incarnation], Handler]] = Later("the handler of outer faces")
         self.revocation: Later[Revocation] = Later("the revocation")
+        self.rosmaster: Later[RosMaster] = Later("the ROS Master")
 
     def node_troubled(self, incarnation: Incarnation, call: NodeCall, why: str) -> None:
         _log.info("a node could not be told", node=incarnation.name, call=call.method, why=why)
@@ -139,62 +171,86 @@ class _Wires:
     async def revive(self, incarnation: Incarnation) -> None:
         await self.liveness().revive(incarnation)
 
-    def returned(self, incarnation: Incarnation) -> None:
-        self.revocation().returned(incarnation)
-
-    def redecide_for(self, host: Address, caller_id: str) -> int:
-        return self.revocation().redecide_for(host, caller_id)
-
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         return self.revocation().may_have(incarnation, kind, resource)
 
-    def may_be_told(self, incarnation: Incarnation, key: str, value: Value) -> bool:
-        return may_be_told(self.master(), incarnation, key, value)
-
     def rosmaster_lost(self) -> None:
-        self.master().rosmaster.shut()
+        self.rosmaster().shut()
         self.reconciler().wake()
 
-    async def withdraw(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
-        await withdraw_lost(self.master(), incarnation, registrations)
-
-    def node_handler(self, incarnation: Incarnation) -> Handler:
-        return self.pipeline().handler(NODE_CALLS, target=incarnation)
+    def serve(self, incarnation: Incarnation) -> Handler:
+        return self.node_handler()(incarnation)
 
 
 def assemble(base: Foundation) -> Parts:
     """All parts, connected; nothing serves yet."""
     wires = _Wires()
     reach = _make_reach(base, wires)
+    return _finish(base, wires, reach, _make_books(base, wires, reach))
+
+
+def _make_books(base: Foundation, wires: _Wires, reach: _Reach) -> _Books:
+    settings, registry, graph = base.settings, reach.registry, reach.graph
     faces = wires.faces.fill(_make_faces(base, wires, reach))
-    rosmaster = RosMaster(
-        base.settings.rosmaster_port,
-        lost=wires.rosmaster_lost,
-        limits=limits_of_answers(value_limits(base.settings), int(base.settings.limits.parameter_bytes)),
+    rosmaster = wires.rosmaster.fill(
+        RosMaster(
+            settings.rosmaster_port,
+            lost=wires.rosmaster_lost,
+            limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
+            small={call.name for call in MASTER_CALLS.values() if call.small},
+        )
     )
-    parameters = ParameterMirror(
+    mirror = ParameterMirror(
         base.store.load_parameters(),
         base.parameters_dirty.set,
         _make_charges(base),
-        depth_limit=base.settings.limits.nesting,
+        depth_limit=settings.limits.nesting,
         note=base.store.note_parameter,
         since=base.store.parameter_changes(),
     )
+    registrar = Registrar(rosmaster, faces)
     reconciler = wires.reconciler.fill(
         Reconciler(
             rosmaster,
-            reach.registry,
+            registry,
             faces,
-            reach.graph,
-            parameters,
+            graph,
+            mirror,
             base.recorder,
             own_parameters=own_parameters,
             may_have=wires.may_have,
         )
     )
-    wires.liveness.fill(_make_liveness(base, wires, reach, reconciler))
-    master = wires.master.fill(_make_master(base, wires, reach, rosmaster, parameters))
-    return _finish(base, wires, reach, master)
+    revocation = wires.revocation.fill(
+        Revocation(
+            registry,
+            graph,
+            reach.relay,
+            registrar,
+            base.recorder,
+            policy=lambda: base.policies.current,
+            parameters=lambda: mirror.tree,
+            put_back=reconciler.put_back,
+        )
+    )
+    liveness = wires.liveness.fill(
+        Liveness(
+            registry,
+            graph,
+            LivenessSettings(
+                settings.liveness.interval,
+                settings.liveness.silent,
+                settings.liveness.shadow,
+                settings.limits.node_call_seconds,
+            ),
+            value_limits(settings),
+            withdraw=registrar.withdraw_lost,
+            put_back=reconciler.put_back,
+            returned=revocation.returned,
+            standing=base.standing,
+        )
+    )
+    return _Books(rosmaster, registrar, faces, mirror, reconciler, revocation, liveness)
 
 
 def _make_charges(base: Foundation) -> ParameterCharges:
@@ -242,6 +298,7 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         relay_all=settings.relaying == "all",
         stand_ins=settings.mediation == "full",
     )
+    rights = ParameterRights(lambda: base.policies.current, base.recorder)
     graph = Graph(
         registry,
         relay,
@@ -249,9 +306,9 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         base.recorder,
         mediation,
         closed=wires.close_faces,
-        may_be_told=wires.may_be_told,
+        may_be_told=rights.may_be_told,
     )
-    return _Reach(registry, places, addresses, delivery, relay, mediation, graph)
+    return _Reach(registry, places, addresses, delivery, relay, mediation, graph, rights)
 
 
 def _make_faces(base: Foundation, wires: _Wires, reach: _Reach) -> Faces:
@@ -259,7 +316,7 @@ def _make_faces(base: Foundation, wires: _Wires, reach: _Reach) -> Faces:
         reach.registry,
         reach.places,
         inner_port=base.port(INNER),
-        serve=wires.node_handler,
+        serve=wires.serve,
         address_for=reach.addresses.told_to,
         limits=base.doors.http,
         visitors=base.doors.visitors,
@@ -271,64 +328,105 @@ def _make_faces(base: Foundation, wires: _Wires, reach: _Reach) -> Faces:
     )
 
 
-def _make_liveness(base: Foundation, wires: _Wires, reach: _Reach, reconciler: Reconciler) -> Liveness:
-    settings = base.settings
-    return Liveness(
-        reach.registry,
-        reach.graph,
-        LivenessSettings(
-            settings.liveness.interval,
-            settings.liveness.silent,
-            settings.liveness.shadow,
-            settings.limits.node_call_seconds,
-        ),
-        value_limits(settings),
-        withdraw=wires.withdraw,
-        put_back=reconciler.put_back,
-        returned=wires.returned,
+def _make_execution(
+    base: Foundation, reach: _Reach, books: _Books, gate: Gate, parameters: ParameterCalls
+) -> Execution:
+    return Execution(
+        gate=gate,
+        policy=lambda: base.policies.current,
+        recorder=base.recorder,
+        registry=reach.registry,
+        liveness=books.liveness,
+        parameters=parameters,
+        redecide_for=books.revocation.redecide_for,
+        large=int(base.settings.limits.offload_bytes),
         standing=base.standing,
     )
 
 
-def _make_master(
-    base: Foundation, wires: _Wires, reach: _Reach, rosmaster: RosMaster, parameters: ParameterMirror
-) -> Master:
-    settings = base.settings
+def _finish(base: Foundation, wires: _Wires, reach: _Reach, books: _Books) -> Parts:
+    """The parts on top: the calls, and what they are carried out with."""
+    settings, registry, relay = base.settings, reach.registry, reach.relay
+    mirror, liveness, port = books.mirror, books.liveness, base.port(RVMASTER)
+    offload = int(settings.limits.offload_bytes)
     gate = Gate(
         lambda: base.policies.current,
-        reach.registry,
+        registry,
         HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host),
     )
-    return Master(
-        port=base.port(RVMASTER),
-        registry=reach.registry,
-        gate=gate,
-        recorder=base.recorder,
-        rosmaster=rosmaster,
-        relay=reach.relay,
-        graph=reach.graph,
-        faces=wires.faces(),
-        liveness=wires.liveness(),
-        parameters=parameters,
-        mediation=reach.mediation,
-        monitors=base.monitors,
-        publish_as=settings.publish_as,
-        hide_publisher=settings.hide_publisher,
-        addresses=reach.addresses,
-        policy=lambda: base.policies.current,
+    registration = RegistrationCalls(
+        books.rosmaster, registry, reach.graph, books.faces, relay, reach.mediation, gate, reach.rights
+    )
+    lookups = LookupCalls(
+        books.rosmaster,
+        registry,
+        books.faces,
+        relay,
+        reach.mediation,
+        reach.addresses,
+        port,
         stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
-        redecide_for=wires.redecide_for,
+        unseen=settings.publish_as if settings.hide_publisher else None,
+    )
+    parameters = ParameterCalls(books.rosmaster, mirror, reach.graph, reach.rights, offload)
+    search = ParameterSearch(books.rosmaster, mirror, reach.rights)
+    monitor_calls = MonitorCalls(base.monitors, registry, relay, books.rosmaster.port, port)
+    node_calls = NodeCalls(registry, relay, reach.mediation, reach.addresses, liveness, gate, port)
+    execution = _make_execution(base, reach, books, gate, parameters)
+    pipeline = Pipeline(
+        execution,
+        Multicall(execution, parameters, base.recorder, offload=offload),
+        addresses=reach.addresses,
+        recorder=base.recorder,
+        limits=value_limits(settings),
+        offload=offload,
+        bulk=bulk_turns(base.standing),
+    )
+    node_table = served(NODE_CALLS.values(), node_calls)
+    wires.node_handler.fill(lambda incarnation: pipeline.handler(node_table, target=incarnation))
+    publisher = OwnPublisher(
+        registry,
+        reach.graph,
+        books.registrar,
+        name=settings.publish_as,
+        inner_port=base.port(INNER),
+        wanted=lambda: _published(base),
+        register=registration.register_publisher,
+    )
+    reminders = Reminders(registry, relay, reach.graph)
+    _connect(base, reach, books, reminders, publisher)
+    return Parts(
+        registry=registry,
+        recorder=base.recorder,
+        monitors=base.monitors,
+        places=reach.places,
+        delivery=reach.delivery,
+        relay=relay,
+        mediation=reach.mediation,
+        graph=reach.graph,
+        rosmaster=books.rosmaster,
+        faces=books.faces,
+        parameters=mirror,
+        liveness=liveness,
+        reminders=reminders,
+        reconciler=books.reconciler,
+        publisher=publisher,
+        monitor_calls=monitor_calls,
+        table=master_table(registration, lookups, parameters, search, monitor_calls),
+        pipeline=pipeline,
+        inner=InnerFace(registry),
     )
 
 
-def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> Parts:
-    """The parts on top, and what policy, hosts and specifications call when they change."""
-    relay, reminders = reach.relay, Reminders(reach.registry, reach.relay, reach.graph)
+def _connect(
+    base: Foundation, reach: _Reach, books: _Books, reminders: Reminders, publisher: OwnPublisher
+) -> None:
+    """What policy, hosts and specifications call when they change."""
+    relay, revocation = reach.relay, books.revocation
     base.monitors.connect(Moving(relay, reach.graph, reminders))
     relay.statement, relay.heard, relay.lost = (
         base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
     )  # fmt: skip
-    publisher = OwnPublisher(master, base.settings.publish_as, base.port(INNER), lambda: _published(base))
     base.monitors.published = publisher.wake
     if base.settings.monitors_on_rosout:
         relay.own_header = rosout.header(standard_definitions())
@@ -336,8 +434,6 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
             base.settings.publish_as, relay.publish, lambda name: base.monitors.checked.monitors.get(name, "")
         )
         base.monitors.records.told = said.reported
-    reconciler = wires.reconciler()
-    revocation = wires.revocation.fill(Revocation(master, put_back=reconciler.put_back))
     base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
     base.hosts.ports.machines = lambda: Counter(
         str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own
@@ -354,24 +450,6 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, master: Master) -> P
         return revoked
 
     base.policies.changed = policy_changed
-    return Parts(
-        master=master,
-        revocation=revocation,
-        places=reach.places,
-        delivery=reach.delivery,
-        reminders=reminders,
-        reconciler=reconciler,
-        publisher=publisher,
-        pipeline=wires.pipeline.fill(
-            Pipeline(
-                master,
-                limits=value_limits(base.settings),
-                offload=int(base.settings.limits.offload_bytes),
-                standing=base.standing,
-            )
-        ),
-        inner=InnerFace(reach.registry),
-    )
 
 
 def _published(base: Foundation) -> dict[str, str]:

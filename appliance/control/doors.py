@@ -87,7 +87,7 @@ class Doors:
         return partial(self._refuse_stranger, peer)
 
     def _refuse_stranger(self, peer: Peer, beginning: bytes) -> bytes:
-        asked = asked_for(beginning)
+        asked = asked_for(peer, beginning)
         reason = f"no rule of the policy names {peer.text}"
         record = self._recorder.happened(
             "decision",

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from appliance.master.core import Master
+from appliance.control.assembly import Parts
 from appliance.master.graph.registry import Life
 from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried, Traffic
 from appliance.policy.model import Category
@@ -18,27 +18,27 @@ _DECISIONS = tuple(
 )
 
 
-def measures_of(master: Master) -> dict[str, Any]:
+def measures_of(parts: Parts) -> dict[str, Any]:
     """Counters of requests, and the state of registry and relay at this moment.
 
     Topics and services are named as far as `MOST_RESOURCES` goes (histograms: `MOST_DELAYED`): who registers names
     without end fills `OTHERS`.
     """
-    lives = Counter(one.life for one in master.registry.all() if not one.own)
-    kinds = Counter(one.kind.value for node, one in master.registry.in_order() if not node.own)
-    records = master.monitors.records
-    values = master.recorder.meter.values()
+    lives = Counter(one.life for one in parts.registry.all() if not one.own)
+    kinds = Counter(one.kind.value for node, one in parts.registry.in_order() if not node.own)
+    records = parts.monitors.records
+    values = parts.recorder.meter.values()
     decided = {(category, outcome): count for category, outcome, count in values["decisions"]}
     return {
         **values,
         "decisions": [[*labels, count] for labels, count in from_zero(decided, _DECISIONS).items()],
         "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         "registrations": dict(kinds),
-        **carried_of(master.relay.carried),
+        **carried_of(parts.relay.carried),
         "monitors": [
             [kind, name, count]
             for (kind, name), count in from_zero(
-                records.counts, ((kind, name) for name in master.monitors.names() for kind in KINDS)
+                records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS)
             ).items()
         ],
         **{
@@ -47,12 +47,12 @@ def measures_of(master: Master) -> dict[str, Any]:
             )
             for kind in ("drop", "change")
         },
-        "limited": [[*labels, count] for labels, count in master.relay.carried.limited_messages.items()],
+        "limited": [[*labels, count] for labels, count in parts.relay.carried.limited_messages.items()],
         "memory": {
-            what: sum(held.get(what, 0) for held in master.relay.carried.memory.values())
+            what: sum(held.get(what, 0) for held in parts.relay.carried.memory.values())
             for what in ("frames", "queues", "latched", "headers")
         },
-        "connections": dict(Counter(one.kind for one in master.relay.connections.values())),
+        "connections": dict(Counter(one.kind for one in parts.relay.connections.values())),
     }
 
 

@@ -3,8 +3,7 @@
 from typing import Any
 
 from appliance.channel import admin
-from appliance.master.calls.monitor_calls import rv_state
-from appliance.master.core import Master
+from appliance.control.assembly import Parts
 from appliance.specifications.monitors import Monitors, Replaced
 
 
@@ -30,9 +29,9 @@ async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who:
             return {"names": held, "revision": monitors.revision, "tag": monitors.tag}
 
 
-def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:
+def monitors_body(parts: Parts, *, texts: bool) -> dict[str, Any]:
     """All monitors with state and counters; with `texts`, the specifications too."""
-    monitors = master.monitors
+    monitors = parts.monitors
     body: dict[str, Any] = {
         "revision": monitors.revision,
         "tag": monitors.tag,
@@ -43,7 +42,7 @@ def monitors_body(master: Master, *, texts: bool) -> dict[str, Any]:
         "differs_from_folder": monitors.differs_from_folder,
         "warnings": list(monitors.checked.warnings),
         "refused": monitors.refused,
-        "rv_state": rv_state(master),
+        "rv_state": parts.monitor_calls.rv_state(),
         "monitors": [_row(monitors, name) for name in monitors.names()],
     }
     if texts:

@@ -5,7 +5,7 @@ Everything is read from the registry and the relay's reports at one moment. The 
 
 from typing import Any
 
-from appliance.master.core import Master
+from appliance.control.assembly import Parts
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reach.relays import RelayControl
 from appliance.specifications.allocation import SERVICE, TOPIC
@@ -13,16 +13,16 @@ from appliance.specifications.allocation import SERVICE, TOPIC
 _ANY_TYPE = "*"
 
 
-def graph_of(master: Master) -> dict[str, Any]:
+def graph_of(parts: Parts) -> dict[str, Any]:
     """The graph now, in plain values."""
-    registry = master.registry
+    registry = parts.registry
     shown = [one for one in registry.all() if one.life is not Life.REPLACED and not one.own]
     live = [one for one in shown if one.life is Life.LIVE]
     names = {one.key: one.name for one in shown}
     return {
         "nodes": [_node(one) for one in sorted(shown, key=lambda one: one.name)],
-        "topics": _topics(master, live, names),
-        "services": _services(master, live, names),
+        "topics": _topics(parts, live, names),
+        "services": _services(parts, live, names),
     }
 
 
@@ -37,8 +37,8 @@ def _node(incarnation: Incarnation) -> dict[str, Any]:
     }
 
 
-def _topics(master: Master, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
-    relay = master.relay
+def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
+    relay = parts.relay
     topics: dict[str, dict[str, Any]] = {}
     for one in live:
         for registration in one.registrations.values():
@@ -55,18 +55,18 @@ def _topics(master: Master, live: list[Incarnation], names: dict[str, str]) -> l
             else:
                 topic["subscribers"].append(one.name)
     for name, topic in topics.items():
-        topic["mediated"] = master.mediation.carries_topic(name)
+        topic["mediated"] = parts.mediation.carries_topic(name)
         topic["connections"] = _connections(relay, TOPIC, name, names)
     return [topics[name] for name in sorted(topics)]
 
 
-def _services(master: Master, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
-    relay = master.relay
+def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[dict[str, Any]]:
+    relay = parts.relay
     return [
         {
             "name": registration.resource,
             "node": one.name,
-            "mediated": master.mediation.carries_service(registration.resource),
+            "mediated": parts.mediation.carries_service(registration.resource),
             **relay.flow(one.key, registration.resource),
             "connections": _connections(relay, SERVICE, registration.resource, names),
         }

@@ -40,7 +40,6 @@ from appliance.hosts.hosts import Hosts
 from appliance.hosts.rest_place import rest_place
 from appliance.hosts.table import HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels
-from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.journal import StoreJournal, restore
 from appliance.master.graph.registry import Life, Registry
 from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
@@ -209,8 +208,8 @@ class _Control:
     async def _serve(self) -> None:
         base, parts, sockets = self._base, self._parts, self._base.sockets
         doors = base.doors
-        await doors.open(sockets[RVMASTER], parts.pipeline.handler(MASTER_CALLS), guarded=True)
-        await doors.open(sockets[_OWN], parts.pipeline.handler(MASTER_CALLS, own=True), guarded=False)
+        await doors.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
+        await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
         self._tokens = Tokens(base.store, base.recorder)
         if self._lifeline.announced:
@@ -218,7 +217,7 @@ class _Control:
         self._lifeline.was_announced = self._tokens.told
         self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
         administration = Administration(
-            parts.master,
+            parts,
             base.policies,
             self._tokens,
             base.store,
@@ -230,7 +229,6 @@ class _Control:
             audit_degraded=lambda: self._audit.degraded,
             queued_deliveries=lambda: parts.delivery.waiting,
             forwarded=self._forwarded.status,
-            live=parts.revocation.live,
         )
         self._rest = RestLink(
             administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof
@@ -263,7 +261,7 @@ class _Control:
         base, parts = self._base, self._parts
         for work in (
             parts.reconciler.run(),
-            parts.master.liveness.run(),
+            parts.liveness.run(),
             base.doors.visitors.sweep(),
             SpareMemory().watch(),
             self._save_parameters(),
@@ -309,14 +307,14 @@ class _Control:
         for task in self._tasks:
             task.cancel()
         base.doors.close()
-        parts.master.faces.close_all()
+        parts.faces.close_all()
         parts.reminders.close()
         parts.delivery.close()
-        parts.master.rosmaster.close()
+        parts.rosmaster.close()
         base.recorder.happened(
             "appliance stopped", "control ended in an orderly way", severity=Severity.NOTICE
         )
-        base.store.save_parameters(parts.master.parameters.tree)
+        base.store.save_parameters(parts.parameters.tree)
         base.store.close()
         self._audit.close()
 
@@ -344,16 +342,16 @@ class _Control:
             _log.error("hosts.yaml was refused", reason=str(error))
 
     def _relay_link(self, index: int, descriptor: int) -> None:
-        relay = self._parts.master.relay
+        relay = self._parts.relay
         relay.attach(index, Channel(socket.socket(fileno=descriptor), messages.RelayLink))
-        self._parts.master.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
+        self._parts.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
         self._parts.reminders.begin()
 
     async def _save_parameters(self) -> None:
         while True:
             await self._parameters_dirty.wait()
             self._parameters_dirty.clear()
-            self._base.store.save_parameters(self._parts.master.parameters.tree)
+            self._base.store.save_parameters(self._parts.parameters.tree)
             await asyncio.sleep(_SAVE_SECONDS)
 
 
@@ -396,18 +394,18 @@ def _open_audit(
 
 async def _restore(base: Foundation, parts: Parts) -> None:
     """Bring back the nodes of before a restart, with their ports and grants, as far as the policy allows."""
-    registry, places = parts.master.registry, parts.places
+    registry, places = parts.registry, parts.places
     for name, sock in base.sockets.items():
         if name.startswith("port:"):
             places.adopt(name, sock)
     restore(registry, base.store)
-    parts.master.relay.load()
+    parts.relay.load()
     claimed: set[int] = set()
     for incarnation in registry.all():
         if incarnation.life is Life.REPLACED:
             continue
         try:
-            await parts.master.faces.reopen(incarnation)
+            await parts.faces.reopen(incarnation)
         except NoPortError as error:
             _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
             registry.forget(incarnation)

@@ -3,39 +3,35 @@
 Under load this saves most of the system calls between the two processes; a call that is alone travels alone. The
 answers are taken apart again, so that nobody notices: a fault of one part is that part's fault.
 
-Only calls whose parameters and answers are a few names travel together. What may be large, slow or impossible to write
-(a parameter's value) travels alone: it could fail, and would take the calls of others with it. One caller's own run of
-calls, whose order counts, travels together by `in_order`.
+Only calls whose parameters and answers are a few names travel together (`small` in the table of calls). What may be
+large, slow or impossible to write (a parameter's value) travels alone: it could fail, and would take the calls of
+others with it. One caller's own run of calls, whose order counts, travels together by `in_order`.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from appliance.ros.errors import EncodingError
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError, XmlRpcClient
 
 _LARGEST = 64  # parts of one multicall: what one slow part can hold up
-_TOGETHER = frozenset({
-    "registerPublisher", "unregisterPublisher", "registerSubscriber", "unregisterSubscriber",
-    "registerService", "unregisterService", "lookupNode", "lookupService", "hasParam", "searchParam",
-    "unsubscribeParam",
-})  # fmt: skip
 Wanted = tuple[str, tuple[Value, ...]]
 _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
 class BatchingClient:
-    """Makes the calls of one turn of the loop together, over `client`."""
+    """Makes those calls of one turn of the loop together that are `small`, over `client`."""
 
-    def __init__(self, client: XmlRpcClient) -> None:
+    def __init__(self, client: XmlRpcClient, small: Collection[str]) -> None:
         self._client = client
+        self._small = small
         self._waiting: list[_Waiting] = []
         self._sending: set[asyncio.Task[None]] = set()
 
     async def call(self, method: str, *params: Value) -> Value:
         """Call `method` and return its value. Raises `CallFailedError`, `EncodingError`."""
-        if method not in _TOGETHER:
+        if method not in self._small:
             return await self._client.call(method, *params)
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[Value] = loop.create_future()

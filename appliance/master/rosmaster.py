@@ -7,12 +7,12 @@ that registers in that moment notices nothing but a delay. The reconcile loop sh
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
 from appliance.master.batch import BatchingClient, Wanted
-from appliance.master.calls.call import Answer
+from appliance.master.caller import Answer
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import Limits, Value
 from appliance.rpc.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
@@ -32,7 +32,10 @@ def limits_of_answers(limits: Limits, parameters: int) -> Limits:
 
 
 class RosMaster:
-    """ROSMaster at `127.0.0.1:port`; `lost()` hears when it seems to be gone. Times are seconds."""
+    """ROSMaster at `127.0.0.1:port`; `lost()` hears when it seems to be gone. Times are seconds.
+
+    Calls that are `small` travel together.
+    """
 
     def __init__(
         self,
@@ -40,6 +43,7 @@ class RosMaster:
         *,
         lost: Callable[[], None],
         limits: Limits,
+        small: Collection[str] = (),
         timeout: float = 10.0,
         hold: float = 15.0,
     ) -> None:
@@ -53,7 +57,7 @@ class RosMaster:
             limits=limits,
             disconnected=lost,
         )
-        self._calls = BatchingClient(self._client)
+        self._calls = BatchingClient(self._client, small)
         self._open = asyncio.Event()
         self._alone = asyncio.Lock()
         self._inside = 0

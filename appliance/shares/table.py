@@ -77,7 +77,7 @@ PARAMETER_BYTES = Share(
     "`limit exceeded`",
     (
         "integration/master/test_shares.py::test_parameters_of_two_hundred_addresses",
-        "unit/master/calls/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
+        "unit/master/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
     ),
 )
 LARGE_WRITES = Share(

@@ -8,18 +8,13 @@ import asyncio
 import ipaddress
 from typing import Any, Self, cast
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Answer, Caller
-from appliance.master.calls.gate import Gate, HostLimits
-from appliance.master.calls.parameters import may_be_told
-from appliance.master.calls.pipeline import Pipeline
-from appliance.master.calls.registration import withdraw_lost
-from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.core import Master
+from appliance.master.caller import Answer, ApiUri, Caller
+from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.delivery import NodeCall
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.liveness import Liveness, LivenessSettings
 from appliance.master.graph.reconcile import Reconciler
+from appliance.master.graph.registrar import Registrar
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation
 from appliance.master.rosmaster import RosMaster
@@ -33,6 +28,7 @@ from appliance.shares.pool import Standing
 from appliance.specifications.allocation import SERVICE
 from appliance.store.state import PermissionRow
 from tests.support.parameters import mirror
+from tests.support.serving import serving
 
 HOST = ipaddress.ip_address("10.0.0.5")
 POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Commands]\ndefault=*\n"
@@ -275,6 +271,7 @@ class ControlParts:
             Addresses(),
             mirror(),
         )
+        rights = ParameterRights(lambda: self.current, cast(Any, self.records))
         self.graph = Graph(
             self.registry,
             cast(Any, self.relay),
@@ -282,7 +279,7 @@ class ControlParts:
             cast(Any, self.records),
             cast(Any, self.mediation),
             closed=lambda one: self.closed.append(one.key),
-            may_be_told=lambda one, key, value: may_be_told(self.master, one, key, value),
+            may_be_told=rights.may_be_told,
         )
         self.rosmaster = RosMaster(1, lost=lambda: None, limits=Limits(), hold=1.0)
         self.rosmaster._calls = cast(Any, self.hidden)
@@ -296,30 +293,44 @@ class ControlParts:
             own_parameters=dict,
             may_have=self._may_have,
         )
-        self.master = cast(Master, self)  # what `Revocation` and `withdraw` use of one is here
-        self.policy = lambda: self.current
-        self.gate = Gate(lambda: self.current, self.registry, HostLimits())
-        self.recorder = self.records
-        self.revocation = Revocation(self.master, put_back=self.reconciler.put_back)
-        self.redecide_for = self.revocation.redecide_for
+        self.registrar = Registrar(self.rosmaster, cast(Any, self.faces))
+        self.revocation = Revocation(
+            self.registry,
+            self.graph,
+            cast(Any, self.relay),
+            self.registrar,
+            cast(Any, self.records),
+            policy=lambda: self.current,
+            parameters=lambda: self.parameters.tree,
+            put_back=self.reconciler.put_back,
+        )
         self.liveness = self._make_liveness(silent)
-        self._serve = Pipeline(
-            self.master, limits=Limits(), offload=1 << 20, standing=lambda _host: Standing.REGISTERED
-        ).handler(MASTER_CALLS)
+        self._serve = serving(
+            policy=lambda: self.current,
+            registry=self.registry,
+            graph=self.graph,
+            rosmaster=self.rosmaster,
+            mirror=self.parameters,
+            recorder=self.records,
+            rights=rights,
+            faces=self.faces,
+            relay=self.relay,
+            mediation=self.mediation,
+            addresses=self.addresses,
+            liveness=self.liveness,
+            redecide_for=self.revocation.redecide_for,
+        )
 
     def _may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         return self.revocation.may_have(incarnation, kind, resource)
 
     def _make_liveness(self, silent: float) -> Liveness:
-        async def withdrawn(incarnation: Incarnation, registrations: list[Registration]) -> None:
-            await withdraw_lost(self.master, incarnation, registrations)
-
         liveness = Liveness(
             self.registry,
             self.graph,
             LivenessSettings(silent=silent),
             Limits(),
-            withdraw=withdrawn,
+            withdraw=self.registrar.withdraw_lost,
             put_back=self.reconciler.put_back,
             returned=self.revocation.returned,
             standing=lambda _host: Standing.REGISTERED,

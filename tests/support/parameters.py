@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from appliance.master.calls.parameter_charges import ParameterCharges, measure
-from appliance.master.calls.parameters import ParameterMirror
+from appliance.master.parameter_charges import ParameterCharges, measure
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.xmlrpc import Value

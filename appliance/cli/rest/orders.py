@@ -97,12 +97,10 @@ def _replaced(body: dict[str, Any]) -> dict[str, Any]:
 
 
 def _registrations(graph: dict[str, Any]) -> list[dict[str, str]]:
-    calls = {
-        "publishes": "registerPublisher", "subscribes": "registerSubscriber", "offers": "registerService",
-    }  # fmt: skip
+    words = {"publishes": "publish", "subscribes": "subscribe", "offers": "offer"}
     return [
-        {"host": node["host"], "caller_id": node["name"], "call": call, "resource": resource}
+        {"host": node["host"], "caller_id": node["name"], "category": category, "resource": resource}
         for node in graph["nodes"]
-        for field, call in calls.items()
+        for field, category in words.items()
         for resource in node[field]
     ]

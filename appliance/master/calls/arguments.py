@@ -4,29 +4,31 @@ A name becomes what ROSMaster would resolve it to; a URI is parsed; anything els
 the parameter, as ROSMaster's own validators would.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
+from appliance.master.caller import ApiUri
 from appliance.ros import names
 from appliance.ros.errors import InvalidNameError, PeerError, ProtocolError
-from appliance.ros.uris import NodeUri, parse_node_uri, parse_service_uri
+from appliance.ros.uris import parse_node_uri, parse_service_uri
 from appliance.ros.xmlrpc import Value
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
-    """One parameter of a call: its name in the ROS documentation, and how its value is made canonical."""
+class Parameter(Generic[T]):
+    """One parameter of a call: its name in the ROS documentation, and how its value is made a canonical one.
+
+    `resource`: it names the topic, service or ROS parameter that a call with it is about. `recorded`: the record of a
+    command has it; it is a resolved name, short, and what a reviewer asks for.
+    """
 
     name: str
-    canonicalise: "Callable[[Value, str], object]"
-
-
-@dataclass(frozen=True, slots=True)
-class ApiUri:
-    """A node's or service's URI as it was given and as it was parsed."""
-
-    text: str
-    uri: NodeUri
+    canonicalise: Callable[[Value, str], T]
+    resource: bool = False
+    recorded: bool = False
 
 
 def _text(value: Value, _caller_id: str) -> str:
@@ -108,15 +110,15 @@ def _protocols(value: Value, _caller_id: str) -> list[list[Value]]:
     return protocols
 
 
-TOPIC = Parameter("topic", _name)
+TOPIC = Parameter("topic", _name, resource=True)
 TOPIC_TYPE = Parameter("topic_type", _type)
-SERVICE = Parameter("service", _name)
-NODE = Parameter("node", _name)
+SERVICE = Parameter("service", _name, resource=True)
+NODE = Parameter("node", _name, recorded=True)
 CALLER_API = Parameter("caller_api", _node_api)
 SERVICE_API = Parameter("service_api", _service_api)
-SUBGRAPH = Parameter("subgraph", _subgraph)
-KEY = Parameter("key", _key)
-SEARCH_KEY = Parameter("key", _search_key)
+SUBGRAPH = Parameter("subgraph", _subgraph, recorded=True)
+KEY = Parameter("key", _key, resource=True, recorded=True)
+SEARCH_KEY = Parameter("key", _search_key, recorded=True)
 VALUE = Parameter("value", _parameter_value)
 MESSAGE = Parameter("msg", _text)
 STATE = Parameter("state", _text)
@@ -126,7 +128,7 @@ METHOD = Parameter("method_name", _text)
 
 
 def canonicalise(
-    parameters: tuple[Parameter, ...], caller_id: str, values: tuple[Value, ...]
+    parameters: Sequence[Parameter[Any]], caller_id: str, values: Sequence[Value]
 ) -> tuple[object, ...]:
     """The canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
     check_arity(parameters, values)
@@ -139,7 +141,7 @@ def canonicalise(
     return tuple(canonical)
 
 
-def check_arity(parameters: tuple[Parameter, ...], values: tuple[Value, ...]) -> None:
+def check_arity(parameters: Sequence[Parameter[Any]], values: Sequence[Value]) -> None:
     """Raise `ProtocolError`, with ROSMaster's words, unless there are as many values as the call takes."""
     if len(values) != len(parameters):
         raise ProtocolError("Error: bad call arity")

@@ -1,37 +1,29 @@
-"""The nouns of RVMaster: a row of the table of calls, who calls, and the answer.
+"""The nouns of RVMaster: a row of a table of calls, and one attempt to make such a call.
 
-`calls.py` has the Master API's rows, `node_calls.py` those of the outer face.
+`table.py` has the Master API's rows, `node_calls.py` those of the outer face. A row names a method of the part that
+carries the call out; mypy holds the method's parameters against the row's.
 """
 
 import enum
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
-from appliance.master.calls.arguments import Parameter
-from appliance.master.graph.registry import Incarnation, Kind
-from appliance.policy.model import Category, Decision, told_of
-from appliance.policy.rights import category_of, touch_of
-from appliance.recorder import Asker
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.arguments import Parameter, canonicalise, check_arity
+from appliance.master.graph.registry import Kind
+from appliance.policy.model import Category, Decision, Request, told_of
+from appliance.policy.rights import category_of, request_of, touch_of
+from appliance.ros.errors import ProtocolError
+from appliance.ros.names import check_caller_id, check_tool_id
 from appliance.ros.xmlrpc import Value
-from appliance.rpc.server import Peer
 
-if TYPE_CHECKING:
-    from appliance.master.core import Master
+_CLAIM_SHOWN = 1024  # characters of a caller_id that is no name
 
-Answer = list[Value]
-"""What a call returns: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
-
-Perform = Callable[["Master", "Caller", tuple[object, ...]], Awaitable[Value]]
-
-
-def denial_text(decision: Decision, record: str, tell: str) -> str:
-    """What a denied caller is told: as much of the reason as the policy lets be told, and the record's id."""
-    return f"{told_of(decision, tell)} [{record}]"
-
-
-class LimitReachedError(Exception):
-    """A call would take more than there is for all hosts; the text says what of."""
+S = TypeVar("S")
+A = TypeVar("A")
+B = TypeVar("B")
+C = TypeVar("C")
 
 
 class Identity(enum.Enum):
@@ -42,52 +34,80 @@ class Identity(enum.Enum):
     NOBODY = "nobody"  # the call has no caller_id
 
 
-@dataclass(frozen=True, slots=True)
-class Caller:
-    """Who makes a call: the peer, and the `caller_id` he claims.
+class Verb(enum.Enum):
+    """What a call does with what it is about."""
 
-    `own` marks the appliance's own nodes, which reach RVMaster on a listener of their own. `target` is set on an
-    outer face: the incarnation that the call is for.
-    """
-
-    peer: Peer
-    caller_id: str
-    arrived: int
-    own: bool = False
-    target: Incarnation | None = None
-
-    @property
-    def asker(self) -> Asker:
-        """The caller as the audit log has him."""
-        return Asker(
-            self.peer.text, self.caller_id, self.arrived, None if self.target is None else self.target.name
-        )
+    REGISTER = "register"  # a node has it from then on
+    UNREGISTER = "unregister"  # a node gives it up
+    CONNECT = "connect"  # the caller learns where to connect, and may from then on
+    READ = "read"  # nothing changes: an empty caller_id will do, and repetitions are counted in the audit log
+    WRITE = "write"  # a ROS parameter, which has the value that the call brings, or is gone if it brings none
+    DO = "do"  # anything else
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class Method(Generic[S]):
+    """A method of `S` that carries a call out, and the parameters of the call that follow the caller_id."""
+
+    perform: Callable[..., Awaitable[Value]]
+    parameters: tuple[Parameter[Any], ...]
+
+
+@overload
+def method(perform: Callable[[S, Caller], Awaitable[Value]], /) -> Method[S]: ...
+@overload
+def method(perform: Callable[[S, Caller, A], Awaitable[Value]], a: Parameter[A], /) -> Method[S]: ...
+@overload
+def method(
+    perform: Callable[[S, Caller, A, B], Awaitable[Value]], a: Parameter[A], b: Parameter[B], /
+) -> Method[S]: ...
+@overload
+def method(
+    perform: Callable[[S, Caller, A, B, C], Awaitable[Value]],
+    a: Parameter[A],
+    b: Parameter[B],
+    c: Parameter[C],
+    /,
+) -> Method[S]: ...
+def method(perform: Callable[..., Awaitable[Value]], /, *parameters: Parameter[Any]) -> Method[Any]:
+    """The method, and which parameter of the call each of its own is."""
+    return Method(perform, parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class Call(Generic[S]):
     """One row of a table of calls.
 
-    parameters  what follows the caller_id
+    method      what carries it out, and its parameters; the first line of its docstring is `system.methodHelp`
+    verb        what it does, with a thing of this
+    kind        (None: it is about no single topic, service or ROS parameter)
     denial      the value of a denied answer: of the type the call returns, so that no client library stumbles over it
-    identity    what is checked of the caller_id; `reads`: the call only reads, an empty one will do
-    resource    which parameter it is about: a topic, a service, or a ROS parameter's key
+    identity    what is checked of the caller_id
     command     the name that the policy knows it by, where that is another (`policy/rights` says what it needs)
-    api         which parameter is the node's API URI
-    registers   what a node has from then on; `gives_up`: what it has no more
+    tells       the answer is the value of the ROS parameter, which may be a large tree
+    small       parameters and answer are a few names: calls of the same moment travel to ROSMaster as one
+    in_run      in a multicall it is decided, recorded and carried out together with its neighbours that are, too
     """
 
     name: str
-    perform: Perform
-    parameters: tuple[Parameter, ...] = ()
+    method: Method[S]
+    verb: Verb
+    kind: Kind | None = None
     denial: Value = 0
     identity: Identity = Identity.FREE
-    resource: int | None = None
     command: str | None = None
-    api: int | None = None
-    registers: Kind | None = None
-    gives_up: Kind | None = None
-    reads: bool = False
+    tells: bool = False
+    small: bool = False
+    in_run: bool = False
+    resource: int | None = field(init=False)  # which parameter names what it is about
+    api: int | None = field(init=False)  # which is the caller's own URI
+
+    def __post_init__(self) -> None:
+        parameters = self.method.parameters
+        places = [place for place, one in enumerate(parameters) if one.resource]
+        own = [place for place, one in enumerate(parameters) if one.name == "caller_api"]
+        object.__setattr__(self, "resource", places[0] if places else None)
+        object.__setattr__(self, "api", own[0] if own else None)
 
     @property
     def category(self) -> Category:
@@ -103,3 +123,87 @@ class Call:
     def policy_name(self) -> str:
         """The name that the policy knows it by."""
         return self.command or self.name
+
+    def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
+        """The call with canonical arguments, and the caller with the name that it claims. Raises `PeerError`."""
+        if self.identity is Identity.NOBODY:
+            return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
+        if not params:
+            raise ProtocolError("missing required caller_id parameter")
+        check_arity(self.method.parameters, params[1:])
+        caller_id = params[0]
+        if not isinstance(caller_id, str):
+            raise ProtocolError("caller_id must be a string")
+        if self.identity is Identity.NODE:
+            check_caller_id(caller_id)
+        elif caller_id or self.verb not in {Verb.READ, Verb.CONNECT}:
+            check_tool_id(caller_id)
+        arguments = canonicalise(self.method.parameters, caller_id, params[1:])
+        return Attempt(replace(caller, caller_id=caller_id), self, arguments)
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A call that was understood: who makes it, its row, and its arguments, canonical and as the row has them."""
+
+    caller: Caller
+    call: Call[Any]
+    arguments: tuple[object, ...]
+
+    @property
+    def resource(self) -> str:
+        """The topic, service or ROS parameter that it is about; empty when it is about none."""
+        return "" if self.call.resource is None else str(self.arguments[self.call.resource])
+
+    @property
+    def request(self) -> Request:
+        """What it is decided and recorded as."""
+        return request_of(self.call.policy_name, self.caller.peer.host, self.caller.caller_id, self.resource)
+
+    @property
+    def api(self) -> ApiUri | None:
+        """The URI that the caller gives for itself."""
+        return None if self.call.api is None else cast(ApiUri, self.arguments[self.call.api])
+
+    @property
+    def value(self) -> Value:
+        """The value that a call which writes a ROS parameter brings; None for one that takes it away."""
+        brings = self.call.verb is Verb.WRITE and len(self.arguments) > 1
+        return cast(Value, self.arguments[1]) if brings else None
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What a command is about (a parameter's key, a node's name), for the record: its resource is the command."""
+        if self.call.category is not Category.COMMAND:
+            return {}
+        return {
+            parameter.name: str(value)
+            for parameter, value in zip(self.call.method.parameters, self.arguments, strict=True)
+            if parameter.recorded
+        }
+
+
+class Served(NamedTuple):
+    """A row that is served, and the part whose method carries it out."""
+
+    call: Call[Any]
+    part: Any
+
+
+Table = Mapping[str, Served]
+"""What a listener serves, by the call's name."""
+
+
+def served(calls: Iterable[Call[S]], part: S) -> dict[str, Served]:
+    """These calls, carried out by this part."""
+    return {call.name: Served(call, part) for call in calls}
+
+
+def denial_text(decision: Decision, record: str, tell: str) -> str:
+    """What a denied caller is told: as much of the reason as the policy lets be told, and the record's id."""
+    return f"{told_of(decision, tell)} [{record}]"
+
+
+def claimed_name(params: Sequence[Value]) -> str:
+    """Whom a call that is not understood says it is from, for the record."""
+    return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

@@ -5,22 +5,20 @@ nothing. A question that only the network can answer (is the node that holds thi
 `Contest`, and asked again with the answer.
 """
 
-import enum
 import ipaddress
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Call, Caller, Identity
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.call import Attempt, Identity, Verb
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.presence import Presence, Probe
 from appliance.master.reach.own_node import OWN, ROSOUT
 from appliance.policy import Policy
-from appliance.policy.model import Address, Category, Decision, Request
-from appliance.policy.rights import decide, request_of, rights_of_call
+from appliance.policy.model import Address, Category, Decision
+from appliance.policy.rights import decide, rights_of_call
 from appliance.ros.parameter_tree import Tree
-from appliance.ros.xmlrpc import Value
 from appliance.shares.table import NAMES
 
 _TIMES_THE_REST = 3
@@ -32,23 +30,6 @@ class Contest:
 
     holder: Incarnation
     decision: Decision
-
-
-class Presence(enum.Enum):
-    """What came of an attempt to call a node."""
-
-    GONE = "gone"  # it refuses connections, or cannot be reached
-    SILENT = "silent"  # it takes connections and does not answer
-    ANSWERS = "answers"
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """The answer to a contest's question; `patience` is seconds until a silent node is unregistered."""
-
-    holder: Incarnation
-    presence: Presence
-    patience: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,46 +49,30 @@ class Gate:
         self._registry = registry
         self._limits = limits
 
-    def asked(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Request:
-        """What a call is decided and recorded as."""
-        resource = "" if call.resource is None else str(arguments[call.resource])
-        return request_of(call.policy_name, caller.peer.host, caller.caller_id, resource)
-
-    def decide(
-        self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree
-    ) -> Decision | Contest:
-        """Whether `caller` may make this call with these canonical arguments, while `tree` are the parameters."""
+    def decide(self, attempt: Attempt, tree: Tree) -> Decision | Contest:
+        """Whether the caller may make this call, while `tree` are the parameters."""
+        caller, call = attempt.caller, attempt.call
         if caller.own:
-            return ROSOUT.decide(caller.caller_id, call, arguments)
-        if self._asks_for_its_topic(caller, call, arguments):
+            return _of_own_node(attempt)
+        asks = caller.target is not None and call.category is Category.SUBSCRIBE
+        if asks and self.is_own_subscriber(caller, attempt.resource):
             return Decision(True, None, OWN)
-        decision = self._by_policy(caller, call, arguments, tree)
-        if not decision.allowed:
-            return decision
-        if call.identity is Identity.NOBODY or not caller.caller_id:
-            return decision
-        denial = (
-            self._late(caller, call, arguments)
-            or self._unreachable(caller, call, arguments)
-            or self._over_limit(caller, call, arguments)
+        rights = rights_of_call(
+            attempt.request, call.policy_name, attempt.resource or None, value=attempt.value, tree=tree
         )
-        if denial is not None:
-            return denial
-        return self._bound(caller, call, decision)
-
-    def _by_policy(self, caller: Caller, call: Call, arguments: tuple[object, ...], tree: Tree) -> Decision:
-        key = None if call.resource is None else str(arguments[call.resource])
-        value = cast(Value, arguments[1]) if call.touches is Category.WRITE and len(arguments) > 1 else None
-        request = self.asked(caller, call, arguments)
-        return decide(self._policy(), rights_of_call(request, call.policy_name, key, value=value, tree=tree))
+        decision = decide(self._policy(), rights)
+        if not decision.allowed or call.identity is Identity.NOBODY or not caller.caller_id:
+            return decision
+        denial = None
+        if attempt.api is not None:
+            denial = self._late(caller, attempt.api)
+            if denial is None and call.verb is not Verb.UNREGISTER:
+                denial = _unreachable(caller, attempt.api) or self._over_limit(caller, attempt.api)
+        return denial or self._bound(attempt, decision)
 
     # --- the binding of claims ---
 
-    def _late(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
-        if call.api is None:
-            return None
-        api = arguments[call.api]
-        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
+    def _late(self, caller: Caller, api: ApiUri) -> Decision | None:
         known = self._registry.find(caller.caller_id, caller.peer.host, api.text)
         if known is not None and known.life is Life.REPLACED:
             return _no(
@@ -115,20 +80,8 @@ class Gate:
             )
         return None
 
-    def _unreachable(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
-        """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
-        if call.api is None or call.gives_up is not None or caller.peer.host.is_loopback:
-            return None
-        api = arguments[call.api]
-        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
-        if not _is_loopback(api.uri.host):
-            return None
-        return _no(
-            f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): nobody else can "
-            f"call it; start it with ROS_IP={caller.peer.text}, or without ROS_IP and ROS_HOSTNAME"
-        )
-
-    def _bound(self, caller: Caller, call: Call, decision: Decision) -> Decision | Contest:
+    def _bound(self, attempt: Attempt, decision: Decision) -> Decision | Contest:
+        caller, call = attempt.caller, attempt.call
         holder = self._registry.holder(caller.caller_id)
         if holder is None:
             return decision
@@ -136,16 +89,12 @@ class Gate:
             return _no(f"the name {holder.name} belongs to the appliance")
         if holder.host == caller.peer.host:
             return decision
-        if call.registers not in {None, Kind.PARAMETER}:
+        if call.verb is Verb.REGISTER and call.kind is not Kind.PARAMETER:
             if self._policy().takeover == "granted":
                 return decision
             return Contest(holder, decision)
         held, other = f"{caller.caller_id} is held by", f"{caller.peer.host} cannot speak for it"
         return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
-
-    def _asks_for_its_topic(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> bool:
-        asks = caller.target is not None and call.category is Category.SUBSCRIBE
-        return asks and self.is_own_subscriber(caller, str(arguments[0]))
 
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
         """Whether a node of the appliance calls another node, at its outer face, for a topic that it subscribed to.
@@ -157,17 +106,13 @@ class Gate:
 
     # --- limits ---
 
-    def _over_limit(self, caller: Caller, call: Call, arguments: tuple[object, ...]) -> Decision | None:
-        if call.api is None or call.gives_up is not None:
-            return None
+    def _over_limit(self, caller: Caller, api: ApiUri) -> Decision | None:
         host = caller.peer.host
         if self._registry.registrations_of(host) >= self._limits.registrations:
             return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
         denial = self._too_many_names(host)
         if denial is not None:
             return denial
-        api = arguments[call.api]
-        assert isinstance(api, ApiUri)  # noqa: S101 - the row says so; narrows the type for mypy
         if self._is_one_too_many(caller, api) and self._registry.spare_of(host) is None:
             return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
         return None
@@ -202,6 +147,33 @@ class Gate:
             self._registry.nodes_of(host) >= self._limits.nodes
             and self._registry.find(caller.caller_id, host, api.text) is None
         )
+
+
+def _of_own_node(attempt: Attempt) -> Decision:
+    """The appliance's own node has the rights that are written at it, whatever the policy says."""
+    caller_id, call = attempt.caller.caller_id, attempt.call
+    known = False
+    if caller_id != ROSOUT.name:
+        what = f"speak as {caller_id[:80] or 'nobody'}"
+    elif call.verb in {Verb.REGISTER, Verb.UNREGISTER} and call.kind is not None:
+        known = ROSOUT.may_have(call.kind, attempt.resource)
+        what = f"have the {call.kind} {attempt.resource}"
+    elif call.verb is Verb.READ and attempt.resource:
+        known = attempt.resource in ROSOUT.parameters
+        what = f"read the parameter {attempt.resource}"
+    else:
+        what = f"call {call.name}"
+    return Decision(known, None, OWN if known else f"{ROSOUT.name} is {OWN} and may not {what}")
+
+
+def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
+    """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
+    if caller.peer.host.is_loopback or not _is_loopback(api.uri.host):
+        return None
+    return _no(
+        f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): nobody else can "
+        f"call it; start it with ROS_IP={caller.peer.text}, or without ROS_IP and ROS_HOSTNAME"
+    )
 
 
 def contested(contest: Contest, probe: Probe | None) -> Decision:

@@ -6,19 +6,20 @@ there.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from appliance.master.calls.call import Call
-from appliance.master.calls.pipeline import canonical_call, claimed_name, what_about
+from appliance.master.caller import Caller
+from appliance.master.calls.call import Call, claimed_name
+from appliance.master.calls.multicall import MULTICALL
+from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.reach.node_calls import NODE_CALLS
 from appliance.policy.model import Category
 from appliance.ros.errors import PeerError
 from appliance.ros.xmlrpc import Limits, Value, parse_call
 from appliance.rpc.method_name import method_named
+from appliance.rpc.server import Peer
 
-MULTICALL = "system.multicall"
-_CALLS: Mapping[str, Call] = {**NODE_CALLS, **MASTER_CALLS}
+_CALLS: Mapping[str, Call[Any]] = {**NODE_CALLS, **MASTER_CALLS}
 _LIMITS = Limits(body=8192, elements=256, depth=16, string=4096, parts=64)
 _UNKNOWN = "unknown"
 _LONGEST = 200
@@ -34,8 +35,8 @@ class Asked(NamedTuple):
     about: dict[str, str]
 
 
-def asked_for(beginning: bytes) -> Asked:
-    """What the request with this beginning of a body asks for; an empty resource where nothing can be told."""
+def asked_for(peer: Peer, beginning: bytes) -> Asked:
+    """What a peer's request with this beginning of a body asks for; an empty resource where nothing can be told."""
     try:
         call = parse_call(beginning, _LIMITS)
     except PeerError:
@@ -45,13 +46,12 @@ def asked_for(beginning: bytes) -> Asked:
         about = {"parts": _parts(call.params)} if call.method == MULTICALL else {}
         return _only_named(call.method, None, about)
     try:
-        caller_id, arguments = canonical_call(row, call.params)
+        attempt = row.attempt(Caller(peer, "", 0), call.params)
     except PeerError:
         return _only_named(call.method, claimed_name(call.params))
-    about = {"call": row.name, **what_about(row, arguments)}
-    if row.category is Category.COMMAND or row.resource is None:
-        return Asked(Category.COMMAND, row.policy_name, caller_id, about)
-    return Asked(row.category, str(arguments[row.resource])[:_LONGEST], caller_id, about)
+    request = attempt.request
+    about = {"call": row.name, **attempt.about}
+    return Asked(request.category, request.resource[:_LONGEST], request.caller_id, about)
 
 
 def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None = None) -> Asked:

@@ -6,37 +6,57 @@ global key is decided before it is looked for, and of a search upwards only thos
 is told when nothing is found depends on the policy alone.
 """
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
-from appliance.master.calls.call import Answer, Caller, denial_text
-from appliance.policy.model import Category, Decision, Request
+from appliance.master.caller import Answer, Caller
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.master.rosmaster import RosMaster
+from appliance.policy.model import Decision
 from appliance.ros.names import resolve_parameter
 from appliance.ros.parameter_tree import standing_at
 
-if TYPE_CHECKING:
-    from appliance.master.core import Master
+_CALL = "searchParam"
 
 
-async def search_param(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
-    key = str(arguments[0])
-    if caller.own or not caller.caller_id or not master.policy().has_section(Category.READ):
-        return await master.rosmaster.call("searchParam", caller.caller_id, key)
-    places = {name: _decide(master, caller, name) for name in _places(key, caller.caller_id)}
-    hidden = [name for name, decision in places.items() if not decision.allowed]
-    if key.startswith("/") and hidden:
-        return [0, _recorded(master, caller, hidden[0], places[hidden[0]]), ""]
-    answer = await master.rosmaster.call("searchParam", caller.caller_id, key)
-    found = _found(answer)
-    if found in hidden:
-        found = _next_readable(master, key, places, found)
-        answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
-    if found is not None and places[found].would_deny:
-        _recorded(master, caller, found, places[found])
-    if answer[0] != 1 and hidden:
-        why = _recorded(master, caller, hidden[0], places[hidden[0]])
-        return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
-    return answer
+@dataclass(frozen=True, slots=True)
+class ParameterSearch:
+    """Finds parameters."""
+
+    rosmaster: RosMaster
+    mirror: ParameterMirror
+    rights: ParameterRights
+
+    async def search_param(self, caller: Caller, key: str) -> Answer:
+        """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
+        if caller.own or not caller.caller_id:
+            return await self.rosmaster.call(_CALL, caller.caller_id, key)
+        places = {name: self.rights.to_find(caller, name) for name in _places(key, caller.caller_id)}
+        hidden = [name for name, decision in places.items() if not decision.allowed]
+        if key.startswith("/") and hidden:
+            return [0, self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]]), ""]
+        answer = await self.rosmaster.call(_CALL, caller.caller_id, key)
+        found = _found(answer)
+        if found in hidden:
+            found = self._next_readable(key, places, found)
+            answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
+        if found is not None and places[found].would_deny:
+            self.rights.recorded(caller, _CALL, found, places[found])
+        if answer[0] != 1 and hidden:
+            why = self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]])
+            return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
+        return answer
+
+    def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
+        """The name that would have been found if nothing were at those that may not be read."""
+        levels = len([part for part in key.split("/") if part])
+        names = list(places)
+        for name in names[names.index(hidden) + 1 :]:
+            # It is enough that the key's first part is there.
+            first = "/".join(name.split("/")[: -levels + 1 or None])
+            if places[name].allowed and standing_at(self.mirror.tree, first)[0] is not None:
+                return name
+        return None
 
 
 def _places(key: str, caller_id: str) -> list[str]:
@@ -52,24 +72,3 @@ def _found(answer: Answer) -> str | None:
     if answer[0] != 1 or not isinstance(answer[2], str):
         return None
     return "/" + "/".join(part for part in answer[2].split("/") if part)
-
-
-def _next_readable(master: "Master", key: str, places: dict[str, Decision], hidden: str) -> str | None:
-    """The name that would have been found if nothing were at those that may not be read."""
-    levels = len([part for part in key.split("/") if part])
-    names = list(places)
-    for name in names[names.index(hidden) + 1 :]:
-        # It is enough that the key's first part is there.
-        first = "/".join(name.split("/")[: -levels + 1 or None])
-        if places[name].allowed and standing_at(master.parameters.tree, first)[0] is not None:
-            return name
-    return None
-
-
-def _decide(master: "Master", caller: Caller, name: str) -> Decision:
-    return master.policy().decide(Request(caller.peer.host, caller.caller_id, Category.READ, name))
-
-
-def _recorded(master: "Master", caller: Caller, name: str, decision: Decision) -> str:
-    record = master.recorder.decided(caller.asker, "searchParam", Category.READ.value, name, decision)
-    return denial_text(decision, record, master.policy().tell)

@@ -1,189 +1,182 @@
-"""The calls that make a node part of the graph, or take it out: topics and services.
+"""The calls that make a node part of the graph, or take it out: topics, services, and parameters it is told of.
 
 A registration outlasts control before its node is told of it (the store writes ahead): a ROS 1 node never registers
 twice, and ROSMaster, which knows the rest, can die in the same moment as control.
 """
 
 import contextlib
-from collections.abc import AsyncIterator, Iterable
-from typing import TYPE_CHECKING, cast
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Answer, Call, Caller
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
-from appliance.ros.uris import service_uri
-
-if TYPE_CHECKING:
-    from appliance.master.core import Master
-
-
-async def register_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
-    topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    async with registering(master, caller, api) as incarnation:
-        inner = master.faces.inner_uri(incarnation)
-        answer = await master.rosmaster.call("registerPublisher", caller.caller_id, topic, topic_type, inner)
-        if answer[0] == 1:
-            master.graph.registered(incarnation, Kind.PUBLICATION, topic, topic_type)
-            hidden = master.mediation.hides_publishers(topic)
-            answer[2] = list(master.registry.uris_for(incarnation, Kind.SUBSCRIPTION, topic, hidden=hidden))
-        return answer
+from appliance.master.caller import Answer, ApiUri, Caller
+from appliance.master.calls.call import Attempt
+from appliance.master.calls.gate import Gate
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registrar import NO_SERVICE, stand_in
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.faces import Faces
+from appliance.master.reach.mediation import Mediation
+from appliance.master.reach.relays import RelayControl
+from appliance.master.rosmaster import RosMaster
 
 
-async def register_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
-    topic, topic_type, api = str(arguments[0]), str(arguments[1]), cast(ApiUri, arguments[2])
-    async with registering(master, caller, api) as incarnation:
-        inner = master.faces.inner_uri(incarnation)
-        answer = await master.rosmaster.call("registerSubscriber", caller.caller_id, topic, topic_type, inner)
-        if answer[0] == 1:
-            master.graph.registered(incarnation, Kind.SUBSCRIPTION, topic, topic_type)
-            answer[2] = list(master.graph.list_for(incarnation, topic))
-        return answer
+@dataclass(frozen=True, slots=True)
+class RegistrationCalls:
+    """Registers at ROSMaster under the node's inner URI; registry, relay and other nodes follow what it took."""
 
+    rosmaster: RosMaster
+    registry: Registry
+    graph: Graph
+    faces: Faces
+    relay: RelayControl
+    mediation: Mediation
+    gate: Gate
+    rights: ParameterRights
 
-async def register_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`registerService(caller_id, service, service_api, caller_api)`."""
-    service, service_api, api = str(arguments[0]), cast(ApiUri, arguments[1]), cast(ApiUri, arguments[2])
-    async with registering(master, caller, api) as incarnation:
-        inner = master.faces.inner_uri(incarnation)
-        answer = await master.rosmaster.call(
-            "registerService", caller.caller_id, service, stand_in(incarnation), inner
-        )
-        if answer[0] == 1:
-            master.graph.registered(incarnation, Kind.SERVICE, service, str(service_api.uri.port))
-        return answer
-
-
-async def unregister_publisher(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`unregisterPublisher(caller_id, topic, caller_api)`."""
-    return await _unregister(master, caller, "unregisterPublisher", Kind.PUBLICATION, arguments)
-
-
-async def unregister_subscriber(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`unregisterSubscriber(caller_id, topic, caller_api)`."""
-    return await _unregister(master, caller, "unregisterSubscriber", Kind.SUBSCRIPTION, arguments)
-
-
-async def unregister_service(master: "Master", caller: Caller, arguments: tuple[object, ...]) -> Answer:
-    """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
-    service, service_api = str(arguments[0]), cast(ApiUri, arguments[1])
-    port = service_api.uri.port
-    provider = next(
-        (
-            one
-            for one in master.registry.registered(Kind.SERVICE, service)
-            if one.name == caller.caller_id
-            # By its own port, or as `rosnode cleanup` does, by the one that lookupService told.
-            and (
-                one.registrations[Kind.SERVICE, service].detail == str(port)
-                or master.relay.port(one, Kind.SERVICE, service) == port
+    async def register_publisher(
+        self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
+    ) -> Answer:
+        """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
+        async with self._registering(caller, caller_api) as node:
+            inner = self.faces.inner_uri(node)
+            answer = await self.rosmaster.call(
+                "registerPublisher", caller.caller_id, topic, topic_type, inner
             )
-        ),
-        None,
-    )
-    uri = stand_in(provider) if provider is not None else NO_SERVICE
-    answer = await master.rosmaster.call("unregisterService", caller.caller_id, service, uri)
-    _speak_as_asked(answer, uri, service_api)
-    if answer[0] == 1 and provider is not None:
-        master.graph.unregistered(provider, Kind.SERVICE, service)
-    return answer
+            if answer[0] == 1:
+                self.graph.registered(node, Kind.PUBLICATION, topic, topic_type)
+                hidden = self.mediation.hides_publishers(topic)
+                answer[2] = list(self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden))
+            return answer
+
+    async def register_subscriber(
+        self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
+    ) -> Answer:
+        """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
+        async with self._registering(caller, caller_api) as node:
+            inner = self.faces.inner_uri(node)
+            answer = await self.rosmaster.call(
+                "registerSubscriber", caller.caller_id, topic, topic_type, inner
+            )
+            if answer[0] == 1:
+                self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type)
+                answer[2] = list(self.graph.list_for(node, topic))
+            return answer
+
+    async def register_service(
+        self, caller: Caller, service: str, service_api: ApiUri, caller_api: ApiUri
+    ) -> Answer:
+        """`registerService(caller_id, service, service_api, caller_api)`."""
+        async with self._registering(caller, caller_api) as node:
+            inner = self.faces.inner_uri(node)
+            answer = await self.rosmaster.call(
+                "registerService", caller.caller_id, service, stand_in(node), inner
+            )
+            if answer[0] == 1:
+                self.graph.registered(node, Kind.SERVICE, service, str(service_api.uri.port))
+            return answer
+
+    async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
+        """`subscribeParam(caller_id, caller_api, key)`."""
+        async with self._registering(caller, caller_api) as node:
+            told = (caller.caller_id, self.faces.inner_uri(node), key)
+            answer = await self.rosmaster.call("subscribeParam", *told)
+            hidden = self.rights.hidden(caller, "subscribeParam", key, answer)
+            if hidden is not None:
+                await self.rosmaster.call("unsubscribeParam", *told)
+                return [0, hidden, 0]
+            if answer[0] == 1:
+                self.graph.registered(node, Kind.PARAMETER, key, "")
+            return answer
+
+    async def unregister_publisher(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
+        """`unregisterPublisher(caller_id, topic, caller_api)`."""
+        return await self._unregister(caller, Kind.PUBLICATION, topic, caller_api)
+
+    async def unregister_subscriber(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
+        """`unregisterSubscriber(caller_id, topic, caller_api)`."""
+        return await self._unregister(caller, Kind.SUBSCRIPTION, topic, caller_api)
+
+    async def unregister_service(self, caller: Caller, service: str, service_api: ApiUri) -> Answer:
+        """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
+        port = service_api.uri.port
+        provider = next(
+            (
+                one
+                for one in self.registry.registered(Kind.SERVICE, service)
+                if one.name == caller.caller_id
+                # By its own port, or as `rosnode cleanup` does, by the one that lookupService told.
+                and (
+                    one.registrations[Kind.SERVICE, service].detail == str(port)
+                    or self.relay.port(one, Kind.SERVICE, service) == port
+                )
+            ),
+            None,
+        )
+        uri = stand_in(provider) if provider is not None else NO_SERVICE
+        answer = await self.rosmaster.call("unregisterService", caller.caller_id, service, uri)
+        _speak_as_asked(answer, uri, service_api)
+        if answer[0] == 1 and provider is not None:
+            self.graph.unregistered(provider, Kind.SERVICE, service)
+        return answer
+
+    async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
+        """`unsubscribeParam(caller_id, caller_api, key)`."""
+        node = self.faces.known(caller, caller_api)
+        inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
+        answer = await self.rosmaster.call("unsubscribeParam", caller.caller_id, inner, key)
+        if answer[0] == 1 and node is not None:
+            self.graph.unregistered(node, Kind.PARAMETER, key)
+        return answer
+
+    async def _unregister(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
+        node = self.faces.known(caller, caller_api) or self._told_as(caller, caller_api)
+        inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
+        method = "unregisterPublisher" if kind is Kind.PUBLICATION else "unregisterSubscriber"
+        answer = await self.rosmaster.call(method, caller.caller_id, topic, inner)
+        _speak_as_asked(answer, inner, caller_api)
+        if answer[0] == 1 and node is not None:
+            self.graph.unregistered(node, kind, topic)
+        return answer
+
+    def _told_as(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """The node that the caller speaks for by the URI that lookupNode told, as `rosnode cleanup` on its host."""
+        holder = self.registry.holder(caller.caller_id)
+        meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
+        return holder if meant else None
+
+    @contextlib.asynccontextmanager
+    async def _registering(self, caller: Caller, api: ApiUri) -> AsyncIterator[Incarnation]:
+        """The incarnation that registers, which makes room for nobody meanwhile.
+
+        A new one takes the room of one of its host's that has nothing or is gone.
+        """
+        spare = self.gate.to_make_room(caller, api)
+        if spare is not None:
+            self.graph.forgotten(spare)
+        incarnation = await self.faces.incarnation_for(caller, api)
+        while self.registry.by_key(incarnation.key) is not incarnation:  # it made room before this went on
+            incarnation = await self.faces.incarnation_for(caller, api)
+        incarnation.calls += 1
+        try:
+            yield incarnation
+        finally:
+            incarnation.calls -= 1
 
 
-def given_up(master: "Master", caller: Caller, call: Call, arguments: tuple[object, ...]) -> None:
+def given_up(registry: Registry, denied: Attempt) -> None:
     """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
-    kind = call.gives_up
-    if kind is None or call.resource is None:
-        return
-    resource = str(arguments[call.resource])
-    asked = next(one for one in arguments if isinstance(one, ApiUri))
-    for one in master.registry.all():
-        shelved = one.shelf.get((kind, resource))
+    kind, caller = denied.call.kind, denied.caller
+    asked = next(one for one in denied.arguments if isinstance(one, ApiUri))
+    for one in registry.all():
+        shelved = None if kind is None else one.shelf.get((kind, denied.resource))
         if shelved is None or (one.name, one.host) != (caller.caller_id, caller.peer.host):
             continue
-        by_port = kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
+        by_port = shelved.kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
         if by_port or one.api_text == asked.text:
-            master.registry.unshelve(one, kind, resource)
-
-
-async def _unregister(
-    master: "Master", caller: Caller, method: str, kind: Kind, arguments: tuple[object, ...]
-) -> Answer:
-    resource, api = str(arguments[0]), cast(ApiUri, arguments[1])
-    incarnation = master.faces.known(caller, api) or _told_as(master, caller, api)
-    inner = master.faces.inner_uri(incarnation) if incarnation is not None else master.faces.nobody()
-    answer = await master.rosmaster.call(method, caller.caller_id, resource, inner)
-    _speak_as_asked(answer, inner, api)
-    if answer[0] == 1 and incarnation is not None:
-        master.graph.unregistered(incarnation, kind, resource)
-    return answer
-
-
-def _told_as(master: "Master", caller: Caller, api: ApiUri) -> Incarnation | None:
-    """The node that the caller speaks for by the URI that lookupNode told, as `rosnode cleanup` does on its host."""
-    holder = master.registry.holder(caller.caller_id)
-    meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
-    return holder if meant else None
-
-
-@contextlib.asynccontextmanager
-async def registering(master: "Master", caller: Caller, api: ApiUri) -> AsyncIterator[Incarnation]:
-    """The incarnation that registers, which makes room for nobody meanwhile.
-
-    A new one takes the room of one of its host's that has nothing or is gone.
-    """
-    spare = master.gate.to_make_room(caller, api)
-    if spare is not None:
-        master.graph.forgotten(spare)
-    incarnation = await master.faces.incarnation_for(caller, api)
-    while master.registry.by_key(incarnation.key) is not incarnation:  # it made room before this went on
-        incarnation = await master.faces.incarnation_for(caller, api)
-    incarnation.calls += 1
-    try:
-        yield incarnation
-    finally:
-        incarnation.calls -= 1
+            registry.unshelve(one, shelved.kind, shelved.resource)
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:
     """ROSMaster's words may repeat the URI it was told, which is nobody's business: the caller reads his own."""
     answer[1] = str(answer[1]).replace(told, asked.text)
-
-
-async def withdraw(master: "Master", incarnation: Incarnation, kind: Kind, resource: str) -> None:
-    """Unregister something at ROSMaster for a node that is gone or may not have it any more."""
-    inner = master.faces.inner_uri(incarnation)
-    match kind:
-        case Kind.PUBLICATION:
-            await master.rosmaster.call("unregisterPublisher", incarnation.name, resource, inner)
-        case Kind.SUBSCRIPTION:
-            await master.rosmaster.call("unregisterSubscriber", incarnation.name, resource, inner)
-        case Kind.SERVICE:
-            await master.rosmaster.call(
-                "unregisterService", incarnation.name, resource, stand_in(incarnation)
-            )
-        case Kind.PARAMETER:
-            await master.rosmaster.call("unsubscribeParam", incarnation.name, inner, resource)
-
-
-async def withdraw_lost(
-    master: "Master", incarnation: Incarnation, registrations: Iterable[Registration]
-) -> None:
-    """Unregister what a lost node had; what is left of it stays when it comes back meanwhile."""
-    for one in registrations:
-        if incarnation.life is Life.LIVE:
-            return
-        await withdraw(master, incarnation, one.kind, one.resource)
-
-
-def stand_in(incarnation: Incarnation) -> str:
-    """The service URI that ROSMaster has for every service of an incarnation; nobody is ever told it."""
-    return service_uri(incarnation.key, incarnation.relay_port)
-
-
-def key_of_stand_in(uri: str) -> str:
-    """The key of the incarnation behind a stand-in."""
-    return uri.removeprefix("rosrpc://").partition(":")[0]
-
-
-NO_SERVICE = "rosrpc://nobody:1"

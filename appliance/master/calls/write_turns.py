@@ -22,7 +22,7 @@ class WriteTurns:
 
     def alone(self, keys: Collection[str]) -> "WriteTurn":
         """To be the only one who writes these keys (canonical), what is above and what is below them: `async with`."""
-        return WriteTurn(self._turns, tuple({key if key == "/" else f"{key}/" for key in keys}))
+        return WriteTurn(self._turns, _ended(keys))
 
 
 class WriteTurn:
@@ -32,7 +32,6 @@ class WriteTurn:
 
     def __init__(self, turns: "dict[WriteTurn, None]", keys: tuple[str, ...]) -> None:
         self._turns = turns
-        # Each with a slash at its end: a key is above another if it is how the other begins.
         self._keys = keys
         self._done: asyncio.Event | None = None  # made for who waits for this one
 
@@ -63,6 +62,18 @@ class WriteTurn:
             self._done.set()
 
     def _touches(self, other: "WriteTurn") -> bool:
-        """Whether a key of one side is, or is above, one of the other side."""
-        mine, others = self._keys, other._keys
-        return any(one.startswith(others) for one in mine) or any(one.startswith(mine) for one in others)
+        return _meet(self._keys, other._keys)
+
+
+def touch(keys: Collection[str], others: Collection[str]) -> bool:
+    """Whether a key of one side is, or is above, one of the other side."""
+    return _meet(_ended(keys), _ended(others))
+
+
+def _ended(keys: Collection[str]) -> tuple[str, ...]:
+    """The keys with a slash at their end: one is above another if it is how the other begins."""
+    return tuple({key if key == "/" else f"{key}/" for key in keys})
+
+
+def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
+    return any(one.startswith(others) for one in mine) or any(one.startswith(mine) for one in others)

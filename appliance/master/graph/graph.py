@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Iterable
 
 from appliance.audit.record import Severity
-from appliance.master.calls.parameter_updates import settled, updates_of
 from appliance.master.graph.delivery import Delivery, NodeCall
+from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.reach.mediation import Mediation
 from appliance.master.reach.relays import RelayControl

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from appliance.master.calls.gate import Presence, Probe
 from appliance.master.graph.delivery import NodeCall
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.presence import Presence, Probe
 from appliance.master.reach.relays import RELAY_NAME
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Limits

@@ -7,22 +7,18 @@ it, so every call of a master is acknowledged there. The relay serves its messag
 import asyncio
 import ipaddress
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable
 
 import structlog
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Caller
-from appliance.master.calls.registration import register_publisher, withdraw
-from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind
+from appliance.master.caller import Answer, ApiUri, Caller
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registrar import Registrar
+from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.reach.places import NoPortError
 from appliance.ros.uris import node_uri, parse_node_uri
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
-
-if TYPE_CHECKING:
-    from appliance.master.core import Master
 
 _log = structlog.get_logger()
 _LOOPBACK = "127.0.0.1"
@@ -30,12 +26,26 @@ _AGAIN_SECONDS = 1.0
 
 
 class OwnPublisher:
-    """Registers what `wanted()` says (topic to type), and nothing else, under `name`."""
+    """Registers what `wanted()` says (topic to type), and nothing else, under `name`.
+
+    `register(caller, topic, type, api)` is `registerPublisher`.
+    """
 
     def __init__(
-        self, master: "Master", name: str, inner_port: int, wanted: Callable[[], dict[str, str]]
+        self,
+        registry: Registry,
+        graph: Graph,
+        registrar: Registrar,
+        *,
+        name: str,
+        inner_port: int,
+        wanted: Callable[[], dict[str, str]],
+        register: Callable[[Caller, str, str, ApiUri], Awaitable[Answer]],
     ) -> None:
-        self._master = master
+        self._registry = registry
+        self._graph = graph
+        self._registrar = registrar
+        self._register = register
         self._name = name
         self._uri = node_uri(_LOOPBACK, inner_port, PUBLISHER_PATH)
         self._wanted = wanted
@@ -64,15 +74,15 @@ class OwnPublisher:
         for incarnation in self._mine():
             for topic in incarnation.resources(Kind.PUBLICATION):
                 if incarnation.api_text != self._uri or topic not in wanted:
-                    await withdraw(self._master, incarnation, Kind.PUBLICATION, topic)
-                    self._master.graph.unregistered(incarnation, Kind.PUBLICATION, topic)
+                    await self._registrar.withdraw(incarnation, Kind.PUBLICATION, topic)
+                    self._graph.unregistered(incarnation, Kind.PUBLICATION, topic)
         for topic, type_name in wanted.items():
             peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
             caller = Caller(peer, self._name, time.monotonic_ns(), own=True)
             api = ApiUri(self._uri, parse_node_uri(self._uri))
-            answer = await register_publisher(self._master, caller, (topic, type_name, api))
+            answer = await self._register(caller, topic, type_name, api)
             if answer[0] != 1:
                 raise CallFailedError(f"{self._name} cannot publish {topic}: {answer[1]!s}")
 
     def _mine(self) -> list[Incarnation]:
-        return [one for one in self._master.registry.live() if one.of_monitors]
+        return [one for one in self._registry.live() if one.of_monitors]

@@ -17,12 +17,12 @@ from typing import cast
 
 import structlog
 
-from appliance.master.calls.call import Answer
-from appliance.master.calls.parameter_updates import settled
-from appliance.master.calls.parameters import ParameterMirror
-from appliance.master.calls.registration import NO_SERVICE, stand_in
+from appliance.master.caller import Answer
 from appliance.master.graph.graph import Graph
+from appliance.master.graph.parameter_updates import settled
+from appliance.master.graph.registrar import NO_SERVICE, stand_in
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.faces import Faces
 from appliance.master.rosmaster import RosMaster
 from appliance.recorder import Recorder

@@ -12,51 +12,54 @@ from typing import Any
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.master.calls.registration import withdraw
-from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.core import Master
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registrar import CALLS, Registrar
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.reach.own_node import OWN, ROSOUT
-from appliance.policy.live import Live, live_by, may_keep
+from appliance.master.reach.relays import RelayControl
+from appliance.policy import Policy
 from appliance.policy.model import Address, Decision
+from appliance.policy.rights import decide_call
+from appliance.recorder import Recorder
+from appliance.ros.parameter_tree import Tree
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow
 
 _log = structlog.get_logger()
-_GAVE = {call.registers: call.name for call in MASTER_CALLS.values() if call.registers is not None}
 
 
 class Revocation:
-    """Decides again what the registry and the relay's grants hold.
+    """Decides again what the registry and the relay's grants hold, by `policy()` and the parameters that are now.
 
     `put_back(incarnation, registrations)` tells ROSMaster of those that the node still has when it is their turn.
     """
 
     def __init__(
         self,
-        master: Master,
+        registry: Registry,
+        graph: Graph,
+        relay: RelayControl,
+        registrar: Registrar,
+        recorder: Recorder,
         *,
+        policy: Callable[[], Policy],
+        parameters: Callable[[], Tree],
         put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
     ) -> None:
-        self._master = master
+        self._registry = registry
+        self._graph = graph
+        self._relay = relay
+        self._registrar = registrar
+        self._recorder = recorder
+        self._policy = policy
+        self._parameters = parameters
         self._put_back = put_back
         self._last: asyncio.Task[None] | None = None
 
-    def live(self) -> list[Live]:
-        """What `redecide` decides: all that nodes have by the policy."""
-        return [
-            *(
-                self._registered(incarnation, registration.kind, registration.resource)
-                for incarnation, registration in self._registrations()
-                if not incarnation.own
-            ),
-            *(self._permitted(row) for row in self._master.relay.permissions() if not self._is_own(row)),
-        ]
-
     def redecide(self) -> int:
         """Take back what the running policy no longer allows; how much that was. What it grants again is put back."""
-        count = self._redecide(self._registrations(), self._master.relay.permissions())
+        count = self._redecide(self._registrations(), self._relay.permissions())
         self._grant_again()
         return count
 
@@ -64,11 +67,7 @@ class Revocation:
         """The same for what one caller has: his call was decided before the policy changed, and carried out after."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
-            [
-                row
-                for row in self._master.relay.permissions()
-                if (row.host, row.caller_id) == (str(host), caller_id)
-            ],
+            [row for row in self._relay.permissions() if (row.host, row.caller_id) == (str(host), caller_id)],
         )
 
     def _redecide(
@@ -83,7 +82,7 @@ class Revocation:
         for row in grants:
             decision = self._decide_permission(row)
             if not decision.allowed:
-                self._master.relay.revoke(row)
+                self._relay.revoke(row)
                 self._record(row, decision)
                 count += 1
         return count
@@ -95,36 +94,36 @@ class Revocation:
             if incarnation.host == host and not incarnation.own:
                 self._take_back(incarnation, registration, decision)
                 count += 1
-        for row in self._master.relay.permissions():
+        for row in self._relay.permissions():
             if row.host == str(host):
-                self._master.relay.revoke(row)
+                self._relay.revoke(row)
                 self._record(row, decision)
                 count += 1
         return count
 
     def returned(self, incarnation: Incarnation) -> None:
         """A node that was away is back: it gets what was taken from it and has been granted again meanwhile."""
-        if self._master.registry.holder(incarnation.name) in (None, incarnation):
+        if self._registry.holder(incarnation.name) in (None, incarnation):
             self._give_back(incarnation)
 
     def _registrations(self) -> list[tuple[Incarnation, Registration]]:
         """Every registration that counts now or will when its node is back, in the order they were made."""
         pairs = [
             (one, each)
-            for one in self._master.registry.all()
+            for one in self._registry.all()
             if one.life is not Life.REPLACED
             for each in one.registrations.values()
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 
     def _take_back(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> None:
-        self._master.graph.revoked(incarnation, registration, decision)
+        self._graph.revoked(incarnation, registration, decision)
         if incarnation.life is Life.LIVE:  # else ROSMaster has been told
             self._tell(incarnation, registration)
 
     def _grant_again(self) -> None:
         """Put back what an earlier policy took from running nodes and this one grants: they never register twice."""
-        for incarnation in self._master.registry.live():
+        for incarnation in self._registry.live():
             self.returned(incarnation)
 
     def _give_back(self, incarnation: Incarnation) -> None:
@@ -135,7 +134,7 @@ class Revocation:
         back = [
             one
             for one in sorted(allowed, key=lambda one: one.order)
-            if self._master.graph.granted_again(incarnation, one)
+            if self._graph.granted_again(incarnation, one)
         ]
         if back:
             self._in_background(self._told(self._put_back(incarnation, back), incarnation))
@@ -148,24 +147,17 @@ class Revocation:
         if incarnation.own:
             known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
-        return may_keep(self._master.policy(), self._registered(incarnation, kind, resource))
+        return self._may_have(CALLS[kind][0], incarnation.host, incarnation.name, resource)
 
     def _decide_permission(self, row: PermissionRow) -> Decision:
-        if self._is_own(row):
+        holder = self._registry.holder(row.caller_id)
+        if row.kind == TOPIC and holder is not None and holder.own:
             return Decision(True, None, OWN)
-        return may_keep(self._master.policy(), self._permitted(row))
-
-    def _is_own(self, row: PermissionRow) -> bool:
-        holder = self._master.registry.holder(row.caller_id)
-        return row.kind == TOPIC and holder is not None and holder.own
-
-    def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
-        tree = self._master.parameters.tree
-        return live_by(_GAVE[kind], incarnation.host, incarnation.name, resource, tree)
-
-    def _permitted(self, row: PermissionRow) -> Live:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"
-        return Live(ipaddress.ip_address(row.host), row.caller_id, call, row.resource)
+        return self._may_have(call, ipaddress.ip_address(row.host), row.caller_id, row.resource)
+
+    def _may_have(self, call: str, host: Address, caller_id: str, resource: str) -> Decision:
+        return decide_call(self._policy(), call, host, caller_id, resource=resource, tree=self._parameters())
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
         self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))
@@ -173,7 +165,7 @@ class Revocation:
     async def _withdraw(self, incarnation: Incarnation, registration: Registration) -> None:
         kind, resource = registration.kind, registration.resource
         if (kind, resource) not in incarnation.registrations:  # else it has been granted again
-            await withdraw(self._master, incarnation, kind, resource)
+            await self._registrar.withdraw(incarnation, kind, resource)
 
     def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
         """After what is under way: ROSMaster hears of changes in the order they were made."""
@@ -193,7 +185,7 @@ class Revocation:
             _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
 
     def _record(self, row: PermissionRow, decision: Decision) -> None:
-        self._master.recorder.happened(
+        self._recorder.happened(
             "revoked",
             decision.reason,
             severity=Severity.WARNING,

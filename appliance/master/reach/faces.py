@@ -8,8 +8,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Caller
+from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
 from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.model import Address

@@ -6,9 +6,7 @@ rosout registers, look for the parameters that roscpp looks for when it starts, 
 
 from dataclasses import dataclass
 
-from appliance.master.calls.call import Call
 from appliance.master.graph.registry import Kind
-from appliance.policy.model import Decision
 
 OWN = "the appliance's own node"
 
@@ -21,29 +19,11 @@ class OwnNode:
     resources: dict[Kind, frozenset[str]]
     parameters: frozenset[str]
 
-    def decide(self, caller_id: str, call: Call, arguments: tuple[object, ...]) -> Decision:
-        """Whether it may make this call of the Master API with these canonical arguments."""
-        kind = call.registers or call.gives_up
-        if caller_id != self.name:
-            what = f"speak as {caller_id[:80] or 'nobody'}"
-        elif kind is not None and call.resource is not None:
-            if self.may_have(kind, str(arguments[call.resource])):
-                return Decision(True, None, OWN)
-            what = f"have the {kind} {arguments[call.resource]}"
-        elif call.name in _LOOKS_FOR:
-            if arguments[0] in self.parameters:
-                return Decision(True, None, OWN)
-            what = f"read the parameter {arguments[0]}"
-        else:
-            what = f"call {call.name}"
-        return Decision(False, None, f"{self.name} is {OWN} and may not {what}")
-
     def may_have(self, kind: Kind, resource: str) -> bool:
         """Whether it may have a registration."""
         return resource in self.resources.get(kind, ())
 
 
-_LOOKS_FOR = frozenset({"hasParam", "getParam"})
 ROSOUT = OwnNode(
     name="/rosout",
     resources={

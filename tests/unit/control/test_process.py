@@ -47,8 +47,8 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
         return 1
 
     policies = SimpleNamespace(current="the new policy", changed=changed)
-    master = SimpleNamespace(registry=registry, relay=Nothing(), faces=Ports())
+    parts = SimpleNamespace(registry=registry, relay=Nothing(), faces=Ports(), places=Nothing())
     base = SimpleNamespace(sockets={}, store=store, policies=policies)
-    await _restore(cast(Any, base), cast(Any, SimpleNamespace(master=master, places=Nothing())))
+    await _restore(cast(Any, base), cast(Any, parts))
     store.close()
     assert decided == [("the new policy", ["/secret"])]

@@ -36,7 +36,7 @@ def run(server: Server, *calls: tuple[str, Any]) -> list[Any]:
     """Make all calls in one turn; their outcomes."""
 
     async def scene() -> list[Any]:
-        client = BatchingClient(server)  # type: ignore[arg-type]  # the server stands for the connection
+        client = BatchingClient(server, {"hasParam", "searchParam", "lookupNode", "registerPublisher"})  # type: ignore[arg-type]  # the server stands for the connection
         return await asyncio.gather(*(client.call(*one) for one in calls), return_exceptions=True)
 
     return asyncio.run(scene())

@@ -11,17 +11,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.calls.arguments import CALLER_API, KEY, SERVICE_API, ApiUri, Parameter
-from appliance.master.calls.call import Call, Caller, Identity
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.arguments import CALLER_API, KEY, SERVICE_API, Parameter
+from appliance.master.calls.call import Attempt, Call, Identity, Verb
 from appliance.master.calls.gate import Contest, Gate, HostLimits
+from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.registrar import CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
-from appliance.master.reach.node_calls import NODE_CALLS
-from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
+from appliance.policy import Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.learn import Observation, learn
-from appliance.policy.live import may_keep
 from appliance.policy.model import Category, Decision, Request
-from appliance.policy.rights import needs_node
+from appliance.policy.rights import decide_call, needs_node
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value
@@ -98,30 +99,31 @@ def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> st
     return "".join(f"[{title}]\n" + "\n".join(rules) + "\n" for title, rules in lines.items())
 
 
-def argument_of(parameter: Parameter) -> Any:
+def argument_of(parameter: Parameter[Any]) -> Any:
     """A canonical value for a parameter of a call."""
     if parameter in {CALLER_API, SERVICE_API}:
         return ApiUri(URI, parse_node_uri(URI))
     return KEY_GIVEN if parameter is KEY else THING
 
 
-def gate_says(policy: Policy, call: Call, tree: Tree) -> Decision:
+def gate_says(policy: Policy, call: Call[Any], tree: Tree) -> Decision:
     """What RVMaster answers to the call."""
     gate = Gate(lambda: policy, Registry(Nothing()), HostLimits())
     name = "" if call.identity is Identity.NOBODY else NAME
-    arguments = tuple(argument_of(one) for one in call.parameters)
-    decision = gate.decide(Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0), call, arguments, tree)
+    arguments = tuple(argument_of(one) for one in call.method.parameters)
+    caller = Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0)
+    decision = gate.decide(Attempt(caller, call, arguments), tree)
     assert not isinstance(decision, Contest)
     return decision
 
 
-def needed(call: Call, missing: frozenset[str]) -> list[str]:
+def needed(call: Call[Any], missing: frozenset[str]) -> list[str]:
     """The sections that must grant it, by the table above."""
     free = EXTENSIONS & (missing | ({"read", "write"} if {"read", "write"} & missing else set()))
     return [section for section in NEEDS.get(call.name, ("Commands",)) if section not in free]
 
 
-def deeds(call: Call) -> list[Request]:
+def deeds(call: Call[Any]) -> list[Request]:
     """What a person would ask about the call: the deed, and the parameter that it is about."""
     found = [
         Request(
@@ -178,7 +180,7 @@ async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> N
         assert world.revocation.may_have(node, kind, resource) == verdict
         for live, name in (("topic", "requestTopic"), ("service", "lookupService")):
             given_by = MASTER_CALLS.get(name) or NODE_CALLS[name]
-            may = may_keep(world.current, Live(HOST, NAME, name, THING)).allowed
+            may = decide_call(world.current, name, HOST, NAME, resource=THING, tree={}).allowed
             assert may == gate_says(world.current, given_by, {}).allowed, live
 
 
@@ -186,7 +188,7 @@ async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> N
 @pytest.mark.parametrize(
     "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
 )
-def test_what_was_learned_from_a_call_lets_it_pass(call: Call, tree: dict[str, Value]) -> None:
+def test_what_was_learned_from_a_call_lets_it_pass(call: Call[Any], tree: dict[str, Value]) -> None:
     """A policy that was learned from the records of a call grants the whole call, and it alone needs no more."""
     key = KEY_GIVEN if call.touches is not None else ""
     learned = learn([Observation(deeds(call)[0], call.name, key)])
@@ -205,9 +207,10 @@ def test_a_call_that_makes_a_node_binds_its_name() -> None:
 
 def test_what_a_call_registers_another_gives_up() -> None:
     """Each kind of thing has one call that registers it and one that gives it up; both are about a resource."""
-    assert {call.registers: call.name for call in ROWS if call.registers is not None} == GRANTS
-    assert {call.name: call.gives_up for call in ROWS if call.gives_up is not None} == GIVES_UP
-    assert all(call.resource is not None for call in ROWS if call.registers or call.gives_up)
+    assert {call.kind: call.name for call in ROWS if call.verb is Verb.REGISTER} == GRANTS
+    assert {call.name: call.kind for call in ROWS if call.verb is Verb.UNREGISTER} == GIVES_UP
+    assert {GIVES_UP[name]: (GRANTS[GIVES_UP[name]], name) for name in GIVES_UP} == CALLS
+    assert all((call.resource is None) == (call.kind is None) for call in ROWS)
 
 
 def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.master.calls.parameter_charges import measure
+from appliance.master.parameter_charges import measure
 from appliance.ros.xmlrpc import Value, build_response
 from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
 from appliance.shares.pool import Standing

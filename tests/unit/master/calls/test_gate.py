@@ -5,12 +5,13 @@ from typing import Any
 
 import pytest
 
-from appliance.master.calls.arguments import ApiUri
-from appliance.master.calls.call import Caller
-from appliance.master.calls.gate import Contest, Gate, HostLimits, Presence, Probe, contested
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.call import Attempt
+from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
+from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.node_calls import NODE_CALLS
+from appliance.master.presence import Presence, Probe
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import Tree
@@ -58,7 +59,9 @@ def gate(rules: str) -> Gate:
 def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -> Decision:
     """The decision on a call, while ROSMaster has the parameters `tree`."""
     peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
-    decision = gate(rules).decide(Caller(peer, "/me", 0), MASTER_CALLS[method], arguments, tree or {})
+    decision = gate(rules).decide(
+        Attempt(Caller(peer, "/me", 0), MASTER_CALLS[method], arguments), tree or {}
+    )
     assert not isinstance(decision, Contest)
     return decision
 
@@ -117,7 +120,7 @@ def test_without_the_section_everything_is_as_it_was() -> None:
     policy = compile_policy(text, file="test.ini")
     peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
     here = Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
-    decision = here.decide(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0), tree)
+    decision = here.decide(Attempt(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0)), tree)
     assert isinstance(decision, Decision)
     assert decision.allowed
 
@@ -159,10 +162,10 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     for own in (True, False):
         registry = held("/rosout", "127.0.0.1", own=own)
         here = Gate(lambda: policy, registry, HostLimits())
-        decision = here.decide(Caller(loopback, "/rosout", 0), call, given, {})
+        decision = here.decide(Attempt(Caller(loopback, "/rosout", 0), call, given), {})
         assert isinstance(decision, Decision)
         assert decision.allowed is not own
-        itself = here.decide(Caller(loopback, "/rosout", 0, own=True), call, given, {})
+        itself = here.decide(Attempt(Caller(loopback, "/rosout", 0, own=True), call, given), {})
         assert isinstance(itself, Decision)
         assert itself.allowed is does
 
@@ -189,7 +192,7 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
         (OPERATOR, "10.0.0.1", "/rosout", False),
     ):
         caller = Caller(Peer(ipaddress.ip_address(host), host, local), "/rosout", 0, target=other)
-        decision = here.decide(caller, NODE_CALLS["requestTopic"], (topic, [["TCPROS"]]), {})
+        decision = here.decide(Attempt(caller, NODE_CALLS["requestTopic"], (topic, [["TCPROS"]])), {})
         assert isinstance(decision, Decision)
         assert decision.allowed is allowed
 
@@ -230,7 +233,7 @@ def test_a_host_has_as_many_registrations_as_are_left() -> None:
         registry.add(node)
         for turn in range(100):
             call = MASTER_CALLS["registerPublisher"]
-            decision = gate.decide(caller, call, (f"/t{turn}", "std_msgs/String", api), {})
+            decision = gate.decide(Attempt(caller, call, (f"/t{turn}", "std_msgs/String", api)), {})
             assert isinstance(decision, Decision)
             if not decision.allowed:
                 assert "registrations" in decision.reason

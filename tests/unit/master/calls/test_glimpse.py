@@ -1,15 +1,20 @@
 """What is told of a request that is refused by the beginning of its body."""
 
+import ipaddress
+
 import pytest
 
 from appliance.master.calls.glimpse import asked_for
 from appliance.policy.model import Category
 from appliance.ros.xmlrpc import Value, build_call
+from appliance.rpc.server import Peer
+
+PEER = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
 
 
 def asked(method: str, *params: Value) -> tuple[Category, str, str | None, dict[str, str]]:
     """What is told of a whole call."""
-    return tuple(asked_for(build_call(method, params)))  # type: ignore[return-value]  # the fields
+    return tuple(asked_for(PEER, build_call(method, params)))  # type: ignore[return-value]  # the fields
 
 
 def test_a_registration_names_its_topic() -> None:
@@ -51,10 +56,10 @@ def test_wrong_arguments_still_name_the_call() -> None:
 def test_a_body_that_is_cut_names_its_method(cut: int) -> None:
     """Of a large body the beginning has the method."""
     body = build_call("setParam", ("/evil", "/k", "v" * 100_000))[:cut]
-    assert asked_for(body)[:2] == (Category.COMMAND, "setParam")
+    assert asked_for(PEER, body)[:2] == (Category.COMMAND, "setParam")
 
 
 @pytest.mark.parametrize("body", [b"", b"\0\xff", b"<methodName>", b"<methodName><!-- --></methodName>"])
 def test_what_has_no_method(body: bytes) -> None:
     """Rubbish has no resource, and is no error."""
-    assert asked_for(body) == (Category.COMMAND, "", None, {"call": "unknown"})
+    assert asked_for(PEER, body) == (Category.COMMAND, "", None, {"call": "unknown"})

@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.calls.call import Caller
-from appliance.master.calls.lookups import lookup_service
-from appliance.master.calls.registration import stand_in
+from appliance.master.caller import Caller
+from appliance.master.calls.lookups import LookupCalls
+from appliance.master.graph.registrar import stand_in
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.ros.uris import parse_node_uri
 
@@ -79,17 +79,19 @@ class Race:
         """As the relay's control."""
         self.granted.append(incarnation)
 
-    def master(self) -> Any:
-        """What a look-up needs of a master."""
-        return SimpleNamespace(
-            rosmaster=self,
-            registry=self.registry,
-            mediation=SimpleNamespace(carries_service=lambda _name: True),
-            relay=SimpleNamespace(
+    def calls(self) -> LookupCalls:
+        """The look-ups of this site."""
+        parts: dict[str, Any] = {
+            "rosmaster": self,
+            "registry": self.registry,
+            "faces": None,
+            "mediation": SimpleNamespace(carries_service=lambda _name: True),
+            "relay": SimpleNamespace(
                 grant_service=self.grant_service, port=lambda one, _kind, _name: one.relay_port
             ),
-            addresses=SimpleNamespace(told_to=lambda _peer: "10.0.0.1"),
-        )
+            "addresses": SimpleNamespace(told_to=lambda _peer: "10.0.0.1"),
+        }
+        return LookupCalls(**parts, port=11311, stop=lambda _reason: None)
 
 
 @pytest.mark.parametrize("order", ORDERS, ids="".join)
@@ -97,7 +99,7 @@ async def test_a_provider_is_told_whatever_overtakes_what(order: tuple[str, ...]
     """The one that is registered when the answer is given: never that there is none."""
     race = Race()
     caller = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))
-    looking = asyncio.ensure_future(lookup_service(race.master(), caller, (SERVICE,)))
+    looking = asyncio.ensure_future(race.calls().lookup_service(caller, SERVICE))
     for name in order:
         race.step(name)
         for _ in range(5):
@@ -117,5 +119,5 @@ async def test_a_provider_that_the_registry_never_has_is_none() -> None:
     race.step("A")
     race.step("L")
     caller = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))
-    assert await lookup_service(race.master(), caller, (SERVICE,)) == [-1, "no provider", ""]
+    assert await race.calls().lookup_service(caller, SERVICE) == [-1, "no provider", ""]
     assert (race.granted, race.asked) == ([], 6)

@@ -2,12 +2,13 @@
 
 import asyncio
 import ipaddress
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from appliance.master.calls.call import Answer, Caller
-from appliance.master.calls.parameter_search import search_param
+from appliance.master.caller import Answer, Caller
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.calls.parameter_search import ParameterSearch
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import standing_at
@@ -23,9 +24,9 @@ class Site:
 
     def __init__(self, tree: Any, rules: str = RULES) -> None:
         policy = compile_policy(rules, file="test.ini")
-        self.policy = lambda: policy
         self.parameters = mirror(tree)
-        self.rosmaster = self.recorder = self
+        rights = ParameterRights(lambda: policy, cast(Any, self))
+        self.calls = ParameterSearch(cast(Any, self), self.parameters, rights)
         self.asked: list[str] = []
         self.records: list[tuple[str, Decision]] = []
 
@@ -51,7 +52,7 @@ class Site:
         """One search."""
         peer = Peer(ipaddress.ip_address(HOST), HOST, "10.0.0.1")
         caller = Caller(peer, caller_id, 0, own=own)
-        return asyncio.run(search_param(self, caller, (key,)))  # type: ignore[arg-type]  # stands for the master
+        return asyncio.run(self.calls.search_param(caller, key))
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,16 @@ import copy
 import ipaddress
 import json
 import subprocess
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.calls.call import Caller, LimitReachedError
-from appliance.master.calls.parameter_charges import measure
-from appliance.master.calls.parameters import ParameterMirror, in_order, set_param
+from appliance.master.caller import Caller
+from appliance.master.calls.parameters import ParameterCalls, Write
+from appliance.master.parameter_charges import LimitReachedError, measure
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
@@ -106,7 +107,7 @@ class OrderedServer:
         self.tree = mirror()
         self.requests: list[list[str]] = []
         self.parameters = there
-        self.rosmaster = self.graph = self
+        self.calls = ParameterCalls(cast(Any, self), there, cast(Any, self), cast(Any, None), 1 << 20)
         self.broken: Exception | None = None
         self.told: list[tuple[str, str | None]] = []
 
@@ -133,11 +134,11 @@ class OrderedServer:
         for method, (_caller, key, *value) in calls:
             if method == "setParam":
                 put(self.tree, key, copy.deepcopy(value[0]), HOST)
-            elif method == "deleteParam":
-                self.tree.delete(key)
             elif key == "/fault":
                 answers.append(CallFailedError("a fault"))
                 continue
+            else:
+                self.tree.delete(key)
             answers.append([1, method, key])
         return answers
 
@@ -146,8 +147,8 @@ def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
     """Carry them out in order."""
     peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
     caller = Caller(peer, "/me", 0)
-    wanted = [(caller, method, tuple(arguments)) for method, *arguments in calls]
-    return asyncio.run(in_order(server, wanted))  # type: ignore[arg-type]  # stands for the master
+    writes = [Write(caller, key, value[0] if value else None) for _method, key, *value in calls]
+    return asyncio.run(server.calls.write(writes))
 
 
 def test_a_run_is_one_request_in_its_order() -> None:
@@ -157,11 +158,10 @@ def test_a_run_is_one_request_in_its_order() -> None:
         server,
         ("setParam", "/a", {"b": 1}),
         ("deleteParam", "/a/b"),
-        ("hasParam", "/a/b"),
         ("setParam", "/c", 2),
     )
-    assert server.requests == [["setParam /a", "deleteParam /a/b", "hasParam /a/b", "setParam /c"]]
-    assert [one[1] for one in answers] == ["setParam", "deleteParam", "hasParam", "setParam"]
+    assert server.requests == [["setParam /a", "deleteParam /a/b", "setParam /c"]]
+    assert [one[1] for one in answers] == ["setParam", "deleteParam", "setParam"]
     assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
     assert server.told == [("/a", "/me"), ("/a/b", None), ("/c", "/me")]
 
@@ -207,7 +207,7 @@ def test_a_value_that_is_too_much() -> None:
 def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
     """A fault of one part is that part's; without an answer each part has the failure, and the mirror stays."""
     server = OrderedServer(mirror())
-    answers = ordered(server, ("hasParam", "/fault"), ("setParam", "/a", 1))
+    answers = ordered(server, ("deleteParam", "/fault"), ("setParam", "/a", 1))
     assert isinstance(answers[0], CallFailedError)
     assert answers[1][0] == 1
     server.broken = CallFailedError("gone")
@@ -263,6 +263,6 @@ def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
     else:
         peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
         for _method, *arguments in calls:
-            asyncio.run(set_param(server, Caller(peer, "/me", 0), tuple(arguments)))  # type: ignore[arg-type]  # same
+            asyncio.run(server.calls.set_param(Caller(peer, "/me", 0), *arguments))
     assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
     assert server.parameters.weight == measure(server.parameters.tree)[0]

@@ -5,21 +5,19 @@ import copy
 import ipaddress
 import threading
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from appliance.master.calls import pipeline
-from appliance.master.calls.gate import Gate, HostLimits
-from appliance.master.calls.pipeline import Pipeline
-from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.registry import Registry
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
-from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
+from appliance.ros.xmlrpc import Value, build_call, parse_response
 from appliance.rpc.server import HttpRequest, Peer
-from appliance.shares.pool import Standing
 from tests.support.parameters import mirror, put
+from tests.support.serving import serving
 
 HOST = ipaddress.ip_address("10.0.0.9")
 
@@ -89,19 +87,23 @@ class Site:
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
         policy = compile_policy(self.policy_text, file="test.ini")
-        self.policy = lambda: policy
-        self.gate = Gate(self.policy, Registry(Anything()), HostLimits())
         self.recorder = Records()
         self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
         self.there = mirror(copy.deepcopy(tree or {}))
-        self.rosmaster = self
-        self.graph = Anything()
-        self.addresses = self
         self.arrived: list[str] = []
         self.go = asyncio.Event()
         self.go.set()
-        served = Pipeline(self, limits=Limits(), offload=OFFLOAD, standing=lambda _host: Standing.REGISTERED)  # type: ignore[arg-type]  # stands for the master
-        self.serve = served.handler(MASTER_CALLS)
+        self.serve = serving(
+            policy=lambda: policy,
+            registry=Registry(Anything()),
+            graph=Anything(),
+            rosmaster=self,
+            mirror=self.parameters,
+            recorder=self.recorder,
+            rights=ParameterRights(lambda: policy, cast(Any, self.recorder)),
+            addresses=self,
+            offload=OFFLOAD,
+        )
 
     async def learn(self, _peer: Peer) -> None:
         """As `Addresses`."""
@@ -220,7 +222,7 @@ def test_parts_are_decided_and_answered_in_their_places() -> None:
         assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
         assert "[Parameters] write default" in answers[1][0][1]
         assert site.there.tree == site.parameters.tree == {"arm": {}}
-        assert [resource.allowed for _, _, resource in site.recorder.decisions] == [False, True, True, True]
+        assert [resource.allowed for _, _, resource in site.recorder.decisions] == [True, False, True, True]
 
     play(scene)
 

@@ -101,8 +101,8 @@ async def test_a_parameter_that_a_node_gives_up_is_not_given_back() -> None:
     await world.settle()
 
 
-async def test_a_question_for_one_value_does_not_wait_for_the_master() -> None:
-    """It is answered from the mirror, which has what ROSMaster took; a namespace is asked of ROSMaster."""
+async def test_a_question_for_a_parameter_does_not_wait_for_the_master() -> None:
+    """It is answered from the mirror, which has what ROSMaster took; a large namespace is asked of ROSMaster."""
     world = await ControlParts.begun()
     await world.ask("setParam", "/n", "/arm/speed", 3)
     before = len(world.hidden.calls)
@@ -110,6 +110,9 @@ async def test_a_question_for_one_value_does_not_wait_for_the_master() -> None:
     assert await world.ask("hasParam", "/n", "/arm") == [1, "/arm", True]
     assert await world.ask("hasParam", "/n", "/arm/speed/x") == [1, "/arm/speed/x", False]
     assert await world.ask("getParam", "/n", "/nothing") == [-1, "Parameter [/nothing] is not set", 0]
+    assert await world.ask("getParam", "/n", "/arm") == [1, "Parameter [/arm]", {"speed": 3}]
     assert world.hidden.calls[before:] == []
-    await world.ask("getParam", "/n", "/arm")
+    await world.ask("setParam", "/n", "/leg", {"model": "x" * (1 << 20)})
+    before = len(world.hidden.calls)
+    await world.ask("getParam", "/n", "/leg")
     assert [call[0] for call in world.hidden.calls[before:]] == ["getParam"]

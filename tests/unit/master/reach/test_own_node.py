@@ -1,10 +1,23 @@
 """What the appliance's own node may do: what an unmodified rosout asks for, and nothing else."""
 
+import ipaddress
+
 import pytest
 
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.arguments import CALLER_API, SERVICE_API
+from appliance.master.calls.call import Attempt
+from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.graph.registry import Kind
+from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.own_node import ROSOUT
+from appliance.policy import compile_policy
+from appliance.policy.model import Decision
+from appliance.ros.uris import parse_node_uri
+from appliance.rpc.server import Peer
+from tests.support.control_parts import Nothing
+
+URI = "http://127.0.0.1:4000/"
 
 ROSOUTS = [
     ("registerPublisher", "/rosout_agg"),
@@ -18,13 +31,26 @@ ROSOUTS = [
 ]
 
 
+def decide(caller_id: str, method: str, resource: str) -> Decision:
+    """The decision on a call at the listener of the appliance's own nodes."""
+    policy, call = compile_policy("[Nodes]\n", file="p.ini"), MASTER_CALLS[method]
+    peer = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
+    arguments = tuple(
+        ApiUri(URI, parse_node_uri(URI)) if one in {CALLER_API, SERVICE_API} else resource
+        for one in call.method.parameters
+    )
+    attempt = Attempt(Caller(peer, caller_id, 0, own=True), call, arguments)
+    decision = Gate(lambda: policy, Registry(Nothing()), HostLimits()).decide(attempt, {})
+    assert isinstance(decision, Decision)
+    return decision
+
+
 @pytest.mark.parametrize(("method", "resource"), ROSOUTS)
 def test_rosout_may_be_rosout(method: str, resource: str) -> None:
     """It may do what it does when it starts and ends, under its own name only."""
-    call = MASTER_CALLS[method]
-    assert ROSOUT.decide("/rosout", call, (resource,)).allowed
+    assert decide("/rosout", method, resource).allowed
     for other in ("/talker", "/rosrv", ""):
-        decision = ROSOUT.decide(other, call, (resource,))
+        decision = decide(other, method, resource)
         assert not decision.allowed
         assert "may not speak as" in decision.reason
 
@@ -32,15 +58,14 @@ def test_rosout_may_be_rosout(method: str, resource: str) -> None:
 @pytest.mark.parametrize("method", MASTER_CALLS)
 def test_it_may_do_nothing_else(method: str) -> None:
     """No call of the Master API is granted for another topic, service or parameter, and most are not granted at all."""
-    call = MASTER_CALLS[method]
     for resource in ("/cmd_vel", "/secret", "/", "/talker/set_logger_level"):
-        decision = ROSOUT.decide("/rosout", call, (resource, resource))
+        decision = decide("/rosout", method, resource)
         assert not decision.allowed
         assert decision.reason.startswith("/rosout is the appliance's own node and may not ")
     granted = {name for name, _ in ROSOUTS}
     if method not in granted:
         for resource in ("/rosout", "/rosout_agg", "/use_sim_time"):
-            assert not ROSOUT.decide("/rosout", call, (resource, resource)).allowed
+            assert not decide("/rosout", method, resource).allowed
 
 
 def test_what_it_publishes_it_may_not_hear() -> None:

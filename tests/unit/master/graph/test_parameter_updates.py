@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.calls.parameter_updates import settled, updates_of
+from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Kind
 from appliance.ros.names import is_relative_member
 from appliance.ros.xmlrpc import Value

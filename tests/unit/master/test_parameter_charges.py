@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.master.calls.call import LimitReachedError
-from appliance.master.calls.parameter_charges import APPLIANCE, measure, member_weight
-from appliance.master.calls.parameters import ParameterMirror
+from appliance.master.parameter_charges import APPLIANCE, LimitReachedError, measure, member_weight
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
 from appliance.ros.parameter_tree import parts_of
 from appliance.ros.xmlrpc import Value

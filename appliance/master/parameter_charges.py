@@ -30,6 +30,10 @@ _VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # about what is written around 
 _NUMBERS = frozenset({bool, int, float})
 
 
+class LimitReachedError(Exception):
+    """A call would take more than there is for all hosts; the text says what of."""
+
+
 class OwnersJournal(Protocol):
     """Where owners are written that must survive a crash of control."""
 

@@ -1,0 +1,1 @@
+"""`rosrv demo`: the product at work."""

@@ -1,0 +1,42 @@
+"""Who calls RVMaster or a node's outer face, the URI that a node gives for itself, and what is answered."""
+
+from dataclasses import dataclass
+
+from appliance.master.graph.registry import Incarnation
+from appliance.recorder import Asker
+from appliance.ros.uris import NodeUri
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.server import Peer
+
+Answer = list[Value]
+"""What a call returns: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
+
+
+@dataclass(frozen=True, slots=True)
+class ApiUri:
+    """A node's or service's URI as it was given and as it was parsed."""
+
+    text: str
+    uri: NodeUri
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who makes a call: the peer, and the `caller_id` he claims.
+
+    `own` marks the appliance's own nodes, which reach RVMaster on a listener of their own. `target` is set on an
+    outer face: the incarnation that the call is for.
+    """
+
+    peer: Peer
+    caller_id: str
+    arrived: int
+    own: bool = False
+    target: Incarnation | None = None
+
+    @property
+    def asker(self) -> Asker:
+        """The caller as the audit log has him."""
+        return Asker(
+            self.peer.text, self.caller_id, self.arrived, None if self.target is None else self.target.name
+        )

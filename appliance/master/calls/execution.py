@@ -1,0 +1,277 @@
+"""One call, from its parameters to its answer: canonicalise → decide → record → perform.
+
+1. A call is decided when it is its turn, by the policy and the registry of that moment. Calls that register wait for
+   those that register under the same name, writes of parameters for those that touch them; nothing else waits.
+2. Who must wait and is denied as things are is denied at once: it waits for nobody, and nobody waits for it. This look
+   grants nothing.
+3. Whether the node that holds a name is still there only the network can say: it is asked before the turn.
+4. A policy that comes into force while a call is carried out decides again what that left: when the policy took back
+   what it denies, the registry and the relay did not have it yet.
+
+What goes wrong on the way is an answer of the right shape for the caller, and a record; never an exception.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.master.caller import Answer, Caller
+from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text
+from appliance.master.calls.claims import Claims
+from appliance.master.calls.gate import Contest, Gate, contested
+from appliance.master.calls.parameters import ParameterCalls, Write
+from appliance.master.calls.registration import given_up
+from appliance.master.calls.write_turns import WriteTurns
+from appliance.master.graph.liveness import Liveness
+from appliance.master.graph.registry import Kind, Registry
+from appliance.master.parameter_charges import LimitReachedError
+from appliance.master.presence import Probe
+from appliance.master.reach.places import NoPortError
+from appliance.policy import Policy
+from appliance.policy.model import Address, Category, Decision
+from appliance.recorder import NOT_RECORDED, Recorder
+from appliance.ros.errors import EncodingError, PeerError, ProtocolError
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.bulk import Bulk, LargeWrites, weigh
+from appliance.rpc.client import CallFailedError
+from appliance.shares.pool import Standing
+
+_log = structlog.get_logger()
+_FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFailedError)
+
+
+class Visit(NamedTuple):
+    """One request: the table that is served to it, who makes it, and its bulk."""
+
+    table: Table
+    caller: Caller
+    bulk: Bulk
+
+
+class Execution:
+    """Carries calls out. What brings a value of `large` bytes or more to ROSMaster waits for others that do.
+
+    `redecide_for(host, caller_id)` takes back what the policy in force does not allow one caller.
+    """
+
+    def __init__(
+        self,
+        *,
+        gate: Gate,
+        policy: Callable[[], Policy],
+        recorder: Recorder,
+        registry: Registry,
+        liveness: Liveness,
+        parameters: ParameterCalls,
+        redecide_for: Callable[[Address, str], int],
+        large: int,
+        standing: Callable[[Address], Standing],
+    ) -> None:
+        self._gate = gate
+        self._policy = policy
+        self._recorder = recorder
+        self._registry = registry
+        self._liveness = liveness
+        self._parameters = parameters
+        self._redecide_for = redecide_for
+        self._large = large
+        self._claims = Claims()
+        self._writes = WriteTurns()
+        self._large_writes = LargeWrites(large, standing)
+
+    async def understand(self, visit: Visit, method: str, params: Sequence[Value]) -> Attempt | Answer:
+        """The call with its canonical arguments, nothing decided yet; the answer when there is none."""
+        if method not in visit.table:
+            return self._unknown(visit.caller, method, params)
+        call = visit.table[method].call
+        try:
+            if visit.bulk.large and weigh(list(params), self._large) >= self._large:
+                return await asyncio.to_thread(call.attempt, visit.caller, params)
+            return call.attempt(visit.caller, params)
+        except PeerError as error:
+            return self._malformed(call, visit.caller, claimed_name(params), error)
+
+    async def answer(self, visit: Visit, attempt: Attempt) -> Value:
+        """Decide one call and carry it out."""
+        if self._parameters.weight_of_answer(attempt) >= self._large:
+            await visit.bulk.take()
+        call, probe = attempt.call, None
+        registers = call.verb in {Verb.REGISTER, Verb.UNREGISTER}
+        outcome = self._decide(attempt)
+        if isinstance(outcome, Contest):
+            probe = await self._liveness.probe(outcome.holder)
+        elif not outcome.allowed or not (registers or call.verb is Verb.WRITE):
+            return await self._carry_out(visit, attempt, outcome)
+        name = self._claims.alone(attempt.caller.caller_id) if registers else contextlib.nullcontext()
+        async with name, self._turn([attempt]):
+            return await self._carry_out(visit, attempt, self._settled(attempt, probe))
+
+    async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
+        """Decide calls that read and write parameters one by one, and carry them out in their order.
+
+        No call of the run reads what one before it writes, so reads are carried out first.
+        """
+        if sum(map(self._parameters.weight_of_answer, run)) >= self._large:
+            await visit.bulk.take()
+        looks = [self._settled(one) for one in run]
+        writing = [
+            one for one, look in zip(run, looks, strict=True) if look.allowed and one.call.verb is Verb.WRITE
+        ]
+        if not writing:
+            return await self._carry_out_run(visit, run, looks)
+        async with self._turn(writing):
+            decisions = [
+                self._settled(one) if look.allowed else look for one, look in zip(run, looks, strict=True)
+            ]
+            return await self._carry_out_run(visit, run, decisions)
+
+    @contextlib.asynccontextmanager
+    async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[None]:
+        """Wait until nothing else writes the parameters that these calls are about.
+
+        Who subscribes to a parameter hears of every write after the value that answers, so that has a turn, too.
+        """
+        keys = [one.resource for one in attempts if one.call.kind is Kind.PARAMETER]
+        host, values = attempts[0].caller.peer.host, [one.value for one in attempts]
+        async with self._writes.alone(keys), self._large_writes.turn(host, values):
+            yield
+
+    async def _carry_out(self, visit: Visit, attempt: Attempt, decision: Decision) -> Value:
+        policy, verb = self._policy(), attempt.call.verb
+        denied = self._recorded(attempt, decision)
+        if denied is not None and verb is Verb.UNREGISTER:
+            given_up(self._registry, attempt)
+        obstacle = await self._obstacle()
+        if obstacle is not None:
+            return [0, obstacle, attempt.call.denial]
+        if denied is not None:
+            return denied
+        answer = await self._perform(visit, attempt)
+        if verb in {Verb.REGISTER, Verb.CONNECT} and self._policy() is not policy:
+            self._redecide_for(attempt.caller.peer.host, attempt.caller.caller_id)
+        return answer
+
+    async def _carry_out_run(
+        self, visit: Visit, run: Sequence[Attempt], decisions: Sequence[Decision]
+    ) -> list[Value]:
+        answers: list[Value] = [
+            self._recorded(one, decision) for one, decision in zip(run, decisions, strict=True)
+        ]
+        obstacle = await self._obstacle()
+        writes: list[int] = []
+        for place, (attempt, denied) in enumerate(zip(run, answers, strict=True)):
+            if denied is not None:
+                continue
+            if obstacle is not None:
+                answers[place] = [0, obstacle, attempt.call.denial]
+            elif attempt.call.verb is Verb.WRITE:
+                writes.append(place)
+            else:
+                answers[place] = await self._perform(visit, attempt)
+        outcomes = await self._parameters.write(
+            [Write(run[place].caller, run[place].resource, run[place].value) for place in writes]
+        )
+        for place, outcome in zip(writes, outcomes, strict=True):
+            answers[place] = self._failed(run[place], outcome) if isinstance(outcome, Exception) else outcome
+        return answers
+
+    # --- decide and record ---
+
+    def _decide(self, attempt: Attempt) -> Decision | Contest:
+        caller = attempt.caller
+        obstacle = self._recorder.obstacle or (
+            "" if caller.own else self._recorder.shut_out(caller.peer.text)
+        )
+        if obstacle:
+            return Decision(False, None, obstacle)
+        return self._gate.decide(attempt, self._parameters.mirror.tree)
+
+    def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
+        """The decision, with what is known of the node that holds the name."""
+        outcome = self._decide(attempt)
+        return contested(outcome, probe) if isinstance(outcome, Contest) else outcome
+
+    def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
+        """Record a decision; the answer of a denial, None for what is allowed."""
+        request, call = attempt.request, attempt.call
+        record = self._recorder.decided(
+            attempt.caller.asker,
+            call.name,
+            request.category.value,
+            request.resource,
+            decision,
+            reads=call.verb is Verb.READ and request.category is Category.COMMAND,
+            **attempt.about,
+        )
+        return None if decision.allowed else [0, self._told(decision, record), call.denial]
+
+    async def _obstacle(self) -> str | None:
+        """What a caller is told when its record must be on disk before the answer, and cannot be."""
+        if not self._recorder.strict or await self._recorder.durable() is None:
+            return None
+        return f"denied: {NOT_RECORDED}"
+
+    def _told(self, decision: Decision, record: str) -> str:
+        return denial_text(decision, record, self._policy().tell)
+
+    # --- perform, and what can go wrong ---
+
+    async def _perform(self, visit: Visit, attempt: Attempt) -> Value:
+        call, part = visit.table[attempt.call.name]
+        try:
+            return await call.method.perform(part, attempt.caller, *attempt.arguments)
+        except _FAILURES as error:
+            return self._failed(attempt, error)
+
+    def _failed(self, attempt: Attempt, error: Exception) -> Answer:
+        """The answer to a call that was allowed and could not be carried out."""
+        caller, call = attempt.caller, attempt.call
+        match error:
+            case NoPortError() | LimitReachedError():
+                record = self._recorder.happened(
+                    "limit exceeded",
+                    str(error),
+                    severity=Severity.ALARM,
+                    decision="deny",
+                    host=caller.peer.text,
+                    caller_id=caller.caller_id,
+                    category=call.category.value,
+                    resource=call.name,
+                    call=call.name,
+                )
+                return [0, f"{error} [{record}]", call.denial]
+            case PeerError():
+                return self._malformed(call, caller, caller.caller_id, error)
+            case EncodingError():
+                wrong = ProtocolError(f"cannot be passed on: {error}")
+                return self._malformed(call, caller, caller.caller_id, wrong)
+            case CallFailedError():
+                # The text names the hidden ROSMaster's address: it is for our log, not for a node.
+                _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
+                return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
+        raise error
+
+    def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
+        caller = replace(caller, caller_id=claimed_name(params))
+        decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
+        record = self._recorder.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
+        return [0, self._told(decision, record), 0]
+
+    def _malformed(self, call: Call[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
+        self._recorder.happened(
+            "malformed",
+            str(error),
+            severity=Severity.WARNING,
+            decision="deny",
+            host=caller.peer.text,
+            caller_id=claimed,
+            category=call.category.value,
+            resource=call.name,
+            call=call.name,
+        )
+        return [-1, str(error), call.denial]

@@ -1,0 +1,139 @@
+"""`system.multicall`: the parts are answered in their order, and a part that fails holds up no other.
+
+Roslaunch clears and sets parameters in one multicall, and the order is what counts. Calls that read and write
+parameters and follow each other are a *run*: each is decided and recorded by itself, they wait for the disk and for
+ROSMaster once. A read of what a run writes begins the next. Everything else waits for the part before it.
+"""
+
+import asyncio
+import time
+from collections import deque
+
+from appliance.audit.record import Severity
+from appliance.master.calls.call import Attempt, Verb
+from appliance.master.calls.execution import Execution, Visit
+from appliance.master.calls.parameters import ParameterCalls
+from appliance.master.calls.write_turns import touch
+from appliance.policy.model import Category
+from appliance.recorder import Recorder
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.bulk import weigh
+
+MULTICALL = "system.multicall"
+PARSE_FAULT, LIMIT_FAULT = -32700, -32600
+_LONGEST_RUN = 64  # parts that reach ROSMaster in one request
+_LONGEST_STRETCH = 0.005  # seconds without a look at anybody else
+_FORM = "a part of a multicall has methodName and params, nothing else"
+
+_Parts = deque["Value | Attempt"]
+
+
+class Multicall:
+    """Answers multicalls. The answers to one have as many bytes as one call can be answered."""
+
+    def __init__(
+        self, execution: Execution, parameters: ParameterCalls, recorder: Recorder, *, offload: int
+    ) -> None:
+        self._execution = execution
+        self._parameters = parameters
+        self._recorder = recorder
+        self._offload = offload
+
+    async def answer(self, visit: Visit, params: tuple[Value, ...]) -> Value:
+        """The answers to the parts of one multicall."""
+        if len(params) != 1 or not isinstance(params[0], list):
+            why = "system.multicall takes one list of calls"
+            self._refused(visit, why)
+            return [-1, why, 0]
+        left: _Parts = deque(params[0])
+        results: list[Value] = []
+        limit = room = self._parameters.mirror.bytes_limit
+        since = time.monotonic()  # not the loop's time, which stands still meanwhile
+        while left:
+            why = self._recorder.owing(visit.caller.peer.text)
+            if room <= 0:
+                why = f"the answers to a multicall have more than {limit} bytes"
+            if why:
+                why = f"{why}; {len(left)} more parts are not carried out"
+                return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
+            answers = await self._next(visit, left, room)
+            room -= await self._weigh(visit, answers)
+            results += answers
+            if time.monotonic() - since > _LONGEST_STRETCH:
+                await asyncio.sleep(0)
+                since = time.monotonic()
+        return results
+
+    async def _next(self, visit: Visit, left: "_Parts", room: int) -> list[Value]:
+        """The answers to the next parts, which are taken from those that are left: to a run, or to one part."""
+        if not _in_run(visit, left[0]):
+            return [await self._one(visit, left.popleft())]
+        answers: list[Value] = []
+        run: list[tuple[int, Attempt]] = []
+        weight, most = 0, min(room, self._offload)
+        while left and len(answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
+            attempt = await self._understand(visit, left[0])
+            if isinstance(attempt, Attempt):
+                if any(_reads_what_is_written(attempt, one) for _place, one in run):
+                    left[0] = attempt
+                    break
+                run.append((len(answers), attempt))
+                weight += self._parameters.weight_of_answer(attempt)
+            left.popleft()
+            answers.append(None if isinstance(attempt, Attempt) else attempt)
+        done = await self._execution.answer_run(visit, [one for _place, one in run])
+        for (place, _one), answer in zip(run, done, strict=True):
+            answers[place] = [answer]
+        return answers
+
+    async def _one(self, visit: Visit, part: "Value | Attempt") -> Value:
+        attempt = await self._understand(visit, part)
+        return [await self._execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
+
+    async def _understand(self, visit: Visit, part: "Value | Attempt") -> "Value | Attempt":
+        """A part as it was understood; else what stands for it in the answer."""
+        match part:
+            case Attempt():
+                return part
+            case {"methodName": "system.multicall"}:
+                return self._refused(visit, "a multicall inside a multicall is not served")
+            case {"methodName": str(method), "params": list(params), **rest} if not rest:
+                attempt = await self._execution.understand(visit, method, params)
+                return attempt if isinstance(attempt, Attempt) else [attempt]
+        return self._refused(visit, _FORM)
+
+    async def _weigh(self, visit: Visit, answers: list[Value]) -> int:
+        """About how many bytes answers have, which are kept until the other parts have theirs."""
+        weight = weigh(answers, self._offload)
+        if weight < self._offload:
+            return weight
+        await visit.bulk.take()
+        return await asyncio.to_thread(weigh, answers, self._parameters.mirror.bytes_limit)
+
+    def _refused(self, visit: Visit, why: str) -> Value:
+        return self._fault(visit, PARSE_FAULT, "malformed", why)
+
+    def _fault(self, visit: Visit, code: int, event: str, why: str) -> Value:
+        """A fault in the place of a part's answer, recorded as this event."""
+        record = self._recorder.happened(
+            event,
+            why,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=visit.caller.peer.text,
+            category=Category.COMMAND.value,
+            resource=MULTICALL,
+        )
+        return {"faultCode": code, "faultString": f"{why} [{record}]"}
+
+
+def _in_run(visit: Visit, part: "Value | Attempt") -> bool:
+    if isinstance(part, Attempt):
+        return part.call.in_run
+    name = part.get("methodName") if isinstance(part, dict) else None
+    return isinstance(name, str) and name in visit.table and visit.table[name].call.in_run
+
+
+def _reads_what_is_written(attempt: Attempt, before: Attempt) -> bool:
+    verbs = attempt.call.verb, before.call.verb
+    return verbs == (Verb.READ, Verb.WRITE) and touch([attempt.resource], [before.resource])

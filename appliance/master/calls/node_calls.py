@@ -1,0 +1,198 @@
+"""The outer face: the node API that other nodes and tools call, answered as if the appliance were not there.
+
+`caller.target` is the incarnation the call is for. Only `getPid` and `shutdown` are carried to the node; the rest is
+answered from the registry and the relay. A `getPid` that the node does not answer breaks off as the node's own
+connection would: `rosnode` takes that for a node it cannot reach and goes on, and ends at an answer that is an error.
+The node that publishes for monitors is control itself: its process is control's. `publisherUpdate` and `paramUpdate`
+are not in the table: only a master sends those, so from anybody else they are denied like any unknown call.
+"""
+
+import os
+from dataclasses import dataclass
+
+from appliance.master.caller import Answer, Caller
+from appliance.master.calls.arguments import MESSAGE, PROTOCOLS, TOPIC
+from appliance.master.calls.call import Call, Identity, Verb, method
+from appliance.master.calls.gate import Gate
+from appliance.master.graph.liveness import Liveness
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.mediation import Mediation
+from appliance.master.reach.relays import RelayControl, tcpros_port
+from appliance.ros.uris import node_uri
+from appliance.ros.xmlrpc import Value
+from appliance.rpc.client import CallFailedError
+from appliance.rpc.server import NoAnswerError
+from appliance.specifications.allocation import TOPIC as TOPIC_CONNECTION
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCalls:
+    """Answers for the node that `caller.target` is. `port` is RVMaster's."""
+
+    registry: Registry
+    relay: RelayControl
+    mediation: Mediation
+    addresses: Addresses
+    liveness: Liveness
+    gate: Gate
+    port: int
+
+    async def request_topic(self, caller: Caller, topic: str, protocols: list[list[Value]]) -> Answer:
+        """`requestTopic(caller_id, topic, protocols)` → the relay's port; the grant is installed first."""
+        target = _target(caller)
+        if (Kind.PUBLICATION, topic) not in target.registrations:
+            return [-1, f"Not a publisher of [{topic}]", []]
+        names = [one[0] for one in protocols if one]
+        if "TCPROS" not in names:
+            offered = ", ".join(str(one)[:40] for one in names) or "nothing"
+            return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
+        own = target.own or self.gate.is_own_subscriber(caller, topic)  # who has no way but the relay
+        if not own and not self.mediation.carries_topic(topic):
+            return await self._negotiated_directly(target, topic, caller)
+        self.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
+        address = self.addresses.told_to(caller.peer)
+        port = self.relay.port(target, Kind.PUBLICATION, topic)
+        return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
+
+    async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
+        """The node's own TCPROS port at its peer address; the host in its answer is never followed."""
+        try:
+            answer = await self.liveness.client(target).call(
+                "requestTopic", caller.caller_id, topic, [["TCPROS"]]
+            )
+            port = tcpros_port(answer)
+        except CallFailedError:
+            self.liveness.look_at(target)
+            return [0, f"{target.name} does not answer", []]
+        return [1, f"ready on {target.host}:{port}", ["TCPROS", str(target.host), port]]
+
+    async def get_pid(self, caller: Caller) -> Answer:
+        """`getPid(caller_id)`: asked of the node."""
+        target = _target(caller)
+        if target.of_monitors:
+            return [1, "", os.getpid()]
+        try:
+            answer = await self.liveness.client(target).call("getPid", caller.caller_id)
+        except CallFailedError as error:
+            self.liveness.look_at(target)
+            raise NoAnswerError from error
+        if isinstance(answer, list) and len(answer) == 3:
+            return answer
+        return [0, f"{target.name} answered with something that is not [code, message, pid]", -1]
+
+    async def shutdown(self, caller: Caller, message: str) -> Answer:
+        """`shutdown(caller_id, msg)`: carried to the node, which often dies before it answers."""
+        target = _target(caller)
+        if target.of_monitors:
+            return [
+                0,
+                f"{target.name} publishes for the appliance's monitors; `rosrv monitor` takes those back",
+                0,
+            ]
+        try:
+            await self.liveness.client(target).call("shutdown", caller.caller_id, message)
+        except CallFailedError:
+            self.liveness.look_at(target)
+        return [1, "shutdown", 0]
+
+    async def get_name(self, caller: Caller) -> Answer:
+        """`getName(caller_id)`."""
+        return [1, "", _target(caller).name]
+
+    async def get_uri(self, caller: Caller) -> Answer:
+        """`getUri(caller_id)` → the outer URI."""
+        return [1, "", _target(caller).outer_uri(self.addresses.told_to(caller.peer))]
+
+    async def get_master_uri(self, caller: Caller) -> Answer:
+        """`getMasterUri(caller_id)` → RVMaster's."""
+        uri = node_uri(self.addresses.told_to(caller.peer), self.port)
+        return [1, uri, uri]
+
+    async def get_subscriptions(self, caller: Caller) -> Answer:
+        """`getSubscriptions(caller_id)` → `[[topic, type], …]`."""
+        return [1, "subscriptions", _typed(_target(caller), Kind.SUBSCRIPTION)]
+
+    async def get_publications(self, caller: Caller) -> Answer:
+        """`getPublications(caller_id)` → `[[topic, type], …]`."""
+        return [1, "publications", _typed(_target(caller), Kind.PUBLICATION)]
+
+    async def get_bus_info(self, caller: Caller) -> Answer:
+        """`getBusInfo(caller_id)` → `[[id, other end, direction, transport, topic, connected, text], …]`."""
+        target, address = _target(caller), self.addresses.told_to(caller.peer)
+        rows: list[Value] = []
+        for connection in self.relay.connections.values():
+            if connection.kind != TOPIC_CONNECTION:
+                continue
+            if connection.key == target.key:
+                port = self.relay.port(target, Kind.PUBLICATION, connection.resource)
+                text = f"TCPROS connection on port {port} to [{connection.host}]"
+                rows.append(
+                    [connection.number, connection.caller_id, "o", "TCPROS", connection.resource, True, text]
+                )
+            if connection.caller_id == target.name and connection.host == str(target.host):
+                publisher = self.registry.by_key(connection.key)
+                if publisher is not None:
+                    uri = publisher.outer_uri(address)
+                    port = self.relay.port(publisher, Kind.PUBLICATION, connection.resource)
+                    text = f"TCPROS connection to [{address}:{port}]"
+                    rows.append([connection.number, uri, "i", "TCPROS", connection.resource, True, text])
+        return [1, "bus info", rows]
+
+    async def get_bus_stats(self, caller: Caller) -> Answer:
+        """`getBusStats(caller_id)` → `[publications, subscriptions, services]`, from the relay's counters."""
+        target = _target(caller)
+        connections = [one for one in self.relay.connections.values() if one.kind == TOPIC_CONNECTION]
+        published: list[Value] = []
+        for topic in target.resources(Kind.PUBLICATION):
+            traffic = self.relay.traffic.get((target.key, topic))
+            size, count = (traffic.bytes, traffic.messages) if traffic is not None else (0, 0)
+            rows: list[Value] = [
+                [one.number, size, count, True]
+                for one in connections
+                if one.key == target.key and one.resource == topic
+            ]
+            published.append([topic, size, rows])
+        subscribed: list[Value] = []
+        for topic in target.resources(Kind.SUBSCRIPTION):
+            rows = []
+            for one in connections:
+                if one.resource == topic and one.caller_id == target.name and one.host == str(target.host):
+                    traffic = self.relay.traffic.get((one.key, topic))
+                    rows.append([one.number, traffic.bytes if traffic is not None else 0, -1, True])
+            subscribed.append([topic, rows])
+        return [1, "", [published, subscribed, []]]
+
+
+def _target(caller: Caller) -> Incarnation:
+    if caller.target is None:
+        raise RuntimeError("a call of the node API was made without a target")
+    return caller.target
+
+
+def _typed(target: Incarnation, kind: Kind) -> list[Value]:
+    return [[one.resource, one.detail] for one in target.registrations.values() if one.kind is kind]
+
+
+NODE_CALLS: dict[str, Call[NodeCalls]] = {
+    call.name: call
+    for call in (
+        Call(
+            "requestTopic",
+            method(NodeCalls.request_topic, TOPIC, PROTOCOLS),
+            Verb.CONNECT,
+            Kind.PUBLICATION,
+            denial=[],
+            identity=Identity.NODE,
+        ),
+        Call("getPid", method(NodeCalls.get_pid), Verb.READ, denial=-1),
+        Call("shutdown", method(NodeCalls.shutdown, MESSAGE), Verb.DO),
+        Call("getName", method(NodeCalls.get_name), Verb.READ, denial=""),
+        Call("getUri", method(NodeCalls.get_uri), Verb.READ, denial=""),
+        Call("getMasterUri", method(NodeCalls.get_master_uri), Verb.READ, denial=""),
+        Call("getSubscriptions", method(NodeCalls.get_subscriptions), Verb.READ, denial=[]),
+        Call("getPublications", method(NodeCalls.get_publications), Verb.READ, denial=[]),
+        Call("getBusInfo", method(NodeCalls.get_bus_info), Verb.READ, denial=[]),
+        Call("getBusStats", method(NodeCalls.get_bus_stats), Verb.READ, denial=[[], [], []]),
+    )
+}

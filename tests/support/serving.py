@@ -1,0 +1,83 @@
+"""RVMaster's pipeline over parts that a test has made, or stand-ins for them."""
+
+from collections.abc import Callable
+from typing import Any
+
+from appliance.master.calls.execution import Execution
+from appliance.master.calls.gate import Gate, HostLimits
+from appliance.master.calls.lookups import LookupCalls
+from appliance.master.calls.monitor_calls import MonitorCalls
+from appliance.master.calls.multicall import Multicall
+from appliance.master.calls.parameter_search import ParameterSearch
+from appliance.master.calls.parameters import ParameterCalls
+from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.calls.table import master_table
+from appliance.master.graph.registry import Registry
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.policy import Policy
+from appliance.ros.xmlrpc import Limits
+from appliance.rpc.bulk import bulk_turns
+from appliance.rpc.server import Handler
+from appliance.shares.pool import Standing
+
+
+def serving(
+    *,
+    policy: Callable[[], Policy],
+    registry: Registry,
+    graph: Any,
+    rosmaster: Any,
+    mirror: ParameterMirror,
+    recorder: Any,
+    rights: Any,
+    addresses: Any,
+    faces: Any = None,
+    relay: Any = None,
+    mediation: Any = None,
+    liveness: Any = None,
+    redecide_for: Any = None,
+    offload: int = 1 << 20,
+) -> Handler:
+    """The handler of RVMaster's listener, where every host has a node."""
+    gate = Gate(policy, registry, HostLimits())
+    parameters = ParameterCalls(rosmaster, mirror, graph, rights, offload)
+    execution = Execution(
+        gate=gate,
+        policy=policy,
+        recorder=recorder,
+        registry=registry,
+        liveness=liveness,
+        parameters=parameters,
+        redecide_for=redecide_for,
+        large=offload,
+        standing=lambda _host: Standing.REGISTERED,
+    )
+    pipeline = Pipeline(
+        execution,
+        Multicall(execution, parameters, recorder, offload=offload),
+        addresses=addresses,
+        recorder=recorder,
+        limits=Limits(),
+        offload=offload,
+        bulk=bulk_turns(lambda _host: Standing.REGISTERED),
+    )
+    monitors: Any = None
+    return pipeline.handler(
+        master_table(
+            RegistrationCalls(rosmaster, registry, graph, faces, relay, mediation, gate, rights),
+            LookupCalls(
+                rosmaster,
+                registry,
+                faces,
+                relay,
+                mediation,
+                addresses,
+                port=11311,
+                stop=lambda _reason: None,
+            ),
+            parameters,
+            ParameterSearch(rosmaster, mirror, rights),
+            MonitorCalls(monitors, registry, relay, real_port=11312, port=11311),
+        )
+    )
