@@ -14,7 +14,7 @@ import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.rest import Rest
-from tests.support.waiting import eventually
+from tests.support.waiting import allowed, eventually
 
 CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 100000, burst: 1000000}\n"
 
@@ -149,7 +149,7 @@ def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
     began = time.monotonic()
     answer = rest.request("POST", "/v1/monitors", bomb[: 1 << 19], headers)
     assert answer.status == 422
-    assert time.monotonic() - began < 10
+    assert time.monotonic() - began < allowed(10)
 
 
 @pytest.mark.parametrize("path", ["/v1/monitors", "/v1/policy", "/v1/policy/explain", "/v1/policy/rollback"])
@@ -172,7 +172,7 @@ def test_json_that_is_meant_to_hurt_is_refused(rest: Rest, path: str, body: byte
     answer = rest.request("POST", path, body, {"Content-Type": "application/json", "If-Match": "*"})
     assert answer.status in (413, 415, 422), answer.body[:300]
     assert answer.headers["content-type"] == "application/problem+json"
-    assert time.monotonic() - began < 10
+    assert time.monotonic() - began < allowed(10)
 
 
 def test_specifications_that_are_meant_to_hurt_are_refused_or_compiled_in_time(rest: Rest) -> None:
@@ -207,11 +207,11 @@ def test_specifications_that_are_meant_to_hurt_are_refused_or_compiled_in_time(r
                 "POST", "/v1/monitors?dry_run=1", data, {"Content-Type": "application/json"}
             )
             assert answer.status in (200, 422), (bomb[:80], answer.body[:300])
-            assert time.monotonic() - began < 30, bomb[:80]
+            assert time.monotonic() - began < allowed(30), bomb[:80]
     finally:
         stop.set()
         looking.join()
-    assert max(others) < 5, max(others)
+    assert max(others) < allowed(5), max(others)
 
 
 def test_names_in_paths_are_names(rest: Rest) -> None:
@@ -269,7 +269,7 @@ def test_a_hundred_thousand_headers_are_cut_off(rest: Rest) -> None:
     assert statuses(rest, many + b"\r\n") in ([], [400], [401], [431])
     long = b"GET /" + b"x" * 10_000_000 + b" HTTP/1.1\r\n\r\n"
     assert statuses(rest, long) in ([], [400], [414])
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - began < allowed(20)
 
 
 def test_methods_that_are_none_are_refused(rest: Rest) -> None:
@@ -305,7 +305,7 @@ def test_a_client_that_reads_nothing_is_not_waited_for(rest: Rest) -> None:
             idle.append(connection)
         began = time.monotonic()
         assert rest.get("/v1/status").status == 200
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < allowed(5)
     finally:
         for connection in idle:
             connection.close()

@@ -16,7 +16,7 @@ import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root
-from tests.support.waiting import eventually
+from tests.support.waiting import allowed, eventually
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_killed_api_costs_nothing_but_a_moment(appliance: Appliance) -> None:
     control = process_row(appliance, "control")["pid"]
     for _ in range(3):
         pid = appliance.kill("api")
-        assert seconds_of_a_call(appliance) < 5
+        assert seconds_of_a_call(appliance) < allowed(5)
         assert rest.get("/v1/status").status in (
             200,
             503,
@@ -74,7 +74,7 @@ def test_a_hanging_api_is_replaced(appliance: Appliance) -> None:
     assert appliance.rest().get("/healthz").status == 200
     pid = appliance.pids("api")[0]
     os.kill(pid, signal.SIGSTOP)
-    assert seconds_of_a_call(appliance) < 5
+    assert seconds_of_a_call(appliance) < allowed(5)
     until_another(appliance, "api", pid)
     assert appliance.rest().get("/healthz").status == 200
 
@@ -118,7 +118,7 @@ def test_a_flood_is_not_rvmasters_problem(appliance: Appliance) -> None:
             one.kill()
             one.wait()
     assert times
-    assert max(times) < 3, times
+    assert max(times) < allowed(3), times
     assert process_row(appliance, "control")["restarts"] == 0
 
 
@@ -185,7 +185,7 @@ def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:
         deadline = time.monotonic() + 30
         while not any("REST cannot be served" in line for line in list(appliance.process.errors)):
             assert time.monotonic() < deadline, appliance.story()
-            assert seconds_of_a_call(appliance) < 5
+            assert seconds_of_a_call(appliance) < allowed(5)
         assert process_row(appliance, "control")["restarts"] == 0
         certificate.write_text(right)
         ssl.get_server_certificate(("127.0.0.1", int(appliance.ready["api"].rpartition(":")[2])), timeout=30)

@@ -12,7 +12,7 @@ from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
 
-SLOW = 2.0  # seconds for a call of the robot in a flood, on a machine with two busy cores
+SLOW = 1.0  # seconds for a call of the robot in a flood, on a machine that does nothing else
 PARTS = 6000
 LONG = "k" * 900
 

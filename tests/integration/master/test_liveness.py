@@ -13,6 +13,7 @@ from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import needs
+from tests.support.waiting import allowed
 
 MONITORS = Path(__file__).parents[3] / "monitors"
 NOBODY = "http://10.77.0.10:1/"
@@ -69,7 +70,7 @@ def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Hos
             with Process(ThisMachine(), command, env=os.environ, label="rosrv audit tail") as tail:
                 tail.wait_for(lambda event: "sequence" in event)
                 robot.run(lambda: register("/brief", NOBODY))
-                tail.wait_for(event="node lost", caller_id="/brief", timeout=8)
+                tail.wait_for(event="node lost", caller_id="/brief", timeout=allowed(8))
 
 
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])

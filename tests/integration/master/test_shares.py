@@ -20,6 +20,7 @@ from tests.support.field import Impostor, answering
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
+from tests.support.waiting import allowed
 
 CONFIGURATION = """\
 relay: {connections: 3000, connections_per_host: 1500}
@@ -27,7 +28,7 @@ api: 10.77.0.2:8443
 api_networks: [10.77.0.0/16]
 """  # relay: fewer than by default, so that they are taken in seconds; strangers' and kept parts are as by default
 LONG_HEADER = struct.pack("<I", 60_000) + bytes(50_000)  # of 60,000 bytes that never come
-SLOW = 2.0  # seconds for a call of the robot in a flood, on a machine with two busy cores
+SLOW = 1.0  # seconds for a call of the robot in a flood, on a machine that does nothing else
 
 
 def http_request(method: str, *parameters: str) -> bytes:
@@ -109,12 +110,12 @@ def test_handshakes_with_rest(siege: Siege) -> None:
     def attack() -> None:
         crowd.hold(crowd.guests[:1], 8443, each=1000)
         crowd.hold([*crowd.guests, *crowd.strangers], 8443, each=20)
-        assert max(looks() for _ in range(10)) < SLOW
-        assert looks(siege.robot) < SLOW  # whose first request it is
+        assert max(looks() for _ in range(10)) < allowed(SLOW)
+        assert looks(siege.robot) < allowed(SLOW)  # whose first request it is
 
     looks()
     siege.throughout(attack, slowest=SLOW)
-    assert max(looks() for _ in range(10)) < SLOW
+    assert max(looks() for _ in range(10)) < allowed(SLOW)
     assert siege.memory("api") < before + (100 << 20)
 
 
