@@ -128,7 +128,11 @@ def test_the_life_of_the_package(machine: Machine) -> None:
                 "rostopic", "pub", "--rate=5", "/chatter", "std_msgs/String", "data: hello")  # fmt: skip
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output
 
+    main = machine.run("systemctl", "show", "--property=MainPID", "--value", "rosrv").output.strip()
     machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
+    machine.run(
+        "tail", f"--pid={main}", "--follow", "/dev/null"
+    )  # it is there until systemd has taken note of its end
     serves(machine)
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
         "the talker was not restarted"
