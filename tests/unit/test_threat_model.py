@@ -1,16 +1,20 @@
-"""docs/threat-model.md: its claims are tried by tests that are there."""
+"""docs/threat-model.md and docs/iec-62443.md: their claims are tried by tests that are there."""
 
 import ast
 import re
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).parents[1]
-PAGE = TESTS.parent / "docs" / "threat-model.md"
 
 
-def test_every_test_that_is_named_exists() -> None:
+@pytest.mark.parametrize("page", ["threat-model.md", "iec-62443.md"])
+def test_every_test_that_is_named_exists(page: str) -> None:
     """Each test in the tables is a function of that name in that file."""
-    named = re.findall(r"`((?:unit|integration|system)/[\w/]+\.py)(?:::(\w+))?`", PAGE.read_text())
+    named = re.findall(
+        r"`((?:unit|integration|system)/[\w/]+\.py)(?:::(\w+))?`", (TESTS.parent / "docs" / page).read_text()
+    )
     assert len(named) > 40
     missing = [f"{path}::{name}" for path, name in named if not _has(TESTS / path, name)]
     assert missing == []
