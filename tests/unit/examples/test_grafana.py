@@ -1,0 +1,84 @@
+"""Tests of the Grafana dashboard that is shipped: it asks for what is measured, and Grafana can draw it."""
+
+import json
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from appliance.metrics import METRICS
+from tests.support.requirements import need_program
+
+ROOT = Path(__file__).parents[3]
+DASHBOARD: dict[str, Any] = json.loads((ROOT / "examples/grafana/rosrv.json").read_text())
+PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+KNOWN = {metric.name: metric for metric in METRICS}
+
+
+def expressions() -> Iterator[tuple[str, str, str]]:
+    """Panel, query and legend of each series; the annotations, too."""
+    for panel in PANELS:
+        yield from ((panel["title"], target["expr"], target["legendFormat"]) for target in panel["targets"])
+    yield from ((one["name"], one["expr"], "") for one in DASHBOARD["annotations"]["list"])
+
+
+@pytest.mark.parametrize(("panel", "query", "legend"), list(expressions()), ids=lambda text: text[:40])
+def test_what_is_asked_for_is_measured(panel: str, query: str, legend: str) -> None:
+    """Every metric exists, with every label that selects, groups or names a series."""
+    names = re.findall(r"\brosrv_\w+", query)
+    assert names or query.startswith("up{"), panel
+    grouped = {
+        label for labels in re.findall(r"\bby \(([^)]*)\)", query) for label in re.split(r", *", labels)
+    }
+    for name in names:
+        metric = KNOWN.get(name) or KNOWN.get(re.sub(r"_bucket$", "", name))
+        assert metric is not None, name
+        assert name.endswith("_bucket") == (metric.kind == "histogram"), name
+        assert ("rate(" in query or "increase(" in query) == (metric.kind != "gauge"), f"{panel}: {name}"
+        selected = set(re.findall(r'(\w+)="', "".join(re.findall(rf"\b{name}{{([^}}]*)}}", query))))
+        assert "instance" in selected, f"{panel} mixes appliances"
+        assert (selected | grouped | set(re.findall(r"{{(\w+)}}", legend))) - {"instance", "le"} <= set(
+            metric.labels
+        )
+
+
+def test_prometheus_reads_every_query(tmp_path: Path) -> None:
+    """As rules of a rule file, once Grafana has put in its variables."""
+    promtool = need_program("promtool", "prometheus")
+    queries = [re.sub(r"\$__rate_interval", "1m", query) for _, query, _ in expressions()]
+    rules = [{"record": f"query:{number}", "expr": query} for number, query in enumerate(queries)]
+    file = tmp_path / "rules.yaml"
+    file.write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": rules}]}))
+    done = subprocess.run(
+        [promtool, "check", "rules", str(file)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_panels_stand_beside_each_other() -> None:
+    """On Grafana's grid of 24 columns none covers another; each has a number, a unit and a sentence of its own."""
+    taken: set[tuple[int, int]] = set()
+    for panel in DASHBOARD["panels"]:
+        place = panel["gridPos"]
+        cells = {
+            (x, y)
+            for x in range(place["x"], place["x"] + place["w"])
+            for y in range(place["y"], place["y"] + place["h"])
+        }
+        assert max(x for x, _ in cells) < 24
+        assert not cells & taken, panel["title"]
+        taken |= cells
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
+    assert all(
+        panel["description"].endswith(".") and panel["fieldConfig"]["defaults"]["unit"] for panel in PANELS
+    )
+
+
+def test_it_names_no_source_of_ours() -> None:
+    """Which Prometheus and which appliance it shows is chosen at its head; it is imported as it is."""
+    assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
+    assert {panel["datasource"]["uid"] for panel in PANELS} == {"${source}"}
