@@ -97,7 +97,8 @@ def _install_iptables(tree: Path, version: str, architecture: Architecture, lock
         _run("tar", "--extract", "--file", str(next(folder.glob("*.tar.gz"))), "--directory", str(folder))
     source = next(path for path in sorted(folder.iterdir()) if path.is_dir())
     shutil.copytree(source / "iptc", tree / "iptc")
-    metadata = tree / f"{source.name.replace('-', '_')}.dist-info"
+    name, _, release = source.name.rpartition("-")
+    metadata = tree / f"{name.replace('-', '_')}-{release}.dist-info"
     metadata.mkdir()
     shutil.copyfile(source / "PKG-INFO", metadata / "METADATA")
     shutil.copyfile(source / "NOTICE", metadata / "NOTICE")

@@ -1,0 +1,32 @@
+"""A Jetson, a Raspberry Pi: all that the program stands on is there for arm64, though nothing of it runs here."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from distribution.environment import ARCHITECTURES, INTERPRETERS, ROOT, make_environment
+from tests.support.requirements import need_program
+
+pytestmark = pytest.mark.timeout(900)
+
+
+def test_every_locked_package_is_there_for_arm64(tmp_path: Path) -> None:
+    """Wheels for both Pythons, and python-iptables compiled: every library in the tree is one for arm64."""
+    need_program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu")
+    work = tmp_path / "work"
+    work.mkdir()
+    make_environment(tmp_path / "tree", ARCHITECTURES["arm64"], work)
+    libraries = [path for path in (tmp_path / "tree").rglob("*.so*") if path.is_file()]
+    assert len(libraries) > 20
+    assert {int.from_bytes(path.read_bytes()[18:20], "little") for path in libraries} == {183}  # EM_AARCH64
+    for version in INTERPRETERS:
+        tag = f"cpython-{version.replace('.', '')}-aarch64-linux-gnu"
+        assert list((tmp_path / "tree" / f"lib/python{version}/site-packages").glob(f"libxtwrapper.{tag}.so"))
+    listed = re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+    folders = (tmp_path / "tree").rglob("*.dist-info")
+    there = {
+        re.sub(r"[_.]", "-", path.name.removesuffix(".dist-info").rpartition("-")[0].lower())
+        for path in folders
+    }
+    assert set(listed) == there

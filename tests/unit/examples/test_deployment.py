@@ -1,0 +1,56 @@
+"""Tests of what the Ansible role and the cloud-init example put on a robot (their own syntax: tests/system)."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from appliance.config_sources import resolve
+from appliance.policy import compile_policy
+
+ROOT = Path(__file__).parents[3]
+ROLE = ROOT / "examples/ansible/roles/rosrv"
+CLOUD = ROOT / "examples/cloud-init/user-data.yaml"
+
+
+def written() -> dict[str, str]:
+    """The files that cloud-init writes: path, text."""
+    data: dict[str, Any] = yaml.safe_load(CLOUD.read_text())
+    return {one["path"]: one["content"] for one in data["write_files"]}
+
+
+def test_the_role_configures_what_the_package_does(tmp_path: Path) -> None:
+    """Without a word in the inventory the configuration is the one that the package brings."""
+    settings = yaml.safe_load((ROLE / "defaults/main.yml").read_text())["rosrv_settings"]
+    assert settings == yaml.safe_load((ROOT / "distribution/appliance.yaml").read_text())
+
+
+def test_the_role_checks_before_it_writes() -> None:
+    """A configuration or policy that is wrong never reaches its place; what changes is loaded."""
+    tasks = {task["name"]: task for task in yaml.safe_load((ROLE / "tasks/main.yml").read_text())}
+    handlers = {handler["name"] for handler in yaml.safe_load((ROLE / "handlers/main.yml").read_text())}
+    placed = [task for task in tasks.values() if "/etc/rosrv" in str(task.get("ansible.builtin.copy"))]
+    assert len(placed) == 2
+    for task in placed:
+        assert task["ansible.builtin.copy"]["validate"].startswith("rosrv ")
+        assert task["notify"] in handlers
+
+
+def test_cloud_init_writes_what_is_right(tmp_path: Path) -> None:
+    """Its policy compiles, its configuration names it and has no mistake."""
+    files = written()
+    policy = compile_policy(files["/etc/rosrv/policies/robot.ini"], file="robot.ini")
+    assert list(policy.warnings) == []
+    configuration = tmp_path / "appliance.yaml"
+    configuration.write_text(files["/etc/rosrv/appliance.yaml"])
+    assert resolve(configuration, {}, {}).policy == tmp_path / "policies/robot.ini"
+
+
+def test_cloud_init_installs_only_what_it_knows() -> None:
+    """The package's checksum is looked at before it is installed; as shipped, the example installs nothing."""
+    steps = yaml.safe_load(CLOUD.read_text())["runcmd"]
+    order = [
+        next(i for i, step in enumerate(steps) if word in step) for word in ("curl", "sha256sum", "apt-get")
+    ]
+    assert order == sorted(order)
+    assert f'"{"0" * 64}  /var/cache/rosrv.deb"' in steps[order[1]]
