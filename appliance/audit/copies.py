@@ -12,15 +12,13 @@ signatures throughout. He cannot change what another machine was given before. S
 
 import json
 import re
-import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import closing
 from pathlib import Path
 
 import msgspec
 
 from appliance.audit.chain import Checkpoint, parse_checkpoint
-from appliance.audit.database import LogUnreadableError, open_for_reading
+from appliance.audit.database import LogUnreadableError, reading
 from appliance.audit.findings import Elsewhere, Finding, Kind
 from appliance.audit.signatures import signature_is_right
 
@@ -76,11 +74,11 @@ def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[Sig
         "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND signature IS NOT NULL"
         " AND public_key IS NOT NULL ORDER BY number LIMIT ?"
     )
+    with reading(log) as connection:
+        rows = connection.execute(query, (after, limit)).fetchall()
     try:
-        with closing(open_for_reading(log)) as connection:
-            rows = connection.execute(query, (after, limit)).fetchall()
         return [SignedCheckpoint.of(*row) for row in rows]
-    except (sqlite3.Error, ValueError) as error:
+    except ValueError as error:
         raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
 

@@ -7,7 +7,8 @@ is never a log in the making: it is an error that is told, and the file is left 
 import os
 import secrets
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
@@ -127,6 +128,16 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(_uri(path, mode), uri=True, isolation_level=None, timeout=_BUSY_SECONDS,
                                  check_same_thread=False)  # fmt: skip
     return _checked(connection, path, lambda _: None)
+
+
+@contextmanager
+def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[sqlite3.Connection]:
+    """A log that is open for reading in the block. Raises `LogUnreadableError`, also for what cannot be read there."""
+    try:
+        with closing(open_for_reading(path)) as connection:
+            yield connection
+    except sqlite3.Error as error:
+        raise LogUnreadableError(f"{path}: cannot be read: {error}{advice}") from error
 
 
 def _uri(path: Path, mode: str) -> str:

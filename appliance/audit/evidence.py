@@ -7,7 +7,6 @@ exported or to the signed checkpoint (`checkpoint`) that seals it. `exported.py`
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ import msgspec
 
 from appliance.audit.chain import NO_CHECKPOINT, content_hash, genesis, link
 from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.database import COLUMNS, LogUnreadableError, open_for_reading
+from appliance.audit.database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.output import Entry, as_json
 from appliance.audit.query import Filter
 from appliance.audit.search import search
@@ -59,13 +58,10 @@ def evidence_line(entry: Entry, chain: Chain) -> str:
 def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[Entry, Chain]]:
     """The records with their places; the last of them only if nothing follows it (`whole`)."""
     following = [one.sequence for one in entries[1:]] + ([0] if whole else [])
-    try:
-        with closing(open_for_reading(path)) as connection:
-            connection.execute("BEGIN")
-            reader = _Reader(connection)
-            placed = [(one, reader.place(one, after)) for one, after in zip(entries, following, strict=False)]
-    except sqlite3.Error as error:
-        raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
+    with reading(path) as connection:
+        connection.execute("BEGIN")
+        reader = _Reader(connection)
+        placed = [(one, reader.place(one, after)) for one, after in zip(entries, following, strict=False)]
     for one, chain in placed:
         if chain is None:
             raise LogUnreadableError(

@@ -12,7 +12,6 @@ the signer's memory with it) only checkpoints kept on another machine can show.
 import re
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -22,7 +21,7 @@ from appliance.audit import database
 from appliance.audit.chain import NO_CHECKPOINT, Removal, StoredColumns, follows, genesis
 from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
 from appliance.audit.copies import CopiesAudit, SignedCheckpoint
-from appliance.audit.database import LogUnreadableError, open_for_reading
+from appliance.audit.database import reading
 from appliance.audit.findings import Elsewhere, Finding, Kind, Verification
 from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_right
 
@@ -56,16 +55,10 @@ class _Removal(msgspec.Struct, frozen=True):
 
     def is_signed(self, log: str, key: bytes) -> bool:
         """Whether the signer with this key has signed exactly this removal."""
-        removal = Removal(
-            log,
-            self.last_checkpoint,
-            self.last_sequence,
-            self.last_hash,
-            self.last_checkpoint_hash,
-            self.limit,
-        )
+        checkpoint, sequence = self.last_checkpoint, self.last_sequence
+        gone = Removal(log, checkpoint, sequence, self.last_hash, self.last_checkpoint_hash, self.limit)
         try:
-            return signature_is_right(key, bytes.fromhex(self.signature), removal.text())
+            return signature_is_right(key, bytes.fromhex(self.signature), gone.text())
         except ValueError:
             return False
 
@@ -94,21 +87,14 @@ def verify(
     """
     if public_key is None and pinned_key_path(path).exists():
         public_key = read_public_key(pinned_key_path(path))
-    try:
-        with closing(open_for_reading(path)) as connection:
-            connection.text_factory = _undecoded
-            log = _log_id(connection)
-            # Before the log is: what is signed while it is read is in neither, or in the log only.
-            remembered = None if signer is None else read_remembered(signer, log)
-            connection.execute("BEGIN")
-            verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
-            return verifier.run()
-    except sqlite3.Error as error:
-        raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
-
-
-def _undecoded(text: bytes) -> str:
-    return text.decode("utf-8", "surrogateescape")
+    with reading(path, advice="") as connection:
+        connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+        log = _log_id(connection)
+        # Before the log is: what is signed while it is read is in neither, or in the log only.
+        remembered = None if signer is None else read_remembered(signer, log)
+        connection.execute("BEGIN")
+        verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
+        return verifier.run()
 
 
 class _Row(NamedTuple):
@@ -274,9 +260,7 @@ class _Verifier:
         query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
         try:
             row = self._connection.execute(query).fetchone()
-            if row is None:
-                return None
-            return msgspec.json.decode(row[0], type=_Removal)
+            return None if row is None else msgspec.json.decode(row[0], type=_Removal)
         except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
             return None  # a damaged record is found when it is walked
 

@@ -9,18 +9,16 @@ Invariants:
 5. Of a log that was put back from a copy, what is recorded in the place of what had been sent is sent as well.
 """
 
-import sqlite3
 import time
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import structlog
 
 from appliance.audit.copies import signed_checkpoints
-from appliance.audit.database import LogUnreadableError, open_for_reading
+from appliance.audit.database import LogUnreadableError, reading
 from appliance.audit.output import Entry
 from appliance.audit.query import Filter
 from appliance.audit.record import Record, Severity
@@ -173,13 +171,10 @@ class Forwarder:
 
 def _extent(path: Path) -> tuple[int, int, str]:
     """First and last sequence, and the log's id. Raises `LogUnreadableError`."""
-    try:
-        with closing(open_for_reading(path)) as connection:
-            query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
-            first, last = connection.execute(query).fetchone()
-            (log_id,) = connection.execute("SELECT id FROM log").fetchone()
-    except sqlite3.Error as error:
-        raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
+    with reading(path, advice="") as connection:
+        query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
+        first, last = connection.execute(query).fetchone()
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
     return int(first), int(last), str(log_id)
 
 
@@ -189,23 +184,20 @@ def _in_log(path: Path, position: Position) -> Position:
     A log that was put back from a copy went on from there: its ids are in order of time, so what is later than the
     last record that was sent is new, whatever its sequence.
     """
-    try:
-        with closing(open_for_reading(path)) as connection:
-            query = "SELECT id FROM record WHERE sequence = ?"
-            found = connection.execute(query, (position.sequence,)).fetchone()
-            query = "SELECT coalesce(max(sequence), 0) FROM record"
-            (head,) = connection.execute(query).fetchone()
-            is_there = not position.record or found is None or found[0] == position.record
-            if is_there and position.sequence <= head:
-                return position
-            query = "SELECT min(sequence) - 1 FROM record WHERE id > ?"
-            (before,) = (
-                connection.execute(query, (position.record,)).fetchone() if position.record else (None,)
-            )
-            sequence = min(position.sequence, head) if before is None else int(before)
-            query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?"
-            (number,) = connection.execute(query, (sequence,)).fetchone()
-    except sqlite3.Error as error:
-        raise LogUnreadableError(f"{path}: cannot be read: {error}") from error
+    with reading(path, advice="") as connection:
+
+        def ask(query: str, *values: object) -> Any:
+            row = connection.execute(query, values).fetchone()
+            return None if row is None else row[0]
+
+        found = ask("SELECT id FROM record WHERE sequence = ?", position.sequence)
+        head = ask("SELECT coalesce(max(sequence), 0) FROM record")
+        is_there = not position.record or found is None or found == position.record
+        if is_there and position.sequence <= head:
+            return position
+        later = "SELECT min(sequence) - 1 FROM record WHERE id > ?"
+        before = ask(later, position.record) if position.record else None
+        sequence = min(position.sequence, head) if before is None else int(before)
+        number = ask("SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?", sequence)
     _log.warning("the audit log was put back from a copy: it is forwarded from there", sequence=sequence)
     return Position(position.log, sequence, min(position.checkpoint, int(number)))
