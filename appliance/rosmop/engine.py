@@ -25,7 +25,7 @@ from typing import Literal
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.batch import Walker, walkers
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
-from appliance.rosmop.faults import explain, line_of
+from appliance.rosmop.faults import explain, happened
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
@@ -344,14 +344,14 @@ class MonitorSet:
     def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
         """Give the message to an event; whether it was dropped."""
         try:
-            happened = step.function(message)
+            has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            if line_of(error) >= step.event.action_line:
+            if happened(error, step.event.action_line):
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
             self._block(message, outcome)
             return message.dropped
-        if not happened:
+        if not has_happened:
             if message.past:
                 self._past(step, message)
             return False

@@ -1,10 +1,12 @@
-"""From an exception in generated code to a place in the text and the values of its variables."""
+"""From an exception, of generated code or of the interpreter, to a place in the text and the values of variables."""
 
 import struct
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
 from appliance.rosmop.compile.module import FILENAME, Module, Site
+from appliance.rosmop.ir.interpreter import Stopped
 from appliance.rosmop.outcomes import Fault
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import FaultError, MalformedError
@@ -12,10 +14,13 @@ from appliance.rosmop.runtime.context import FaultError, MalformedError
 
 def explain(error: Exception, module: Module, monitor: str, otherwise: Position) -> Fault:
     """The fault that an exception is. `otherwise` is where it stands if the code has no better place."""
-    line, variables = _innermost(error.__traceback__)
-    number = error.site if isinstance(error, FaultError) else -1
-    if number < 0:
-        number = module.site_of_line(line)
+    if isinstance(error, Stopped):
+        number, variables, error = error.site, error.variables, error.error
+    else:
+        line, variables = _innermost(error.__traceback__)
+        number = error.site if isinstance(error, FaultError) else -1
+        if number < 0:
+            number = module.site_of_line(line)
     site = module.sites[number] if number >= 0 else Site(otherwise)
     values = {}
     for name, code, show in site.variables:
@@ -25,14 +30,16 @@ def explain(error: Exception, module: Module, monitor: str, otherwise: Position)
     return Fault(monitor, site.position, _text(error), values)
 
 
-def line_of(error: Exception) -> int:
-    """The line of the outermost function of generated code at which the exception came about."""
+def happened(error: Exception, action_line: int) -> bool:
+    """Whether an event had happened before the exception: its action, which begins at this line, had begun."""
+    if isinstance(error, Stopped):
+        return error.happened
     traceback = error.__traceback__
     while traceback is not None:
         if traceback.tb_frame.f_code.co_filename == FILENAME:
-            return traceback.tb_lineno
+            return traceback.tb_lineno >= action_line
         traceback = traceback.tb_next
-    return 0
+    return False
 
 
 _MISSING = object()
@@ -48,9 +55,10 @@ def _text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _innermost(traceback: TracebackType | None) -> tuple[int, dict[str, Any]]:
+def _innermost(traceback: TracebackType | None) -> tuple[int, Mapping[str, Any]]:
     """The line and the local variables of the innermost function of generated code."""
-    line, variables = 0, {}
+    line: int = 0
+    variables: Mapping[str, Any] = {}
     while traceback is not None:
         if traceback.tb_frame.f_code.co_filename == FILENAME:
             line, variables = traceback.tb_lineno, traceback.tb_frame.f_locals

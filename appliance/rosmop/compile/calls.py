@@ -1,4 +1,4 @@
-"""Calls as code: macros of rosconsole, the library, helper functions, member functions, constructors."""
+"""Calls: macros of rosconsole, the library, helper functions, member functions, constructors."""
 
 import math
 import re
@@ -13,6 +13,7 @@ from appliance.rosmop.compile.places import Value, path, root
 from appliance.rosmop.compile.provided import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.scope import HelperFunction, Scope
 from appliance.rosmop.compile.storing import require_place, store
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -74,7 +75,7 @@ def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
-        return Value(kinds.TIME, f"{scope.context}.turn.now", node.position)
+        return Value(form.Now(), node.position)
     if parts[0] == "std" and parts[-1] in cursors.ALGORITHMS:
         values = [value_of(scope, argument) for argument in node.arguments]
         return cursors.algorithm(scope, parts[-1], values, (node.position, scope.site(node)))
@@ -116,25 +117,26 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
             f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
         )
     scope.calls.add(function.name)
-    codes, targets = [], []
+    handed: list[form.Expression] = []
+    targets: list[Value] = []
     for argument, parameter in zip(node.arguments, function.parameters, strict=True):
         value = value_of(scope, argument)
         if parameter in function.references:
             targets.append(_referenced(value, parameter.type, function))
             _check_alone(targets, function)
-            codes.append(value.code)
+            handed.append(value.form)
         elif parameter.constant and value.type == parameter.type:
-            codes.append(value.code)
+            handed.append(value.form)
         else:
-            codes.append(convert(scope, value, parameter.type, scope.site(argument)))
-    if function.recursive:
-        codes.append("n + 1" if scope.recursive else "0")
-    code = f"{function.code}({', '.join(codes)})"
-    if targets:
-        result = scope.temporary()
-        stores = [store(scope, target, f"{result}[{i}]") for i, target in enumerate(targets, 1)]
-        code = f"(({result} := {code}), {', '.join(stores)}, {result}[0])[-1]"
-    return Value(function.result, code, node.position, pure=False)
+            handed.append(convert(scope, value, parameter.type, scope.site(argument)))
+    depth = scope.recursive if function.recursive else None
+    call = form.Invoke(function.result, function.code, tuple(handed), depth)
+    if not targets:
+        return Value(call, node.position, pure=False)
+    result = form.Read(kinds.VOID, scope.temporary())
+    stores = [store(scope, target, form.Item(target.type, result, i)) for i, target in enumerate(targets, 1)]
+    items = (form.Assign(kinds.VOID, result.name, call), *stores, form.Item(function.result, result, 0))
+    return Value(form.Sequence(function.result, items, -1), node.position, pure=False)
 
 
 def _referenced(value: Value, kind: kinds.Type, function: HelperFunction) -> Value:
@@ -171,7 +173,7 @@ def _check_alone(targets: Sequence[Value], function: HelperFunction) -> None:
 def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueOf) -> Value:
     level, stream, variant = macro.groups()
     arguments = list(node.arguments)
-    guard = ""
+    guard: form.Expression | None = None
     if variant is not None and variant != "_ONCE":
         if not arguments:
             raise SpecificationError.at(node.position, f"`{macro[0]}` needs a first argument")
@@ -179,18 +181,19 @@ def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueO
         if variant == "_COND":
             guard = condition(first)
         elif variant == "_THROTTLE":
-            seconds = number(convert(scope, first, kinds.DOUBLE), kinds.DOUBLE, kinds.DOUBLE)
-            guard = f"{scope.context}.throttle({seconds}, {scope.site(node)})"
+            guard = form.Throttle(convert(scope, first, kinds.DOUBLE), scope.site(node))
     elif variant == "_ONCE":
-        guard = f"{scope.context}.throttle(c_inf, {scope.site(node)})"
+        guard = form.Throttle(form.Literal(kinds.DOUBLE, math.inf), scope.site(node))
     if stream:
         if len(arguments) != 1:
             raise SpecificationError.at(node.position, f"`{macro[0]}` takes what is printed: `a << b`")
         value = streamed(scope, node, level, arguments[0], value_of)
     else:
         value = _log(scope, node, level, tuple(arguments), value_of)
-    code = f"({value.code} if {guard} else None)" if guard else value.code
-    return Value(kinds.VOID, code, node.position, pure=False)
+    if guard is None:
+        return value
+    nothing = form.Literal(kinds.VOID, None)
+    return Value(form.Conditional(kinds.VOID, guard, value.form, nothing), node.position, pure=False)
 
 
 def _log(
@@ -199,9 +202,8 @@ def _log(
     if not arguments:
         raise SpecificationError.at(node.position, "there is nothing to print; write a text")
     template, *rest = (value_of(scope, argument) for argument in arguments)
-    text = formatted(scope, template, rest)
-    code = f"{scope.context}.log({level!r}, {text}, {scope.site(node)})"
-    return Value(kinds.VOID, code, node.position, pure=False)
+    line = form.Log(level, formatted(scope, template, rest), scope.site(node))
+    return Value(line, node.position, pure=False)
 
 
 def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
@@ -209,8 +211,7 @@ def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
     if len(node.arguments) != 1:
         raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
     text = convert(scope, value_of(scope, node.arguments[0]), kinds.STRING)
-    code = f"{scope.context}.log('INFO', {text}, {scope.site(node)})"
-    return Value(kinds.VOID, code, node.position, pure=False)
+    return Value(form.Log("INFO", text, scope.site(node)), node.position, pure=False)
 
 
 def stream_of(node: tree.Expression) -> str | None:
@@ -233,7 +234,7 @@ def streamed(
     *,
     headed: bool = False,
 ) -> Value:
-    """Code that prints `a << b << c`; `headed` if the first is the stream itself."""
+    """Print `a << b << c`; `headed` if the first is the stream itself."""
     parts: list[tree.Expression] = []
     while isinstance(chain, tree.Binary) and chain.operator == "<<":
         parts.append(chain.right)
@@ -241,14 +242,14 @@ def streamed(
     parts += [] if headed else [chain]
     stream = Stream(scope, scope.site(node))
     pieces = [_piece(scope, stream, part, value_of) for part in reversed(parts)]
-    row, site = "".join(f"{piece}, " for piece in pieces if piece), scope.site(node)
-    code = f"{scope.context}.log({level!r}, p_join({scope.context}, ({row}), {site}), {site})"
-    return Value(kinds.VOID, code, node.position, pure=False)
+    site = scope.site(node)
+    text = form.Join(tuple(piece for piece in pieces if piece is not None), site)
+    return Value(form.Log(level, text, site), node.position, pure=False)
 
 
-def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> str | None:
+def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> form.Expression | None:
     if isinstance(part, tree.Name) and part.parts[-1] == "endl":
-        return "b'\\n'"
+        return form.Literal(kinds.STRING, b"\n")
     if isinstance(part, tree.Call) and isinstance(part.callee, tree.Name):
         name, arguments = part.callee.parts[-1], part.arguments
         if name == "setprecision" and len(arguments) == 1:
@@ -269,20 +270,20 @@ def construct(
 ) -> Value:
     """`type(arguments)`."""
     if not arguments:
-        return Value(kind, scope.codecs.zero(kind), position)
+        return Value(form.Zero(kind), position)
     values = [value_of(scope, argument) for argument in arguments if not isinstance(argument, tree.Elements)]
     site = scope.lines.site
     if isinstance(kind, kinds.Vector):
-        return Value(kind, _vector(scope, kind, arguments, values, value_of), position)
+        return Value(_vector(scope, kind, arguments, values, value_of), position)
     if isinstance(kind, kinds.Time | kinds.Duration) and values and kinds.is_number(values[0].type):
-        return Value(kind, _moment(kind, values, site), position)
+        return Value(_moment(kind, values, site), position)
     if isinstance(kind, kinds.String) and len(values) == 2:
         count = convert(scope, values[0], kinds.ULONG)
         character = convert(scope, values[1], kinds.CHAR)
-        return Value(kind, f"e_repeat({scope.context}, {count}, {character}, {site})", position)
+        return Value(form.Call(kind, "e_repeat", (count, character), site), position)
     if len(arguments) != 1 or len(values) != 1 or isinstance(kind, kinds.Void):
         raise SpecificationError.at(position, f"{kind} cannot be made from this")
-    return Value(kind, convert(scope, values[0], kind), position, pure=values[0].pure)
+    return Value(convert(scope, values[0], kind), position, pure=values[0].pure)
 
 
 def _vector(
@@ -291,35 +292,34 @@ def _vector(
     arguments: Sequence[tree.Expression],
     values: Sequence[Value],
     value_of: ValueOf,
-) -> str:
+) -> form.Expression:
     site = scope.lines.site
     if len(arguments) == 1 and isinstance(arguments[0], tree.Elements):
         return elements(scope, arguments[0], kind, value_of)
     if len(values) == 1 and isinstance(values[0].type, kinds.Vector):
         return convert(scope, values[0], kind, site)
-    codecs = scope.codecs
     if not values or len(values) > 2 or not kinds.is_number(values[0].type):
         raise SpecificationError.at(
             arguments[0].position, f"a {kind} is made from a size, and a value for all"
         )
-    count = number(values[0].code, values[0].type, kinds.ULONG)
-    width = codecs.width(kind.element)
+    count = number(values[0].form, kinds.ULONG)
     if len(values) == 1:
-        return f"l_filled({scope.context}, {count}, {codecs.maker(kind.element)}, {width}, {site})"
+        width = form.Literal(kinds.ULONG, scope.codecs.width(kind.element))
+        return form.Call(kind, "l_filled", (count, form.OfType("zero", kind.element), width), site)
     value = convert(scope, values[1], kind.element, site)
-    copied = codecs.copy(kind.element, scope.context, "e", site)
-    measure = scope.module.use(codecs.measure(kind.element))
-    return f"e_fill({scope.context}, {count}, {value}, lambda e: {copied}, {measure}, {site})"
+    copy, measure = form.OfType("copy", kind.element, site), form.OfType("measure", kind.element)
+    return form.Call(kind, "e_fill", (count, value, copy, measure), site)
 
 
-def _moment(kind: kinds.Type, values: Sequence[Value], site: int) -> str:
-    limit = "m_time" if isinstance(kind, kinds.Time) else "m_duration"
+def _moment(kind: kinds.Type, values: Sequence[Value], site: int) -> form.Expression:
     if len(values) == 1:
-        return f"{limit}(m_nanoseconds({values[0].code}, {site}), {site})"
+        seconds = form.Call(kinds.LONG, "m_nanoseconds", (values[0].form,), site)
+        limit = "m_time" if isinstance(kind, kinds.Time) else "m_duration"
+        return form.Call(kind, limit, (seconds,), site)
     if len(values) != 2:
         raise SpecificationError.at(values[2].position, f"{kind} takes seconds, or seconds and nanoseconds")
-    second, nano = (number(value.code, value.type, kinds.LONG) for value in values)
-    return f"{limit}({second} * 1000000000 + {nano}, {site})"
+    second, nano = (number(value.form, kinds.LONG) for value in values)
+    return form.MomentOf(kind, second, nano, site)
 
 
 def limits_of(kind: kinds.Type) -> Mapping[str, int | float]:

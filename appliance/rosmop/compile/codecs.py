@@ -4,48 +4,22 @@ A message is the list of its fields; numbers that follow each other are read and
 """
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 from appliance.rosmop.compile.module import Module
+from appliance.rosmop.ir.values import BILLION, Values, struct_code, struct_size
 from appliance.rosmop.runtime import vectors, wire
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, Slot
 
-_CODES = {
-    (True, 8): "b",
-    (False, 8): "B",
-    (True, 16): "h",
-    (False, 16): "H",
-    (True, 32): "i",
-    (False, 32): "I",
-    (True, 64): "q",
-    (False, 64): "Q",
-}
-_MOMENTS: dict[Type, str] = {kinds.TIME: "II", kinds.DURATION: "ii"}
-_BILLION = 1_000_000_000
 
-
-def struct_code(kind: Type) -> str | None:
-    """The `struct` code of a type of fixed size, None for others."""
-    if isinstance(kind, kinds.Bool):
-        return "?"
-    if isinstance(kind, kinds.Integer):
-        return _CODES[kind.signed, kind.bits]
-    if isinstance(kind, kinds.Floating):
-        return "f" if kind.bits == 32 else "d"
-    return _MOMENTS.get(kind)
-
-
-class Codecs:
+class Codecs(Values):
     """Makes the functions of each type once and knows their names."""
 
     def __init__(self, module: Module, messages: Messages) -> None:
+        super().__init__(messages)
         self._module = module
-        self._messages = messages
         self._made: dict[tuple[str, Type], str] = {}
-        self._measures: dict[Type, Callable[[Any], int]] = {}
         for name in ("text", "text_end", "count", "numbers", "moments", "elements", "skip", "skip_inner"):
             module.namespace[f"w_{name}"] = getattr(wire, name)
         for name in ("put_text", "put_numbers", "put_moments"):
@@ -56,17 +30,7 @@ class Codecs:
 
     # Values
 
-    def width(self, kind: Type) -> int:
-        """The bytes that C++ takes for a value (without what a string or vector in it points to)."""
-        if isinstance(kind, kinds.Integer | kinds.Floating):
-            return kind.bits // 8
-        if isinstance(kind, kinds.Record):
-            return sum(self.width(slot.type) for slot in self._messages.slots(kind.name).values()) or 1
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
-            return kind.length * self.width(kind.element)
-        return 1 if isinstance(kind, kinds.Bool) else 8 if kind in (kinds.TIME, kinds.DURATION) else 32
-
-    def zero(self, kind: Type) -> str:
+    def zero_text(self, kind: Type) -> str:
         """An expression for a zero value."""
         if isinstance(kind, kinds.Bool):
             return "False"
@@ -86,19 +50,19 @@ class Codecs:
         if key in self._made:
             return self._made[key]
         if isinstance(kind, kinds.Record):
-            zeros = [self.zero(slot.type) for slot in self._messages.slots(kind.name).values()]
+            zeros = [self.zero_text(slot.type) for slot in self._messages.slots(kind.name).values()]
             body = f"[{', '.join(zeros)}]"
         elif isinstance(kind, kinds.Vector) and kind.length is not None:
-            zero = self.zero(kind.element)
+            zero = self.zero_text(kind.element)
             scalar = kinds.is_scalar(kind.element)
             body = f"[{zero}] * {kind.length}" if scalar else f"[{zero} for _ in w_range({kind.length})]"
         else:
-            body = self.zero(kind)
+            body = self.zero_text(kind)
         name = self._made[key] = self._module.fresh("z")
         self._module.add([(f"def {name}():", -1), (f"    return {body}", -1)])
         return name
 
-    def copy(self, kind: Type, context: str, code: str, site: int) -> str:
+    def copy_text(self, kind: Type, context: str, code: str, site: int) -> str:
         """An expression for a copy of a value."""
         if kinds.is_scalar(kind):
             return code
@@ -126,33 +90,9 @@ class Codecs:
     def _copied(self, kind: Type, code: str) -> str:
         return code if kinds.is_scalar(kind) else f"{self._copier(kind)}(c, {code}, s)"
 
-    def measure(self, kind: Type) -> Callable[[Any], int]:
-        """A function that says how many bytes a value holds."""
-        if kind not in self._measures:
-            self._measures[kind] = self._measure(kind)
-        return self._measures[kind]
-
-    def _measure(self, kind: Type) -> Callable[[Any], int]:
-        if isinstance(kind, kinds.String | kinds.Characters):
-            return len
-        if isinstance(kind, kinds.Vector):
-            width, inner = self.width(kind.element), self.measure(kind.element)
-            if struct_code(kind.element):
-                return lambda values: len(values) * width
-            return lambda values: len(values) * width + sum(map(inner, values))
-        if isinstance(kind, kinds.Record):
-            large = [
-                (slot.index, self.measure(slot.type))
-                for slot in self._messages.slots(kind.name).values()
-                if not struct_code(slot.type)
-            ]
-            own = self.width(kind)
-            return lambda record: own + sum(measure(record[index]) for index, measure in large)
-        return lambda _: 8
-
     # Decoding
 
-    def decode(self, kind: Type, buffer: str, start: str) -> str:
+    def decode_text(self, kind: Type, buffer: str, start: str) -> str:
         """An expression for the pair of the value at `start` and where it ends."""
         if isinstance(kind, kinds.String):
             return f"w_text({buffer}, {start})"
@@ -177,14 +117,14 @@ class Codecs:
                 lines += self._decode_run(run, values) if fixed else self._decode_slot(run[0], values)
             return [*lines, f"return [{', '.join(values[index] for index in sorted(values))}], p"]
         if isinstance(kind, kinds.Vector):
-            return self._decode_vector(kind)
+            return self._decode_vector_lines(kind)
         code = struct_code(kind) or ""
         unpack, size = self._module.struct("<" + code, "unpack_from"), struct_size(code)
         if len(code) == 2:
-            return [f"q, r = {unpack}(b, p)", f"return q * {_BILLION} + r, p + {size}"]
+            return [f"q, r = {unpack}(b, p)", f"return q * {BILLION} + r, p + {size}"]
         return [f"return {unpack}(b, p)[0], p + {size}"]
 
-    def _decode_vector(self, kind: kinds.Vector) -> list[str]:
+    def _decode_vector_lines(self, kind: kinds.Vector) -> list[str]:
         lines = []
         number = str(kind.length)
         if kind.length is None:
@@ -204,7 +144,7 @@ class Codecs:
             codes += code
             if len(code) == 2:
                 names += [f"q{slot.index}", f"r{slot.index}"]
-                values[slot.index] = f"q{slot.index} * {_BILLION} + r{slot.index}"
+                values[slot.index] = f"q{slot.index} * {BILLION} + r{slot.index}"
             else:
                 names.append(f"f{slot.index}")
                 values[slot.index] = f"f{slot.index}"
@@ -213,7 +153,7 @@ class Codecs:
 
     def _decode_slot(self, slot: Slot, values: dict[int, str]) -> list[str]:
         values[slot.index] = f"f{slot.index}"
-        return [f"f{slot.index}, p = {self.decode(slot.type, 'b', 'p')}"]
+        return [f"f{slot.index}, p = {self.decode_text(slot.type, 'b', 'p')}"]
 
     def _runs(self, kind: kinds.Record) -> list[tuple[bool, list[Slot]]]:
         """The fields in groups: numbers that follow each other, or one field of another kind."""
@@ -266,23 +206,5 @@ class Codecs:
         for kind, code in values:
             struct_codes = struct_code(kind) or ""
             codes += struct_codes
-            arguments.append(f"{code} // {_BILLION}, {code} % {_BILLION}" if len(struct_codes) == 2 else code)
+            arguments.append(f"{code} // {BILLION}, {code} % {BILLION}" if len(struct_codes) == 2 else code)
         return f"{self._module.struct('<' + codes, 'pack')}({', '.join(arguments)})"
-
-    # Lengths
-
-    def least(self, kind: Type) -> int:
-        """The bytes of the shortest value."""
-        code = struct_code(kind)
-        if code is not None:
-            return struct_size(code)
-        if isinstance(kind, kinds.Record):
-            return self._messages.definitions.layout(kind.name).minimum
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
-            return kind.length * self.least(kind.element)
-        return 4
-
-
-def struct_size(codes: str) -> int:
-    """The bytes of values with these `struct` codes."""
-    return sum({"?": 1, "b": 1, "h": 2, "i": 4, "q": 8, "f": 4, "d": 8}[code.lower()] for code in codes)

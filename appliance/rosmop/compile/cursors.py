@@ -3,26 +3,18 @@
 A cursor is an index into a vector that is known when the code is compiled; it is no value that a variable holds.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.rosmop.compile.conversion import convert, number, wrapped
+from appliance.rosmop.compile.conversion import convert, number
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import mark, require_place
+from appliance.rosmop.compile.storing import mark, marked, require_place
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
-from appliance.rosmop.runtime import vectors
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-
-FUNCTIONS: dict[str, Callable[..., object]] = {
-    "k_erase": vectors.erase,
-    "k_insert": vectors.insert,
-    "k_sort": vectors.sort,
-    "k_reverse": vectors.reverse,
-    "k_sum": vectors.accumulate,
-}
 
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 """Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
@@ -42,35 +34,36 @@ def moved(operator: str, left: Value, right: Value, position: Position) -> Value
     """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
     if not isinstance(left.type, Cursor) or operator not in ("+", "-"):
         return None
+    pure = left.pure and right.pure
     if kinds.is_number(right.type):
-        code = f"({left.code} {operator} {number(right.code, right.type, kinds.LONG)})"
-        return Value(left.type, code, position, pure=left.pure and right.pure)
+        function, distance = "k_after" if operator == "+" else "k_before", number(right.form, kinds.LONG)
+        return Value(form.Call(left.type, function, (left.form, distance)), position, pure=pure)
     if isinstance(right.type, Cursor) and operator == "-":
-        return Value(kinds.LONG, f"({left.code} - {right.code})", position, pure=left.pure and right.pure)
+        return Value(form.Call(kinds.LONG, "k_before", (left.form, right.form)), position, pure=pure)
     return None
 
 
 def begin_or_end(base: Value, name: str, position: Position) -> Value:
     """`v.begin()` or `v.end()`."""
-    return Value(Cursor(base), "0" if name == "begin" else f"l_len({base.code})", position, pure=base.pure)
+    kind = Cursor(base)
+    place = form.Literal(kind, 0) if name == "begin" else form.Call(kind, "l_len", (base.form,))
+    return Value(place, position, pure=base.pure)
 
 
 def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
     """`v.erase(place)`, `v.erase(first, last)`."""
-    codes = [_index(base, cursor) for cursor in cursors]
-    last = codes[1] if len(codes) > 1 else "None"
-    return _changed(scope, base, f"k_erase({scope.context}, {base.code}, {codes[0]}, {last}, {at[1]})", at[0])
+    first, last = _index(base, cursors[0]), form.Literal(kinds.VOID, None)
+    arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
+    return _changed(scope, base, form.Call(kinds.VOID, "k_erase", arguments, at[1]), at[0])
 
 
 def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
     """`v.insert(place, value)`."""
     kind = _vector(base, at[0])
     value = convert(scope, arguments[1], kind.element, at[1])
-    width = scope.codecs.width(kind.element)
-    place = _index(base, arguments[0])
-    return _changed(
-        scope, base, f"k_insert({scope.context}, {base.code}, {place}, {value}, {width}, {at[1]})", at[0]
-    )
+    width = form.Literal(kinds.ULONG, scope.codecs.width(kind.element))
+    handed = (base.form, _index(base, arguments[0]), value, width)
+    return _changed(scope, base, form.Call(kinds.VOID, "k_insert", handed, at[1]), at[0])
 
 
 def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -80,17 +73,21 @@ def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Positi
         raise SpecificationError.at(position, f"`{name}` goes from `v.begin()` to `v.end()`")
     base = values[0].type.vector
     kind = _vector(base, position)
-    span = f"{base.code}, {values[0].code}, {_index(base, values[1])}, {site}"
+    span = (base.form, values[0].form, _index(base, values[1]))
     if name == "accumulate":
-        return _sum(scope, values, span, at)
+        return _sum(values, span, at)
     if len(values) != 2:
         raise SpecificationError.at(values[2].position, f"`{name}` with a function of one's own is not known")
     if name == "sort" and not kinds.is_scalar(kind.element):
         raise SpecificationError.at(position, f"a {kind} has no order to sort by")
-    return _changed(scope, base, f"k_{name}({scope.context}, {span})", position)
+    return _changed(scope, base, form.Call(kinds.VOID, f"k_{name}", span, site), position)
 
 
-def _sum(scope: Scope, values: Sequence[Value], span: str, at: tuple[Position, int]) -> Value:
+def _sum(
+    values: Sequence[Value],
+    span: tuple[form.Expression, form.Expression, form.Expression],
+    at: tuple[Position, int],
+) -> Value:
     if len(values) != 3 or not kinds.is_number(values[2].type):
         raise SpecificationError.at(
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
@@ -101,10 +98,7 @@ def _sum(scope: Scope, values: Sequence[Value], span: str, at: tuple[Position, i
     if not kinds.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")
     wide = kinds.common(kind, element)
-    added = f"{number('a', kind, wide)} + {number('e', element, wide)}"
-    result = wrapped(added, wide) if isinstance(wide, kinds.Integer) else f"({added})"
-    step = f"lambda a, e: {number(result, wide, kind)}"
-    return Value(kind, f"k_sum({scope.context}, {span}, {values[2].code}, {step})", at[0])
+    return Value(form.Accumulate(kind, *span, values[2].form, wide, at[1]), at[0])
 
 
 def _vector(base: Value, position: Position) -> kinds.Vector:
@@ -113,13 +107,12 @@ def _vector(base: Value, position: Position) -> kinds.Vector:
     return base.type
 
 
-def _index(base: Value, cursor: Value) -> str:
-    if not isinstance(cursor.type, Cursor) or cursor.type.vector.code != base.code:
+def _index(base: Value, cursor: Value) -> form.Expression:
+    if not isinstance(cursor.type, Cursor) or cursor.type.vector.form != base.form:
         raise SpecificationError.at(cursor.position, "write `v.begin() + n` of the same vector")
-    return cursor.code
+    return cursor.form
 
 
-def _changed(scope: Scope, base: Value, code: str, position: Position) -> Value:
+def _changed(scope: Scope, base: Value, change: form.Expression, position: Position) -> Value:
     require_place(base, "this")
-    flag = mark(scope, base)
-    return Value(kinds.VOID, f"(({flag} := True), {code})[1]" if flag else code, position, pure=False)
+    return Value(marked(mark(scope, base), change), position, pure=False)

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.compile.conversion import condition, refusal
 from appliance.rosmop.compile.expressions import value_of
-from appliance.rosmop.compile.fields import Bound, check_overlaps, pending, read_fields, write_back
+from appliance.rosmop.compile.fields import Bound, check_overlaps, read_fields, writes
 from appliance.rosmop.compile.locate import type_of_path
-from appliance.rosmop.compile.module import Lines
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import check_topic, write
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
@@ -57,11 +57,8 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
     scope.message_type = kind
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    body = _body(scope, event, trigger, kind)
-    lines, action_starts = _assemble(scope, event, bound, body)
-    header = [(f"def {function}(m):", -1), *_globals(scope)]
-    action_line = shared.module.next_line + len(header) + action_starts
-    shared.module.add(header + lines)
+    happens = _assemble(scope, event, bound, *_body(scope, event, trigger))
+    action_line = shared.define(scope.function(function, ("m",), happens=happens))
     service = trigger.type if trigger.part is not None else None
     return EventCode(
         event.name,
@@ -85,13 +82,9 @@ def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, functio
     scope.drop_refused = "a timer has no message to drop"
     scope.lines.site = scope.site(event)
     write(scope, event.action)
-    scope.lines.add("return True")
-    shared.module.add([(f"def {function}(m):", -1), *_globals(scope), *scope.lines.lines])
+    scope.add(form.Leave(scope.lines.site, True))
+    shared.define(scope.function(function, ("m",)))
     return EventCode(event.name, function, event.position, period_ns=event.trigger.period_ns)
-
-
-def _globals(scope: Scope) -> list[tuple[str, int]]:
-    return [(f"    global {', '.join(sorted(scope.written))}", -1)] if scope.written else []
 
 
 def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
@@ -199,58 +192,45 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 
 
 def _body(
-    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: str
-) -> tuple[list[tuple[str, int]], list[tuple[str, int]]]:
-    """The lines of `when` and of the action. They come first, because they say which fields are needed."""
-    teller = scope.module.fresh("u")
-    scope.read_message = lambda: _whole(scope, teller, kind)
-    own, scope.lines = scope.lines, Lines()
+    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger
+) -> tuple[list[form.Statement], list[form.Statement]]:
+    """The `when` and the action. They come first, because they say which fields are needed."""
     when = trigger.when
-    if when is not None:
-        with scope.at(when):
-            try:
-                scope.lines.add(f"if not {condition(value_of(scope, when))}: return False")
-            except SpecificationError as error:
-                scope.shared.findings += error.findings
-        if scope.changes_anything():
-            raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
-    conditions, scope.lines = scope.lines, Lines()
-    scope.lines.site = own.site
-    write(scope, event.action)
-    action, scope.lines = scope.lines, own
-    return conditions.lines, action.lines
-
-
-def _whole(scope: Scope, teller: str, kind: str) -> str:
-    """Code for `MESSAGE`: the message with what was assigned so far, which `teller` tells."""
-    scope.whole_asked = teller
-    record = kinds.Record(kind)
-    return f"x_whole(m, {scope.context}, {scope.codecs.decoder(record)}, {teller}(), {scope.lines.site})"
+    with scope.nested() as conditions:
+        if when is not None:
+            with scope.at(when):
+                try:
+                    test = condition(value_of(scope, when))
+                    scope.add(form.Require(scope.lines.site, test))
+                except SpecificationError as error:
+                    scope.shared.findings += error.findings
+            if scope.changes_anything():
+                raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
+    with scope.nested() as action:
+        write(scope, event.action)
+    return conditions, action
 
 
 def _assemble(
     scope: Scope,
     event: tree.Event,
     bound: list[Bound],
-    body: tuple[list[tuple[str, int]], list[tuple[str, int]]],
-) -> tuple[list[tuple[str, int]], int]:
-    """All lines of the function, and how many stand before the action."""
-    conditions, action = body
-    lines = Lines()
-    lines.site = scope.site(event)
-    scope.lines = lines
-    lines.add("b = m.buffer")
+    conditions: list[form.Statement],
+    action: list[form.Statement],
+) -> int:
+    """Write all statements of the function; returns how many stand before the action."""
+    site = scope.lines.site = scope.site(event)
     read_fields(scope, bound)
     written = [each for each in bound if each.variable is not None and each.variable.assigned]
     check_overlaps(bound, written)
-    for each in written:
-        assert each.variable is not None
-        lines.add(f"{each.variable.flag} = False")
-    if scope.whole_asked is not None:
-        lines.add(f"{scope.whole_asked} = lambda: {pending(scope, written)}")
-    lines.lines += conditions
-    before = len(lines.lines)
-    lines.lines += action
-    write_back(scope, written)
-    lines.add("return True")
-    return lines.lines, before
+    fields = writes(scope, written)
+    for field in fields:
+        scope.evaluate(form.Assign(kinds.BOOL, field.flag, form.Literal(kinds.BOOL, False)))
+    if scope.pending is not None:
+        scope.add(form.Pending(site, scope.pending, fields))
+    scope.lines.found += conditions
+    before = len(scope.lines.found)
+    scope.lines.found += action
+    scope.add(form.WriteBack(site, fields, scope.temporary("w")))
+    scope.add(form.Leave(site, True))
+    return before

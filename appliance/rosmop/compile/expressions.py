@@ -1,4 +1,4 @@
-"""Expressions as code. One function for each kind of expression of `syntax/tree.py`; types are checked here."""
+"""Expressions. One function for each kind of expression of `syntax/tree.py`; types are checked here."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -8,6 +8,8 @@ from appliance.rosmop.compile.conversion import condition, constant_value, conve
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
 from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.interpreter import constant_of
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import FaultError
 from appliance.rosmop.runtime.numbers import f32
@@ -28,13 +30,13 @@ def value_of(scope: Scope, node: tree.Expression) -> Value:
     return _KINDS[type(node)](scope, node)
 
 
-def converted(scope: Scope, node: tree.Expression, target: Type) -> str:
-    """Code for an expression as a value of the target type; `{…}` makes a vector."""
+def converted(scope: Scope, node: tree.Expression, target: Type) -> form.Expression:
+    """An expression as a value of the target type; `{…}` makes a vector."""
     return initializers.converted(scope, node, target, value_of)
 
 
-def elements(scope: Scope, node: tree.Elements, target: Type) -> str:
-    """Code for `{a, b, c}` as a vector."""
+def elements(scope: Scope, node: tree.Elements, target: Type) -> form.Expression:
+    """`{a, b, c}` as a vector."""
     return initializers.elements(scope, node, target, value_of)
 
 
@@ -90,7 +92,7 @@ def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
 
 
-def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
+def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
     """The value that `make` makes of the operands; if all are numbers that are known, so is what comes of them."""
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
@@ -103,7 +105,7 @@ def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]
     if not kinds.is_number(value.type):
         return value
     try:
-        constant = eval(value.code, scope.module.namespace)  # noqa: S307  our own code, as in module.py
+        constant = constant_of(value.form)
     except FaultError:
         return value
     return constant_value(value.position, value.type, constant)
@@ -158,15 +160,13 @@ def read(variable: Variable, node: tree.Node) -> Value:
     variable.used = True
     if variable.alias is not None:
         alias = variable.alias
-        return Value(
-            alias.type, alias.code, node.position, VariablePlace(variable), owned=False, pure=alias.pure
-        )
-    place = VariablePlace(variable)
-    return Value(variable.type, variable.code, node.position, place, owned=False, constant=variable.known)
+        return Value(alias.form, node.position, VariablePlace(variable), owned=False, pure=alias.pure)
+    place, value = VariablePlace(variable), form.Read(variable.type, variable.code)
+    return Value(value, node.position, place, owned=False, constant=variable.known)
 
 
 def _message(scope: Scope, node: tree.Expression) -> Value:
-    if scope.read_message is None or scope.message_type is None:
+    if scope.message_type is None:
         hint = {
             "handler": "a handler has no message; copy it in the action: `v = MESSAGE;`",
             "timer": "a timer has no message",
@@ -174,7 +174,9 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
             "function": "a function has no message; pass it what it needs",
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
-    return Value(kinds.Record(scope.message_type), scope.read_message(), node.position)
+    scope.pending = scope.pending or scope.module.fresh("u")
+    whole = form.Whole(kinds.Record(scope.message_type), scope.pending, scope.lines.site)
+    return Value(whole, node.position)
 
 
 def _unary(scope: Scope, node: tree.Expression) -> Value:
@@ -187,7 +189,6 @@ def _unary(scope: Scope, node: tree.Expression) -> Value:
         )
     site = scope.site(node)
     return folded(
-        scope,
         (value_of(scope, node.operand),),
         lambda operand: operators.unary(node.operator, operand, node.position, site),
     )
@@ -205,15 +206,14 @@ def _step(scope: Scope, node: tree.Expression) -> Value:
     operands = operators.Operands(scope, node.position, target, one, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
     stored = storing.store(scope, target, changed)
-    code = stored if node.prefix else f"({target.code}, {stored})[0]"
-    return Value(target.type, code, node.position, pure=False)
+    before = form.Sequence(target.type, (target.form, stored), 0)
+    return Value(stored if node.prefix else before, node.position, pure=False)
 
 
 def _binary(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Binary)
     operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
     return folded(
-        scope,
         operands,
         lambda left, right: operators.binary(
             node.operator, operators.Operands(scope, node.position, left, right, site)
@@ -223,12 +223,12 @@ def _binary(scope: Scope, node: tree.Expression) -> Value:
 
 def _assign(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Assign)
-    target, code = assignment(scope, node)
-    return Value(target.type, storing.store(scope, target, code), node.position, owned=False, pure=False)
+    target, value = assignment(scope, node)
+    return Value(storing.store(scope, target, value), node.position, owned=False, pure=False)
 
 
-def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
-    """The target of an assignment, and code for the value it gets."""
+def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]:
+    """The target of an assignment, and the value it gets."""
     if node.target == tree.Name(node.position, ("MESSAGE",)):
         raise SpecificationError.at(
             node.position, "`MESSAGE` cannot be assigned; bind the fields you want to change"
@@ -248,49 +248,49 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, str]:
     value = value_of(scope, node.value)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     if node.operator == "+=" and isinstance(target.type, kinds.String):
-        return target, operators.extended(operands).code
+        return target, operators.extended(operands).form
     return target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
 
 
-def _character_or_text(scope: Scope, node: tree.Expression) -> str:
+def _character_or_text(scope: Scope, node: tree.Expression) -> form.Expression:
     """What is assigned to a string: C++ takes a character, too."""
     value = value_of(scope, node)
     if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
-        return f"t_bytes(({value.code} & 255,))"
+        return form.Call(kinds.STRING, "t_byte", (value.form,))
     return convert(scope, value, kinds.STRING)
 
 
 def _conditional(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Conditional)
     values = tuple(value_of(scope, part) for part in (node.condition, node.yes, node.no))
-    return folded(scope, values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
+    return folded(values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
 
 
 def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
     test = condition(tested)
     if kinds.is_number(yes.type) and kinds.is_number(no.type):
         kind = yes.type if yes.type == no.type else kinds.common(yes.type, no.type)
-        codes = [number(each.code, each.type, kind) for each in (yes, no)]
+        either = [number(each.form, kind) for each in (yes, no)]
     elif kinds.convertible(no.type, yes.type):
         kind = kinds.STRING if isinstance(yes.type, kinds.Characters) else yes.type
-        codes = [
-            convert(scope, each, kind) if kinds.is_scalar(kind) or each.type != kind else each.code
+        either = [
+            convert(scope, each, kind) if kinds.is_scalar(kind) or each.type != kind else each.form
             for each in (yes, no)
         ]
     else:
         raise SpecificationError.at(
             no.position, f"`?:` between {yes.type} and {no.type}; make them the same type"
         )
-    code = f"({codes[0]} if {test} else {codes[1]})"
     pure = tested.pure and yes.pure and no.pure
-    return Value(kind, code, position, owned=yes.owned and no.owned, pure=pure)
+    chosen = form.Conditional(kind, test, *either)
+    return Value(chosen, position, owned=yes.owned and no.owned, pure=pure)
 
 
 def _sequence(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Sequence)
     values = [value_of(scope, item) for item in node.items]
-    code = f"({', '.join(value.code for value in values)})[-1]"
-    return Value(values[-1].type, code, node.position, owned=values[-1].owned, pure=False)
+    all_of_them = form.Sequence(values[-1].type, tuple(value.form for value in values), -1)
+    return Value(all_of_them, node.position, owned=values[-1].owned, pure=False)
 
 
 def _index(scope: Scope, node: tree.Expression) -> Value:
@@ -298,12 +298,12 @@ def _index(scope: Scope, node: tree.Expression) -> Value:
     base, index = value_of(scope, node.base), value_of(scope, node.index)
     site = scope.site(node)
     if isinstance(base.type, kinds.Vector):
-        return vector_members.element_value(scope, base, index, node.position, site)
+        return vector_members.element_value(base, index, node.position, site)
     if isinstance(base.type, kinds.String | kinds.Characters):
-        code = convert(scope, index, kinds.LONG)
-        place = CharacterPlace(base, code, site) if base.place is not None else None
-        read_code = f"e_character({base.code}, {code}, {site})"
-        return Value(kinds.CHAR, read_code, node.position, place, pure=base.pure and index.pure)
+        at = convert(scope, index, kinds.LONG)
+        place = CharacterPlace(base, at, site) if base.place is not None else None
+        character = form.Call(kinds.CHAR, "e_character", (base.form, at), site)
+        return Value(character, node.position, place, pure=base.pure and index.pure)
     raise SpecificationError.at(node.position, f"{base.type} has no elements")
 
 
@@ -316,9 +316,8 @@ def _cast(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Cast)
     target = resolve(node.type, scope.messages)
     return folded(
-        scope,
         (value_of(scope, node.operand),),
-        lambda value: Value(target, convert(scope, value, target), node.position, pure=value.pure),
+        lambda value: Value(convert(scope, value, target), node.position, pure=value.pure),
     )
 
 
@@ -338,8 +337,8 @@ def _construct(scope: Scope, node: tree.Expression) -> Value:
 def _new(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.NewCharacters)
     size = convert(scope, value_of(scope, node.size), kinds.ULONG)
-    code = f"e_repeat({scope.context}, {size}, 0, {scope.site(node)})"
-    return Value(kinds.CHARACTERS, code, node.position, pure=False)
+    zeros = (size, form.Literal(kinds.CHAR, 0))
+    return Value(form.Call(kinds.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position, pure=False)
 
 
 def _limit(scope: Scope, node: tree.Expression) -> Value:

@@ -1,23 +1,22 @@
-"""Fields as code: what a bound parameter reads from the bytes of a message, and what an assigned one writes.
+"""Fields: what a bound parameter reads from the bytes of a message, and what an assigned one writes.
 
-Numbers at known distances from each other are read with one call. A changed number is written in place; only a
+Numbers at known distances from each other are read together. A changed number is written in place; only a
 changed string, array or message of another size makes a new buffer.
 """
 
 from dataclasses import dataclass
 
-from appliance.rosmop.compile.codecs import struct_code, struct_size
-from appliance.rosmop.compile.conversion import convert, literal
-from appliance.rosmop.compile.locate import Locator, Spot, Walk
+from appliance.rosmop.compile.conversion import convert
+from appliance.rosmop.compile.locate import Locator, Walk
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.form import Spot
+from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-
-CHARGED = 1024
-"""A message longer than this is charged when an array or all of it is decoded."""
 
 
 @dataclass(eq=False)
@@ -33,15 +32,21 @@ class Bound:
     end: str = ""  # of a field of variable size: the code's name for where it ends
 
 
-def pending(scope: Scope, written: list[Bound]) -> str:
-    """Code for the assigned fields, as (whether assigned, path, value)."""
-    entries = []
+def writes(scope: Scope, written: list[Bound]) -> tuple[form.Write, ...]:
+    """The fields that the action assigns."""
+    found = []
     for each in written:
-        assert each.variable is not None
-        path = tuple(_slots(scope, each))
-        value = _as_field(scope, each)
-        entries.append(f"({each.variable.flag}, {path!r}, {value})")
-    return f"({', '.join(entries)},)" if entries else "()"
+        variable = each.variable
+        assert variable is not None
+        assert variable.flag is not None
+        assert variable.assigned
+        read = form.Read(variable.type, variable.code)
+        value = convert(scope, Value(read, each.binding.position, owned=False), each.type)
+        end = each.end or None
+        found.append(
+            form.Write(variable.flag, value, each.spot or Spot(None, 0), end, tuple(_slots(scope, each)))
+        )
+    return tuple(found)
 
 
 def _slots(scope: Scope, each: Bound) -> list[int | str]:
@@ -61,42 +66,29 @@ def _slots(scope: Scope, each: Bound) -> list[int | str]:
     return path
 
 
-def _as_field(scope: Scope, each: Bound) -> str:
-    """Code for a variable's value as the field has it."""
-    assert each.variable is not None
-    value = Value(each.variable.type, each.variable.code, each.binding.position, owned=False)
-    return convert(scope, value, each.type)
-
-
 def read_fields(scope: Scope, bound: list[Bound]) -> None:
-    """Write the lines that find and read the fields that are used, and compare those that have constants."""
-    lines = scope.lines
+    """Write what finds and reads the fields that are used, and compares those that have constants."""
     layout = scope.messages.definitions.layout(scope.message_type or "")
-    walk = Walk(Locator(scope.module, scope.codecs, lines, scope.context), layout, Spot(None, 0))
+    walk = Walk(Locator(scope.module, scope.lines.found, scope.lines.site), layout, Spot(None, 0))
     fixed: list[Bound] = []
-    large = False
+    variable_size: list[Bound] = []
     for each in bound:
         each.spot = walk.find(each.binding.path)
-        if each.variable is not None and not each.variable.used:
-            continue
-        if struct_code(each.type) is not None:
-            fixed.append(each)
-        elif isinstance(each.type, kinds.Vector | kinds.Record):
-            large = True
-    if large:
-        lines.add(f"if w_len(b) > {CHARGED}: {scope.context}.allocate(w_len(b), {lines.site})")
+        if each.variable is None or each.variable.used:
+            (variable_size if struct_code(each.type) is None else fixed).append(each)
+    if any(isinstance(each.type, kinds.Vector | kinds.Record) for each in variable_size):
+        scope.add(form.Allocate(scope.lines.site, None))
     _read_fixed(scope, fixed)
-    for each in bound:
-        if struct_code(each.type) is None and (each.variable is None or each.variable.used):
-            each.read, each.end = scope.temporary("r"), scope.temporary("x")
-            start = "0" if each.spot is None else each.spot.code
-            lines.add(f"{each.read}, {each.end} = {scope.codecs.decode(each.type, 'b', start)}")
+    for each in variable_size:
+        each.read, each.end = scope.temporary("r"), scope.temporary("x")
+        at = each.spot or Spot(None, 0)
+        scope.add(form.ReadValue(scope.lines.site, each.read, each.end, at, each.type))
     for each in bound:
         _take(scope, each)
 
 
 def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
-    """Read numbers; those at known distances from each other with one call."""
+    """Read numbers; those at known distances from each other together."""
     groups: dict[str | None, list[Bound]] = {}
     for each in fixed:
         assert each.spot is not None  # a number is somewhere
@@ -120,60 +112,26 @@ def _near(one: Bound, other: Bound) -> bool:
 
 
 def _read_together(scope: Scope, together: list[Bound]) -> None:
-    codes, names = "<", []
-    at = _offset(together[0])
+    first = together[0].spot
+    assert first is not None  # a number is somewhere
     for each in together:
-        code = struct_code(each.type) or ""
-        gap = _offset(each) - at
-        codes += (f"{gap}x" if gap else "") + code
-        at = _offset(each) + struct_size(code)
         each.read = scope.temporary("r")
-        names += [f"{each.read}_{index}" for index in range(2)] if len(code) == 2 else [each.read]
-    unpack = scope.module.struct(codes, "unpack_from")
-    spot = together[0].spot
-    assert spot is not None
-    scope.lines.add(f"{', '.join(names)}, = {unpack}(b, {spot.code})")
-    for each in together:
-        if len(struct_code(each.type) or "") == 2:
-            scope.lines.add(f"{each.read} = {each.read}_0 * 1000000000 + {each.read}_1")
+    fields = tuple((each.read, each.type, _offset(each) - first.offset) for each in together)
+    scope.add(form.ReadNumbers(scope.lines.site, first, fields))
 
 
 def _take(scope: Scope, each: Bound) -> None:
     """Compare a field with its constant, or give it to its variable."""
+    site, read = scope.lines.site, form.Read(each.type, each.read)
     if each.constant is not None:
-        scope.lines.add(f"if not {each.read} == {literal(each.constant)}: return False")
+        constant = form.Literal(each.type, each.constant)
+        test: form.Expression = form.Compare("==", read, constant, site)
+        if isinstance(each.type, kinds.String):
+            test = form.CompareTexts("==", read, constant, True, site)
+        scope.add(form.Require(site, test))
     elif each.variable is not None and each.variable.used:
-        value = Value(each.type, each.read, each.binding.position)
-        scope.lines.add(f"{each.variable.code} = {convert(scope, value, each.variable.type)}")
-
-
-def write_back(scope: Scope, written: list[Bound]) -> None:
-    """Write the lines that put assigned fields into the message, unless it was dropped.
-
-    What can fault, the encoding of fields of variable size, comes before the first byte is written: all of the action's
-    changes are relayed, or none.
-    """
-    lines = scope.lines
-    edits = scope.temporary("w")
-    lines.add("if m.dropped: return True")
-    spliced = [each for each in written if struct_code(each.type) is None]
-    if spliced:
-        lines.add(f"{edits} = []")
-    for each in spliced:
-        assert each.variable is not None
-        start = "0" if each.spot is None else each.spot.code
-        lines.add(f"if {each.variable.flag}:")
-        lines.add("    o = e_bytearray()")
-        lines.add(f"    {scope.codecs.encoder(each.type)}({_as_field(scope, each)}, o)")
-        lines.add(f"    {edits}.append(({start}, {each.end}, e_bytes(o)))")
-    for each in written:
-        if struct_code(each.type) is not None:
-            assert each.variable is not None
-            assert each.spot is not None
-            packed = scope.codecs.pack([(each.type, _as_field(scope, each))])
-            lines.add(f"if {each.variable.flag}: m.patch({each.spot.code}, {packed})")
-    if spliced:
-        lines.add(f"if {edits}: m.splice({edits})")
+        value = convert(scope, Value(read, each.binding.position), each.variable.type)
+        scope.evaluate(form.Assign(each.variable.type, each.variable.code, value))
 
 
 def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:

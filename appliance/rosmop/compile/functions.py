@@ -1,4 +1,4 @@
-"""Helper functions, `init`, first values and handlers as Python functions."""
+"""Helper functions, `init`, first values and handlers."""
 
 from collections.abc import Iterable, Mapping, Set
 
@@ -8,7 +8,7 @@ from appliance.rosmop.compile.loops import charge
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.statements import initial, known, write
-from appliance.rosmop.runtime.context import MAX_CALLS
+from appliance.rosmop.ir import form
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -88,7 +88,7 @@ def compile_start(
         raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
     functions = tuple(shared.module.fresh("i") for _ in scopes)
     for scope, function in zip(scopes, functions, strict=True):
-        _add(scope, f"def {function}():")
+        shared.define(scope.function(function, ()))
     return functions
 
 
@@ -107,10 +107,10 @@ def _constants(shared: Shared, names: SpecificationNames, specification: tree.Sp
             if variable is not None:
                 scope.written.add(variable.code)
                 value = _constant(scope, declarator)
-                code = scope.codecs.zero(variable.type)
+                first: form.Expression = form.Zero(variable.type)
                 if value is not None and kinds.convertible(value.type, variable.type):
-                    code = convert(scope, value, variable.type)
-                scope.lines.add(f"{variable.code} = {code}")
+                    first = convert(scope, value, variable.type)
+                scope.evaluate(form.Assign(variable.type, variable.code, first))
     return scope
 
 
@@ -145,9 +145,9 @@ def _first_value(
     scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, variable: Variable
 ) -> None:
     with scope.at(declarator):
-        _, code = initial(scope, declaration.type, declarator)
+        _, value = initial(scope, declaration.type, declarator)
         scope.written.add(variable.code)
-        scope.lines.add(f"{variable.code} = {code}")
+        scope.evaluate(form.Assign(variable.type, variable.code, value))
 
 
 def declare_functions(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
@@ -238,15 +238,15 @@ def compile_function(shared: Shared, names: SpecificationNames, function: Helper
     with scope.at(function.node):
         charge(scope, function.node.body)
         if function.recursive:
-            site = scope.lines.site
-            scope.lines.add(f"if n > {MAX_CALLS}: e_too_deep({site}, {function.name!r})")
+            scope.add(form.LimitDepth(scope.lines.site, function.name))
         write(scope, function.node.body)
-        zero = "None" if isinstance(function.result, kinds.Void) else scope.codecs.zero(function.result)
-        handed = "".join(f", {variable.code}" for variable in function.references)
-        scope.lines.add(f"return ({zero}{handed})" if handed else f"return {zero}")
+        nothing = form.Literal(kinds.VOID, None)
+        value = nothing if isinstance(function.result, kinds.Void) else form.Zero(function.result)
+        handed = tuple(variable.code for variable in function.references)
+        scope.add(form.Return(scope.lines.site, value, handed))
     function.changes, function.calls = scope.changes_shared, frozenset(scope.calls)
     parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
-    _add(scope, f"def {function.code}({', '.join(parameters)}):")
+    shared.define(scope.function(function.code, tuple(parameters)))
 
 
 def compile_handler(
@@ -257,11 +257,5 @@ def compile_handler(
     scope.drop_refused = drop_refused
     write(scope, handler.body)
     function = shared.module.fresh("j")
-    _add(scope, f"def {function}(m):")
+    shared.define(scope.function(function, ("m",)))
     return function
-
-
-def _add(scope: Scope, header: str) -> None:
-    lines = scope.lines.lines or [("    pass", -1)]
-    written = [(f"    global {', '.join(sorted(scope.written))}", -1)] if scope.written else []
-    scope.module.add([(header, -1), *written, *lines])

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from appliance.rosmop.compile.conversion import convert
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.ir import form
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -16,20 +17,20 @@ from appliance.rosmop.types.kinds import Type
 ValueOf = Callable[[Scope, tree.Expression], Value]
 
 
-def converted(scope: Scope, node: tree.Expression, target: Type, value_of: ValueOf) -> str:
-    """Code for an expression as a value of the target type; `{…}` makes a vector."""
+def converted(scope: Scope, node: tree.Expression, target: Type, value_of: ValueOf) -> form.Expression:
+    """An expression as a value of the target type; `{…}` makes a vector."""
     if isinstance(node, tree.Elements):
         return elements(scope, node, target, value_of)
     return convert(scope, value_of(scope, node), target, scope.site(node))
 
 
-def elements(scope: Scope, node: tree.Elements, target: Type, value_of: ValueOf) -> str:
-    """Code for `{a, b, c}` as a vector."""
+def elements(scope: Scope, node: tree.Elements, target: Type, value_of: ValueOf) -> form.Expression:
+    """`{a, b, c}` as a vector."""
     if not isinstance(target, kinds.Vector):
         if len(node.items) == 1:
             return converted(scope, node.items[0], target, value_of)
         if not node.items:
-            return scope.codecs.zero(target)
+            return form.Zero(target)
         raise SpecificationError.at(
             node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
         )
@@ -37,10 +38,5 @@ def elements(scope: Scope, node: tree.Elements, target: Type, value_of: ValueOf)
         raise SpecificationError.at(
             node.items[target.length].position, f"more than the {target.length} elements of the array"
         )
-    items = [converted(scope, item, target.element, value_of) for item in node.items]
-    missing = 0 if target.length is None else target.length - len(items)
-    code = f"[{', '.join(items)}]"
-    if missing:
-        rest = scope.codecs.maker(kinds.Vector(target.element, missing))
-        code = f"({code} + {rest}())"
-    return code
+    items = tuple(converted(scope, item, target.element, value_of) for item in node.items)
+    return form.Vector(target, items, 0 if target.length is None else target.length - len(items))

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from appliance.rosmop.compile.conversion import convert, number
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import mark, require_place, store
+from appliance.rosmop.compile.storing import mark, marked, require_place, store
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -33,41 +34,45 @@ class Invocation:
             )
         return number_of
 
-    def index(self, position: int, default: int | None = None) -> str:
+    def index(self, position: int, default: int | None = None) -> form.Expression:
         """An argument as an index."""
         if default is not None and position >= len(self.arguments):
-            return str(default)
+            return form.Literal(kinds.ULONG, default)
         value = self.arguments[position]
         if not kinds.is_number(value.type):
             raise SpecificationError.at(value.position, f"`{self.name}` needs a number; this is {value.type}")
-        return number(value.code, value.type, kinds.ULONG)
+        return number(value.form, kinds.ULONG)
 
-    def text(self, position: int) -> str:
+    def text(self, position: int) -> form.Expression:
         """An argument as a string; a character is one of length 1."""
         value = self.arguments[position]
         if value.type == kinds.CHAR:
-            return f"t_bytes(({value.code} & 255,))"
+            return form.Call(kinds.STRING, "t_byte", (value.form,))
         return convert(self.scope, value, kinds.STRING)
 
-    def value(self, kind: kinds.Type, code: str, *, pure: bool = True) -> Value:
-        """The result."""
-        return Value(kind, code, self.position, pure=pure and self.base.pure)
+    def called(self, kind: kinds.Type, function: str, *arguments: form.Expression) -> form.Call:
+        """A function of the form, of the base and these arguments."""
+        return form.Call(kind, function, (self.base.form, *arguments), self.site)
 
-    def changes(self, code: str) -> Value:
+    def value(self, kind: kinds.Type, function: str, *arguments: form.Expression) -> Value:
+        """The result, by a function of the form."""
+        return Value(self.called(kind, function, *arguments), self.position, pure=self.base.pure)
+
+    def changes(self, value: form.Expression) -> Value:
         """The result of a function that gives the base a new value."""
         require_place(self.base, f"`{self.name}`")
-        return Value(kinds.VOID, store(self.scope, self.base, code), self.position, pure=False)
+        stored = store(self.scope, self.base, value)
+        return Value(form.Discard(stored), self.position, pure=False)
 
-    def changes_in_place(self, code: str, *, grows: bool = True) -> Value:
-        """The result of a function that changes the vector itself."""
+    def changes_in_place(self, function: str, *arguments: form.Expression) -> Value:
+        """The result of a function of the form that changes the vector itself."""
         require_place(self.base, f"`{self.name}`")
-        if grows and isinstance(self.base.type, kinds.Vector) and self.base.type.length is not None:
+        if isinstance(self.base.type, kinds.Vector) and self.base.type.length is not None:
             raise SpecificationError.at(
                 self.position, f"`{self.name}`: an array of fixed length stays so long"
             )
-        flag = mark(self.scope, self.base)
-        whole = f"(({flag} := True), {code})[1]" if flag else code
-        return Value(kinds.VOID, whole, self.position, pure=False)
+        change = marked(mark(self.scope, self.base), self.called(kinds.VOID, function, *arguments))
+        return Value(change, self.position, pure=False)
 
 
 Method = Callable[[Invocation], Value]
@@ -77,10 +82,10 @@ Method = Callable[[Invocation], Value]
 def length(call: Invocation) -> Value:
     """`size()`, `length()`."""
     call.count(0)
-    return call.value(kinds.ULONG, f"l_len({call.base.code})")
+    return call.value(kinds.ULONG, "l_len")
 
 
 def empty(call: Invocation) -> Value:
     """`empty()`."""
     call.count(0)
-    return call.value(kinds.BOOL, f"(not {call.base.code})")
+    return call.value(kinds.BOOL, "l_empty")

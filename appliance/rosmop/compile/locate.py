@@ -1,12 +1,13 @@
-"""Finds fields in the bytes of a message, as code.
+"""Finds fields in the bytes of a message.
 
 Offsets are worked out here as far as they are the same in every message; only what stands behind a string or an
 array of variable length is computed when a message comes, once for all fields that need it.
 """
 
 from appliance.ros.layout import ArrayPart, FixedPart, Layout, Leaf, Part, StringPart
-from appliance.rosmop.compile.codecs import Codecs
-from appliance.rosmop.compile.module import Lines, Module
+from appliance.rosmop.compile.module import Module
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.form import Spot
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -46,25 +47,6 @@ def _step(messages: Messages, kind: Type, step: tree.PathStep) -> Type:
     raise SpecificationError.at(step.position, f"{kind} has no field `{step.name}`{hint}")
 
 
-class Spot:
-    """A place in the bytes: a variable of the code (or none) and a distance from it."""
-
-    def __init__(self, base: str | None, offset: int) -> None:
-        self.base = base
-        self.offset = offset
-
-    def plus(self, more: int) -> "Spot":
-        """So many bytes further."""
-        return Spot(self.base, self.offset + more)
-
-    @property
-    def code(self) -> str:
-        """As an expression."""
-        if self.base is None:
-            return str(self.offset)
-        return f"{self.base} + {self.offset}" if self.offset else self.base
-
-
 class Walk:
     """A message (or an element of an array) being walked through: where its parts begin, as far as is known."""
 
@@ -75,7 +57,7 @@ class Walk:
         self._elements: dict[tuple[int, int], Walk | Spot] = {}
 
     def start_of(self, part: int) -> Spot:
-        """Where a part begins; writes the code for what stands before it."""
+        """Where a part begins; writes what finds the parts before it."""
         while len(self._starts) <= part:
             index = len(self._starts) - 1
             self._starts.append(self._locator.behind(self._layout.parts[index], self._starts[index]))
@@ -131,40 +113,35 @@ class Walk:
 
 
 class Locator:
-    """Writes the code that finds fields; `lines` are those of the function, `context` the name of who is charged.
-
-    `inner`: the function says where an element ends, and is called for each.
-    """
+    """Writes the statements that find fields into `found`; `inner`: for an element that is skipped."""
 
     def __init__(
-        self, module: Module, codecs: Codecs, lines: Lines, context: str, *, inner: bool = False
+        self, module: Module, found: list[form.Statement], site: int, *, inner: bool = False
     ) -> None:
         self._module = module
-        self._codecs = codecs
-        self.lines = lines
-        self._context = context
-        self._skip = "w_skip_inner" if inner else "w_skip"
-        self._skippers: dict[int, str] = {}
+        self._found = found
+        self._site = site
+        self._inner = inner
+        self._skippers: dict[int, form.Skipper] = {}
 
     def behind(self, part: Part, start: Spot) -> Spot:
         """Where a part that begins at `start` ends."""
         if isinstance(part, FixedPart):
             return start.plus(part.size)
-        length = self._module.struct("<I", "unpack_from")
         end = self._module.fresh("p")
         if isinstance(part, StringPart):
-            self.lines.add(f"{end} = {start.plus(4).code} + {length}(b, {start.code})[0]")
+            self._found.append(form.AfterText(self._site, end, start))
             return Spot(end, 0)
-        count = str(part.count)
+        count: str | int
         if part.count is None:
-            least = self._least(part)
-            count = self._module.fresh("q")
-            self.lines.add(f"{count} = w_count(b, {start.code}, {least})")
+            count = self._count(start, part)
             start = start.plus(4)
-        if part.element_size is not None:
-            self.lines.add(f"{end} = {start.code} + {count} * {part.element_size}")
         else:
-            self.lines.add(self._skipped(end, start, count, part))
+            count = part.count
+        if part.element_size is not None:
+            self._found.append(form.AfterElements(self._site, end, start, count, part.element_size))
+        else:
+            self._skip(end, start, count, part)
         return Spot(end, 0)
 
     def element(self, item: Leaf | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
@@ -173,38 +150,32 @@ class Locator:
         if isinstance(item, Leaf):
             return start.plus(index * (item.size // (item.count or 1)))
         if item.count is None:
-            count = self._module.fresh("q")
-            self.lines.add(f"{count} = w_count(b, {start.code}, {self._least(item)})")
-            self.lines.add(f"if {count} <= {index}:")
-            self.lines.add(f"    m.past = ({self.lines.site}, {index}, {count})")
-            self.lines.add("    return False")
+            self._found.append(form.NotPast(self._site, self._count(start, item), index))
             start = start.plus(4)
         if item.element_size is not None:
             return start.plus(index * item.element_size)
         if not index:
             return start
-        spot = self._module.fresh("p")
-        self.lines.add(self._skipped(spot, start, str(index), item))
-        return Spot(spot, 0)
+        end = self._module.fresh("p")
+        self._skip(end, start, index, item)
+        return Spot(end, 0)
 
-    def _skipped(self, target: str, start: Spot, count: str, item: Leaf | ArrayPart) -> str:
-        return f"{target} = {self._skip}(b, {start.code}, {count}, {self.skipper(item)}, {self._context})"
+    def _count(self, start: Spot, item: ArrayPart) -> str:
+        least = item.element_size
+        if least is None:
+            least = item.layout.minimum if item.layout is not None else 4
+        count = self._module.fresh("q")
+        self._found.append(form.Count(self._site, count, start, least))
+        return count
 
-    def skipper(self, item: Leaf | ArrayPart) -> str:
-        """The name of the function that says where an element ends."""
-        if item.layout is None:
-            return "w_text_end"
-        key = id(item.layout)
-        if key not in self._skippers:
-            inner = Lines()
+    def _skip(self, name: str, start: Spot, count: str | int, item: Leaf | ArrayPart) -> None:
+        skipper = None if item.layout is None else self._skipper(item.layout)
+        self._found.append(form.Skip(self._site, name, start, count, skipper, self._inner))
+
+    def _skipper(self, layout: Layout) -> form.Skipper:
+        if id(layout) not in self._skippers:
+            inner: list[form.Statement] = []
             name = self._module.fresh("k")
-            locator = Locator(self._module, self._codecs, inner, self._context, inner=True)
-            end = Walk(locator, item.layout, Spot("p", 0)).end()
-            self._module.add([(f"def {name}(b, p):", -1), *inner.lines, (f"    return {end.code}", -1)])
-            self._skippers[key] = name
-        return self._skippers[key]
-
-    def _least(self, item: ArrayPart) -> int:
-        if item.element_size is not None:
-            return item.element_size
-        return item.layout.minimum if item.layout is not None else 4
+            end = Walk(Locator(self._module, inner, -1, inner=True), layout, Spot("p", 0)).end()
+            self._skippers[id(layout)] = form.Skipper(name, tuple(inner), end)
+        return self._skippers[id(layout)]

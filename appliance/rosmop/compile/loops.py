@@ -1,4 +1,4 @@
-"""Loops and `switch` as code. Every iteration is charged, so that no loop outlives its budget."""
+"""Loops and `switch`. Every iteration is charged, so that no loop outlives its budget."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,6 +7,7 @@ from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Loop, Scope
 from appliance.rosmop.compile.vector_members import element_value
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import wrap
 from appliance.rosmop.syntax import tree
@@ -23,10 +24,8 @@ MAX_NESTED = 15
 
 
 def charge(scope: Scope, node: tree.Node) -> None:
-    """Write the lines that charge for one iteration (or one call)."""
-    context = scope.context
-    scope.lines.add(f"{context}.budget -= {weight(node)}")
-    scope.lines.add(f"if {context}.budget < 0: {context}.spend(0, {scope.lines.site})")
+    """Charge for one iteration (or one call)."""
+    scope.add(form.Charge(scope.lines.site, weight(node)))
 
 
 def weight(node: tree.Node) -> int:
@@ -47,17 +46,16 @@ def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`while` and `do … while`."""
     assert isinstance(node, tree.While)  # so says the table in statements.py
     _enter(scope, node, Loop(False))
-    scope.lines.add("while True:")
-    with scope.indented():
+    with scope.nested() as statements:
         charge(scope, node)
         if node.at_end:
             scope.loops[-1].step = lambda: _leave_unless(scope, node.condition)
         else:
             _leave_unless(scope, node.condition)
-    write_body(scope, [node.body], write)
-    if node.at_end:
-        with scope.indented():
+        _block(scope, [node.body], write)
+        if node.at_end:
             _leave_unless(scope, node.condition)
+    scope.add(form.Loop(scope.lines.site, tuple(statements)))
     scope.loops.pop()
 
 
@@ -69,15 +67,14 @@ def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
             write(scope, node.start)
         step = tree.Evaluate(node.step.position, node.step) if node.step is not None else None
         _enter(scope, node, Loop(False, (lambda: write(scope, step)) if step is not None else None))
-        scope.lines.add("while True:")
-        with scope.indented():
+        with scope.nested() as statements:
             charge(scope, node)
             if node.condition is not None:
                 _leave_unless(scope, node.condition)
-        write_body(scope, [node.body], write)
-        if step is not None:
-            with scope.indented():
+            _block(scope, [node.body], write)
+            if step is not None:
                 write(scope, step)
+        scope.add(form.Loop(scope.lines.site, tuple(statements)))
         scope.loops.pop()
 
 
@@ -90,27 +87,35 @@ def write_range_for(scope: Scope, node: tree.Statement, write: Write) -> None:
     element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
     _enter(scope, node, Loop(False))
-    with scope.block():
-        if node.type.reference and not node.type.constant:
-            _by_reference(scope, node, values, kind)
+    each = None if node.type.reference and not node.type.constant else scope.temporary()
+    index = "" if each is not None else _first_index(scope, node, values, kind)
+    with scope.block(), scope.nested() as statements:
+        if each is None:
+            _by_reference(scope, node, values, kind, index)
         else:
-            _by_value(scope, node, values, element, kind)
-        write_body(scope, [node.body], write)
+            _by_value(scope, node, element, kind, each)
+        _block(scope, [node.body], write)
+    site = scope.lines.site
+    scope.add(
+        form.Loop(site, tuple(statements))
+        if each is None
+        else form.ForEach(site, each, values.form, tuple(statements))
+    )
     scope.loops.pop()
 
 
-def _by_value(scope: Scope, node: tree.RangeFor, values: Value, element: Type, kind: Type) -> None:
-    each = scope.temporary()
-    scope.lines.add(f"for {each} in {values.code}:")
-    with scope.indented():
-        charge(scope, node)
-        code = f"(({each} + 128 & 255) - 128)" if isinstance(values.type, kinds.String) else each
-        value = Value(element, code, node.position, owned=node.type.reference)
-        variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
-        scope.lines.add(f"{variable.code} = {convert(scope, value, kind)}")
+def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, each: str) -> None:
+    charge(scope, node)
+    read: form.Expression = form.Read(element, each)
+    if element == kinds.CHAR:  # of a string; those of a vector are in their range
+        read = form.Convert(kinds.CHAR, form.Read(kinds.UINT8, each))
+    value = Value(read, node.position, owned=node.type.reference)
+    variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
+    scope.evaluate(form.Assign(kind, variable.code, convert(scope, value, kind)))
 
 
-def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> None:
+def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> str:
+    """The name of an index that stands before the first element."""
     if not isinstance(values.type, kinds.Vector) or values.place is None or not values.pure:
         raise SpecificationError.at(
             node.values.position, "a reference goes through a vector variable; leave out the `&`"
@@ -118,14 +123,18 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) 
     if values.type.element != kind:
         raise SpecificationError.at(node.type.position, f"the elements are {values.type.element}, not {kind}")
     index = scope.temporary("i")
-    scope.lines.add(f"{index} = -1")
-    scope.lines.add("while True:")
-    with scope.indented():
-        charge(scope, node)
-        scope.lines.add(f"{index} += 1")
-        scope.lines.add(f"if {index} >= l_len({values.code}): break")
-    at = Value(kinds.LONG, index, node.position)
-    alias = element_value(scope, values, at, node.position, scope.lines.site)
+    scope.evaluate(form.Assign(kinds.LONG, index, form.Literal(kinds.LONG, -1)))
+    return index
+
+
+def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, index: str) -> None:
+    charge(scope, node)
+    site, at = scope.lines.site, form.Read(kinds.LONG, index)
+    one = form.Literal(kinds.LONG, 1)
+    scope.evaluate(form.Assign(kinds.LONG, index, form.Arithmetic(kinds.LONG, "+", at, one, site)))
+    length = form.Call(kinds.LONG, "l_len", (values.form,))
+    scope.add(form.If(site, form.Compare(">=", at, length, site), (form.Break(site),), ()))
+    alias = element_value(values, Value(at, node.position), node.position, site)
     scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
 
 
@@ -138,35 +147,32 @@ def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
         raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
     start, flag = scope.temporary(), scope.temporary("k")
     table, default = _cases(scope, node, kind)
-    selected = number(value.code, value.type, kind)
-    scope.lines.add(f"{flag} = False")
-    scope.lines.add(f"{start} = {{{table}}}.get({selected}, {default})")
+    site = scope.lines.site
+    nothing = form.Literal(kinds.BOOL, False)
+    scope.evaluate(form.Assign(kinds.BOOL, flag, nothing))
+    scope.add(form.Select(site, start, number(value.form, kind), table, default))
     _enter(scope, node, Loop(True, continued=flag))
-    before = len(scope.lines.lines)
-    scope.lines.add("while True:")
-    with scope.block() as names, scope.indented():
+    with scope.block() as names, scope.nested() as statements:
         for index, case in enumerate(node.cases):
             if case.statements:
-                scope.lines.add(f"if {start} <= {index}:")
-                _statements(scope, case.statements, write)
-        scope.lines.add("break")
-    _write_zeros(scope, names, before)
+                with scope.nested() as inner:
+                    _statements(scope, case.statements, write)
+                reached = form.Compare(
+                    "<=", form.Read(kinds.INT, start), form.Literal(kinds.INT, index), site
+                )
+                scope.add(form.If(site, reached, tuple(inner), ()))
+        scope.add(form.Break(site))
+    for variable in names.values():  # a case may jump over the declaration
+        scope.evaluate(form.Assign(variable.type, variable.code, form.Zero(variable.type)))
+    scope.add(form.Loop(site, tuple(statements)))
     loop = scope.loops.pop()
     if loop.step is not None:
-        scope.lines.add(f"if {flag}:")
-        with scope.indented():
+        with scope.nested() as going_on:
             write_continue(scope, node.position)
+        scope.add(form.If(site, form.Read(kinds.BOOL, flag), tuple(going_on), ()))
 
 
-def _write_zeros(scope: Scope, names: dict[str, Variable], before: int) -> None:
-    """Give the variables of a `switch` a value before it: a case may jump over the declaration."""
-    lines, scope.lines.lines = scope.lines.lines, []
-    for variable in names.values():
-        scope.lines.add(f"{variable.code} = {scope.codecs.zero(variable.type)}")
-    scope.lines.lines = [*lines[:before], *scope.lines.lines, *lines[before:]]
-
-
-def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[str, int]:
+def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[tuple[tuple[int, int], ...], int]:
     table: dict[int, int] = {}
     default = len(node.cases)
     for index, case in enumerate(node.cases):
@@ -188,7 +194,7 @@ def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[str, i
         if wanted in table:
             raise SpecificationError.at(case.value.position, f"case {wanted} occurs twice")
         table[wanted] = index
-    return ", ".join(f"{constant}: {index}" for constant, index in table.items()), default
+    return tuple(table.items()), default
 
 
 def write_continue(scope: Scope, position: Position) -> None:
@@ -198,13 +204,14 @@ def write_continue(scope: Scope, position: Position) -> None:
     loop = scope.loops[-1]
     if loop.is_switch:
         loop.step = lambda: None
-        scope.lines.add(f"{loop.continued} = True")
-        scope.lines.add("break")
+        assert loop.continued is not None  # a `switch` has it
+        scope.evaluate(form.Assign(kinds.BOOL, loop.continued, form.Literal(kinds.BOOL, True)))
+        scope.add(form.Break(scope.lines.site))
         return
     if loop.step is not None:
         with scope.around(loop):
             loop.step()
-    scope.lines.add("continue")
+    scope.add(form.Continue(scope.lines.site))
 
 
 def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
@@ -217,20 +224,22 @@ def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
 
 def _leave_unless(scope: Scope, node: tree.Expression) -> None:
     with scope.at(node):
-        scope.lines.add(f"if not {condition(value_of(scope, node))}: break")
+        site = scope.lines.site
+        scope.add(form.If(site, form.Not(condition(value_of(scope, node))), (form.Break(site),), ()))
 
 
-def write_body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
-    """Write statements one step deeper, in a block of names of their own."""
+def body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> tuple[form.Statement, ...]:
+    """Statements in a block of names of their own."""
+    with scope.nested() as found:
+        _block(scope, statements, write)
+    return tuple(found)
+
+
+def _block(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
     with scope.block():
         _statements(scope, statements, write)
 
 
 def _statements(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
-    """Write statements one step deeper; `pass` if nothing comes of them."""
-    with scope.indented():
-        before = len(scope.lines.lines)
-        for statement in statements:
-            write(scope, statement)
-        if len(scope.lines.lines) == before:
-            scope.lines.add("pass")
+    for statement in statements:
+        write(scope, statement)

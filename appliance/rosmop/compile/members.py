@@ -7,13 +7,12 @@ from appliance.rosmop.compile.conversion import constant_value
 from appliance.rosmop.compile.invocation import Invocation, Method
 from appliance.rosmop.compile.places import PartPlace, SlotPlace, Value
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
-
-FUNCTIONS = string_members.FUNCTIONS | vector_members.FUNCTIONS | time_members.FUNCTIONS
 
 
 def field(scope: Scope, base: Value, name: str, position: Position, site: int) -> Value:
@@ -26,13 +25,12 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
                 return constant(scope, base.type.name, name, position)
             raise SpecificationError.at(position, str(error)) from None
         place = SlotPlace(base, slot.index) if base.place is not None else None
-        code = f"{base.code}[{slot.index}]"
-        return Value(slot.type, code, position, place, owned=base.owned, pure=base.pure)
+        item = form.Item(slot.type, base.form, slot.index)
+        return Value(item, position, place, owned=base.owned, pure=base.pure)
     if isinstance(base.type, kinds.Time | kinds.Duration) and name in ("sec", "nsec"):
         kind = kinds.UINT if isinstance(base.type, kinds.Time) else kinds.INT
-        operator = "//" if name == "sec" else "%"
         part = PartPlace(base, name, site) if base.place is not None else None
-        return Value(kind, f"({base.code} {operator} 1000000000)", position, part, pure=base.pure)
+        return Value(form.Call(kind, f"m_{name}", (base.form,)), position, part, pure=base.pure)
     members = methods_of(base.type)
     if name in members:
         raise SpecificationError.at(position, f"`{name}` is a function; write `.{name}(…)`")

@@ -6,8 +6,8 @@ values follow from each other; where they may not (a NaN, a zero whose sign chan
 
 from dataclasses import dataclass
 
-from appliance.rosmop.compile.codecs import struct_size
 from appliance.rosmop.compile.module import Module
+from appliance.rosmop.ir.values import struct_size
 
 Line = tuple[int, str]
 """A line and how much deeper it stands."""

@@ -1,7 +1,8 @@
-"""Variables, values of expressions as code, and the places that can be assigned."""
+"""Variables, values of expressions, and the places that can be assigned."""
 
 from dataclasses import dataclass
 
+from appliance.rosmop.ir.form import Expression
 from appliance.rosmop.positions import Position
 from appliance.rosmop.types.kinds import Type
 
@@ -32,19 +33,23 @@ class Variable:
 
 @dataclass(frozen=True)
 class Value:
-    """An expression: its type and the code that computes it.
+    """An expression: its form, and what is known of it.
 
     `place` is where the value lives if it can be assigned. `owned` means that nothing else refers to it, so it
     needs no copy. `constant` is known without running. `pure` means that computing it twice changes nothing.
     """
 
-    type: Type
-    code: str
+    form: Expression
     position: Position
     place: "Place | None" = None
     owned: bool = True
     constant: bool | int | float | bytes | None = None
     pure: bool = True
+
+    @property
+    def type(self) -> Type:
+        """What it is one of."""
+        return self.form.type
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ class ElementPlace(Place):
     """An element of a vector."""
 
     base: Value
-    index: str
+    index: Expression
     site: int
 
 
@@ -73,7 +78,7 @@ class CharacterPlace(Place):
     """A character of a string."""
 
     base: Value
-    index: str
+    index: Expression
     site: int
 
 
@@ -94,7 +99,7 @@ class PartPlace(Place):
     site: int
 
 
-def path(value: Value) -> tuple[str | int, ...]:
+def path(value: Value) -> tuple[object, ...]:
     """Where a value lives: the name of the variable, then elements and fields, down to it."""
     place = value.place
     if isinstance(place, VariablePlace):

@@ -4,39 +4,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
-from appliance.rosmop.compile.conversion import convert, number, require_number, wrapped
+from appliance.rosmop.compile.conversion import convert, number, require_number
 from appliance.rosmop.compile.output import formatted
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.compile.storing import require_original, store
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime import numbers, texts
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
-
-FUNCTIONS: dict[str, Callable[..., object]] = {
-    **{f"h_{name}": function for name, (_, function) in numbers.MATH.items()},
-    **{f"h_{name}f": function for name, function in numbers.FLOAT_MATH.items()},
-    "h_abs": abs,
-    "h_min": min,
-    "h_max": max,
-    "h_signbit": numbers.signbit,
-    "h_isnan": math.isnan,
-    "h_isinf": math.isinf,
-    "h_isfinite": math.isfinite,
-    "h_to_integer": lambda value: b"%d" % value,
-    "h_to_floating": lambda value: b"%f" % value,
-    "h_parse": texts.parse_integer,
-    "h_parse_floating": texts.parse_floating,
-    "h_atoi": texts.lenient_integer,
-    "h_atof": texts.lenient_floating,
-    "h_filled": texts.filled,
-    "h_filled_at_most": texts.filled_at_most,
-    "h_printed": texts.printed,
-    "h_extended": texts.extended,
-    "h_compare": texts.compare,
-    "h_len": len,
-}
 
 
 class Arguments:
@@ -60,13 +37,17 @@ class Arguments:
                 self.position, f"`{self.name}` takes {wanted} argument(s), not {len(self.values)}"
             )
 
-    def text(self, index: int) -> str:
+    def text(self, index: int) -> form.Expression:
         """An argument as a string."""
         return convert(self.scope, self.values[index], kinds.STRING)
 
-    def value(self, kind: kinds.Type, code: str) -> Value:
+    def result(self, result: form.Expression) -> Value:
         """The result of a function without effects."""
-        return Value(kind, code, self.position, pure=all(value.pure for value in self.values))
+        return Value(result, self.position, pure=all(value.pure for value in self.values))
+
+    def value(self, kind: kinds.Type, function: str, *arguments: form.Expression) -> Value:
+        """The same, by a function of the form."""
+        return self.result(form.Call(kind, function, arguments, self.site))
 
 
 Function = Callable[[Arguments], Value]
@@ -85,9 +66,9 @@ def _math(name: str, count: int) -> Function:
         for value in call.values:
             require_number(value, f"`{call.name}`")
         if all(value.type == kinds.FLOAT for value in call.values):  # C++ has an overload for them
-            return call.value(kinds.FLOAT, f"h_{name}f({', '.join(value.code for value in call.values)})")
-        codes = [number(value.code, value.type, kinds.DOUBLE) for value in call.values]
-        return call.value(kinds.DOUBLE, f"h_{name}({', '.join(codes)})")
+            return call.value(kinds.FLOAT, f"h_{name}f", *(value.form for value in call.values))
+        doubles = [number(value.form, kinds.DOUBLE) for value in call.values]
+        return call.value(kinds.DOUBLE, f"h_{name}", *doubles)
 
     return function
 
@@ -98,7 +79,7 @@ def _math_of_floats(name: str, count: int) -> Function:
 
     def of_floats(call: Arguments) -> Value:
         call.values = [
-            Value(kinds.FLOAT, number(value.code, value.type, kinds.FLOAT), value.position, pure=value.pure)
+            Value(number(value.form, kinds.FLOAT), value.position, pure=value.pure)
             if kinds.is_number(value.type)
             else value
             for value in call.values
@@ -113,8 +94,7 @@ def _rounded(name: str) -> Function:
     function = _math(name, 1)
 
     def to_integer(call: Arguments) -> Value:
-        value = function(call)
-        return call.value(kinds.LONG, number(value.code, value.type, kinds.LONG))
+        return call.result(number(function(call).form, kinds.LONG))
 
     return to_integer
 
@@ -124,8 +104,7 @@ def _absolute_of_long(call: Arguments) -> Value:
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [
-        Value(kinds.LONG, number(value.code, value.type, kinds.LONG), value.position, pure=value.pure)
-        for value in call.values
+        Value(number(value.form, kinds.LONG), value.position, pure=value.pure) for value in call.values
     ]
     return _absolute(call)
 
@@ -133,10 +112,8 @@ def _absolute_of_long(call: Arguments) -> Value:
 def _absolute(call: Arguments) -> Value:
     call.count(1)
     require_number(call.values[0], "`abs`")
-    value = call.values[0]
-    kind = kinds.promoted(value.type)
-    code = f"h_abs({number(value.code, value.type, kind)})"
-    return call.value(kind, wrapped(code, kind) if isinstance(kind, kinds.Integer) else code)
+    kind = kinds.promoted(call.values[0].type)
+    return call.result(form.Unary(kind, "abs", number(call.values[0].form, kind)))
 
 
 def _extreme(name: str) -> Function:
@@ -145,16 +122,15 @@ def _extreme(name: str) -> Function:
         left, right = call.values
         if kinds.is_number(left.type) and kinds.is_number(right.type):
             kind = left.type if left.type == right.type else kinds.common(left.type, right.type)
-            codes = [number(value.code, value.type, kind) for value in call.values]
-            return call.value(kind, f"h_{name}({codes[0]}, {codes[1]})")
+            return call.value(kind, f"h_{name}", *(number(value.form, kind) for value in call.values))
         if left.type != right.type or not isinstance(left.type, kinds.String | kinds.Time | kinds.Duration):
             raise SpecificationError.at(
                 call.position, f"`{call.name}` has no meaning for {left.type} and {right.type}"
             )
-        code = left.code
+        first = left.form
         if isinstance(left.type, kinds.String):
-            code = f"o_charged({call.scope.context}, {code}, {call.site})"
-        return call.value(left.type, f"h_{name}({code}, {right.code})")
+            first = form.Call(left.type, "o_charged", (first,), call.site)
+        return call.value(left.type, f"h_{name}", first, right.form)
 
     return function
 
@@ -163,7 +139,7 @@ def _question(name: str) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
         require_number(call.values[0], f"`{name}`")
-        return call.value(kinds.BOOL, f"h_{name}({call.values[0].code})")
+        return call.value(kinds.BOOL, f"h_{name}", call.values[0].form)
 
     return function
 
@@ -173,7 +149,7 @@ def _to_string(call: Arguments) -> Value:
     value = call.values[0]
     require_number(value, "`std::to_string`")
     floating = isinstance(value.type, kinds.Floating)
-    return call.value(kinds.STRING, f"h_to_{'floating' if floating else 'integer'}({value.code})")
+    return call.value(kinds.STRING, f"h_to_{'floating' if floating else 'integer'}", value.form)
 
 
 def _parser(kind: kinds.Integer) -> Function:
@@ -184,7 +160,8 @@ def _parser(kind: kinds.Integer) -> Function:
         base = call.values[2].constant if len(call.values) > 2 else 10
         if base not in (2, 8, 10, 16):
             raise SpecificationError.at(call.values[2].position, "the base must be 2, 8, 10 or 16")
-        return call.value(kind, f"h_parse({call.text(0)}, {base}, {kind.least}, {kind.most}, {call.site})")
+        limits = (form.Literal(kind, number) for number in (kind.least, kind.most))
+        return call.value(kind, "h_parse", call.text(0), form.Literal(kinds.INT, base), *limits)
 
     return function
 
@@ -192,8 +169,7 @@ def _parser(kind: kinds.Integer) -> Function:
 def _parse_floating(kind: kinds.Floating) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
-        code = f"h_parse_floating({call.text(0)}, {kind.bits}, {call.site})"
-        return call.value(kind, code if kind.bits == 64 else f"c_f32({code})")
+        return call.value(kind, "h_parse_floating", call.text(0), form.Literal(kinds.INT, kind.bits))
 
     return function
 
@@ -201,21 +177,21 @@ def _parse_floating(kind: kinds.Floating) -> Function:
 def _lenient(kind: kinds.Type, name: str) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
-        code = f"h_{name}({call.text(0)})"
-        return call.value(kind, wrapped(code, kind) if isinstance(kind, kinds.Integer) else code)
+        wide = kinds.LONG if isinstance(kind, kinds.Integer) else kind
+        return call.result(number(form.Call(wide, f"h_{name}", (call.text(0),)), kind))
 
     return function
 
 
 def _compare(call: Arguments) -> Value:
     call.count(2)
-    charged = f"o_charged({call.scope.context}, {call.text(0)}, {call.site})"
-    return call.value(kinds.INT, f"h_compare({charged}, {call.text(1)})")
+    charged = form.Call(kinds.STRING, "o_charged", (call.text(0),), call.site)
+    return call.value(kinds.INT, "h_compare", charged, call.text(1))
 
 
 def _length(call: Arguments) -> Value:
     call.count(1)
-    return call.value(kinds.ULONG, f"h_len({call.text(0)})")
+    return call.value(kinds.ULONG, "h_len", call.text(0))
 
 
 def _buffer(call: Arguments) -> Value:
@@ -232,12 +208,7 @@ def _fills(function: str) -> Function:
     def fill(call: Arguments) -> Value:
         call.count(2)
         target = _buffer(call)
-        code = store(
-            call.scope,
-            target,
-            f"{function}({call.scope.context}, {target.code}, {call.text(1)}, {call.site})",
-        )
-        return Value(kinds.CHARACTERS, code, call.position, pure=False)
+        return _stored(call, target, function, call.text(1))
 
     return fill
 
@@ -245,30 +216,39 @@ def _fills(function: str) -> Function:
 def _fills_at_most(call: Arguments) -> Value:
     call.count(3)
     target = _buffer(call)
-    limit = number(call.values[2].code, call.values[2].type, kinds.ULONG)
-    code = f"h_filled_at_most({call.scope.context}, {target.code}, {call.text(1)}, {limit}, {call.site})"
-    return Value(kinds.CHARACTERS, store(call.scope, target, code), call.position, pure=False)
+    limit = number(call.values[2].form, kinds.ULONG)
+    return _stored(call, target, "h_filled_at_most", call.text(1), limit)
+
+
+def _stored(call: Arguments, target: Value, function: str, *arguments: form.Expression) -> Value:
+    """The buffer after a function of the form has filled it."""
+    filled = form.Call(kinds.CHARACTERS, function, (target.form, *arguments), call.site)
+    return Value(store(call.scope, target, filled), call.position, pure=False)
 
 
 def _prints(call: Arguments) -> Value:
     call.count(2, 100)
     target = _buffer(call)
-    text = formatted(call.scope, call.values[1], call.values[2:])
-    made = call.scope.temporary()
-    code = store(call.scope, target, f"h_filled({call.scope.context}, {target.code}, {made}, {call.site})")
-    return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
+    return _printed(call, target, "h_filled", formatted(call.scope, call.values[1], call.values[2:]))
 
 
 def _prints_at_most(call: Arguments) -> Value:
     call.count(3, 100)
     target = _buffer(call)
-    limit = number(call.values[1].code, call.values[1].type, kinds.ULONG)
+    limit = number(call.values[1].form, kinds.ULONG)
     text = formatted(call.scope, call.values[2], call.values[3:])
-    made = call.scope.temporary()
-    code = store(
-        call.scope, target, f"h_printed({call.scope.context}, {target.code}, {made}, {limit}, {call.site})"
-    )
-    return Value(kinds.INT, f"(({made} := {text}), {code}, h_len({made}))[-1]", call.position, pure=False)
+    return _printed(call, target, "h_printed", text, limit)
+
+
+def _printed(
+    call: Arguments, target: Value, function: str, text: form.Expression, *arguments: form.Expression
+) -> Value:
+    """The length of a text that a function of the form puts into a buffer."""
+    made = form.Read(kinds.STRING, call.scope.temporary())
+    filled = _stored(call, target, function, made, *arguments)
+    length = form.Call(kinds.INT, "h_len", (made,))
+    items = (form.Assign(kinds.STRING, made.name, text), filled.form, length)
+    return Value(form.Sequence(kinds.INT, items, -1), call.position, pure=False)
 
 
 LIBRARY: Mapping[str, Function] = MappingProxyType(

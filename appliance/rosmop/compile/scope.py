@@ -1,4 +1,4 @@
-"""What a function under compilation knows: variables by name, the lines written so far, where it stands."""
+"""What a function under compilation knows: variables by name, the statements written so far, where it stands."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from appliance.rosmop.compile.codecs import Codecs
-from appliance.rosmop.compile.module import Lines, Module, Site
+from appliance.rosmop.compile.module import Module, Site
 from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compile.python import Printer
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -54,7 +56,7 @@ class SpecificationNames:
 
 @dataclass(eq=False)
 class Loop:
-    """A loop or switch around the current statement: the lines a `continue` needs before it.
+    """A loop or switch around the current statement, and what a `continue` needs before it.
 
     `blocks` are the names that the step sees: those around the loop, not those around the `continue`.
     """
@@ -74,6 +76,14 @@ class Publication:
     position: Position
 
 
+@dataclass
+class Statements:
+    """Statements while they are written, and the site of the next."""
+
+    found: list[form.Statement] = field(default_factory=list)
+    site: int = -1
+
+
 class Shared:
     """What all functions of all specifications share while they are compiled."""
 
@@ -81,12 +91,18 @@ class Shared:
         self.module = module
         self.messages = messages
         self.codecs = Codecs(module, messages)
+        self.functions: dict[str, form.Function] = {}
         self.specifications: list[SpecificationNames] = []
         self.measures: dict[str, Callable[[Any], int]] = {}
         self.findings: list[Finding] = []
         self.publications: list[Publication] = []
         self.partial = False
         """Files of the set could not be read: a name that is not known here may be declared there."""
+
+    def define(self, function: form.Function) -> int:
+        """Add a function; returns the line of the code at which its event happens."""
+        self.functions[function.name] = function
+        return Printer(self.module, self.codecs, function.context).function(function)
 
     def foreign(self, own: SpecificationNames, name: str, position: Position) -> Variable | None:
         """A variable of another specification."""
@@ -113,12 +129,11 @@ class Scope:
         self.codecs = shared.codecs
         self.messages = shared.messages
         self.context = names.context
-        self.lines = Lines()
+        self.lines = Statements()
         self.result: Type = kinds.VOID
         self.references: tuple[Variable, ...] = ()
         self.message_type: str | None = None  # of the message that `MESSAGE` is
-        self.read_message: Callable[[], str] | None = None
-        self.whole_asked: str | None = None  # `MESSAGE` was read: the code's name for what is pending
+        self.pending: str | None = None  # `MESSAGE` was read: the code's name for what this action assigns
         self.drop_refused: str | None = None  # why `DROP;` may not stand here
         self.below: set[str] = set()  # shared variables whose declarations are still to come
         self.loops: list[Loop] = []
@@ -207,7 +222,7 @@ class Scope:
         """Note that the topic is published."""
         self.shared.publications.append(Publication(topic, kind, position))
 
-    # Lines
+    # Statements
 
     def temporary(self, prefix: str = "t") -> str:
         """A name for an intermediate value."""
@@ -219,7 +234,7 @@ class Scope:
 
     @contextmanager
     def at(self, node: tree.Node) -> Iterator[None]:
-        """Lines written inside belong to this node."""
+        """Statements written inside belong to this node."""
         before = self.lines.site
         self.lines.site = self.site(node)
         try:
@@ -227,14 +242,29 @@ class Scope:
         finally:
             self.lines.site = before
 
+    def add(self, statement: form.Statement) -> None:
+        """Append a statement."""
+        self.lines.found.append(statement)
+
+    def evaluate(self, value: form.Expression) -> None:
+        """Append an expression for its effect."""
+        self.add(form.Evaluate(self.lines.site, value))
+
     @contextmanager
-    def indented(self) -> Iterator[None]:
-        """Lines written inside are one step deeper."""
-        self.lines.depth += 1
+    def nested(self) -> Iterator[list[form.Statement]]:
+        """Statements written inside are these, and not of the function itself."""
+        outer, self.lines.found = self.lines.found, []
         try:
-            yield
+            yield self.lines.found
         finally:
-            self.lines.depth -= 1
+            self.lines.found = outer
+
+    def function(
+        self, name: str, parameters: tuple[str, ...], *, happens: int | None = None
+    ) -> form.Function:
+        """What was written, as a function."""
+        shared = tuple(sorted(self.written))
+        return form.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
 
     def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object]]]:
         seen: set[str] = set()

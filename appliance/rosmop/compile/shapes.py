@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from appliance.rosmop.compile.codecs import struct_size
+from appliance.rosmop.ir.values import struct_size
 
 _LENGTH = struct.Struct("<I")
 

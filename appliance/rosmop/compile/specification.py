@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any, TypeVar
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compile import conversion, cursors, members, operators, output, provided, storing
 from appliance.rosmop.compile.events import EventCode, compile_event
 from appliance.rosmop.compile.functions import (
     compile_function,
@@ -20,12 +19,13 @@ from appliance.rosmop.compile.functions import (
 )
 from appliance.rosmop.compile.lint import lint_property, unused_events
 from appliance.rosmop.compile.module import Module, TooComplexError
+from appliance.rosmop.compile.python import NAMESPACE
 from appliance.rosmop.compile.scope import Publication, Shared, SpecificationNames
+from appliance.rosmop.ir import form
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
 from appliance.rosmop.positions import Finding
-from appliance.rosmop.runtime import texts, vectors, wire
-from appliance.rosmop.runtime.context import MAX_BYTES, Context, FaultError, Turn
+from appliance.rosmop.runtime.context import MAX_BYTES, Context, Turn
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types.messages import Messages, nearest, shown
@@ -76,6 +76,8 @@ class Compiled:
     warnings: tuple[Finding, ...]
     publications: tuple[Publication, ...] = ()
     messages: Messages = field(default_factory=lambda: Messages(Definitions({})))
+    functions: Mapping[str, form.Function] = field(default_factory=dict)
+    """The same in the intermediate form, by name."""
 
 
 def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compiled:
@@ -95,7 +97,16 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compi
             position, f"too complex to compile ({error}); split expressions and functions"
         ) from None
     warnings = tuple(sorted(findings, key=lambda finding: finding.position))
-    return Compiled(module, namespace, tuple(compiled), turn, warnings, tuple(shared.publications), messages)
+    return Compiled(
+        module,
+        namespace,
+        tuple(compiled),
+        turn,
+        warnings,
+        tuple(shared.publications),
+        messages,
+        shared.functions,
+    )
 
 
 def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
@@ -123,33 +134,8 @@ def _compile_all(
 
 def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None:
     """Put into the namespace what generated code may use, and nothing else."""
-    for functions in (
-        conversion.FUNCTIONS,
-        storing.FUNCTIONS,
-        operators.FUNCTIONS,
-        members.FUNCTIONS,
-        provided.FUNCTIONS,
-        output.FUNCTIONS,
-        cursors.FUNCTIONS,
-    ):
-        module.namespace |= functions
-    module.namespace |= {
-        "__rv__": measures,
-        "c_nan": float("nan"),
-        "c_inf": float("inf"),
-        "e_character": texts.character,
-        "e_repeat": texts.repeat,
-        "e_filled": texts.filled,
-        "e_fill": vectors.filled_with,
-        "e_bytearray": bytearray,
-        "e_bytes": bytes,
-        "e_too_deep": _too_deep,
-        "x_whole": wire.whole,
-    }
-
-
-def _too_deep(site: int, name: str) -> None:
-    raise FaultError(site, f"`{name}` calls itself without end")
+    module.namespace |= NAMESPACE
+    module.namespace["__rv__"] = measures
 
 
 def _declare(

@@ -1,4 +1,4 @@
-"""Statements as code. One function for each kind of statement of `syntax/tree.py`.
+"""Statements. One function for each kind of statement of `syntax/tree.py`.
 
 A statement that is refused is noted and the next one is looked at, so that one check finds as much as it can.
 """
@@ -12,7 +12,8 @@ from appliance.rosmop.compile.conversion import condition, convert
 from appliance.rosmop.compile.cursors import Cursor
 from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import store_lines
+from appliance.rosmop.compile.storing import write_store
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime import numbers
 from appliance.rosmop.syntax import tree
@@ -54,14 +55,14 @@ def _declare(scope: Scope, node: tree.Declaration) -> None:
             node.position, "there are no static variables in functions; declare it before the events"
         )
     for declarator in node.declarators:
-        kind, code = initial(scope, node.type, declarator)
+        kind, value = initial(scope, node.type, declarator)
         if scope.codecs.width(kind) > LARGE:
             size = scope.codecs.width(kind)
-            scope.lines.add(f"{scope.context}.allocate({size}, {scope.lines.site})")
+            scope.add(form.Allocate(scope.lines.site, size))
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
         variable.copied = _is_copy(scope, declarator, kind)
         variable.known = known(scope, node.type, declarator, kind)
-        scope.lines.add(f"{variable.code} = {code}")
+        scope.evaluate(form.Assign(kind, variable.code, value))
 
 
 def _is_copy(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> bool:
@@ -94,8 +95,10 @@ def _rounded(value: float, kind: kinds.Floating) -> float:
     return value if kind.bits == 64 else numbers.f32(value)
 
 
-def initial(scope: Scope, name: tree.TypeName, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
-    """The type of a declared variable, and code for its first value."""
+def initial(
+    scope: Scope, name: tree.TypeName, declarator: tree.Declarator
+) -> tuple[kinds.Type, form.Expression]:
+    """The type of a declared variable, and its first value."""
     if name.name == ("auto",):
         return _deduced(scope, declarator)
     kind = resolve(name, scope.messages)
@@ -107,11 +110,11 @@ def initial(scope: Scope, name: tree.TypeName, declarator: tree.Declarator) -> t
         value = calls.construct(scope, declarator.position, kind, declarator.arguments, value_of)
         return kind, convert(scope, value, kind)
     if declarator.value is None:
-        return kind, scope.codecs.zero(kind)
+        return kind, form.Zero(kind)
     return kind, converted(scope, declarator.value, kind)
 
 
-def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
+def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, form.Expression]:
     if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = value_of(scope, declarator.value)
@@ -123,28 +126,29 @@ def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, str
     return kind, convert(scope, value, kind)
 
 
-def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple[kinds.Type, str]:
+def _array(scope: Scope, kind: kinds.Type, declarator: tree.Declarator) -> tuple[kinds.Type, form.Expression]:
     size = _array_size(scope, declarator)
     if kind == kinds.CHAR and not isinstance(declarator.value, tree.Elements):
-        zeros = f"e_repeat({scope.context}, {size}, 0, {scope.lines.site})"
+        site, nothing = scope.lines.site, form.Literal(kinds.CHAR, 0)
+        zeros = form.Call(kinds.CHARACTERS, "e_repeat", (form.Literal(kinds.ULONG, size), nothing), site)
         if declarator.value is None:
             return kinds.CHARACTERS, zeros
         text = converted(scope, declarator.value, kinds.STRING)
         if size is None:
-            return kinds.CHARACTERS, f"({text} + b'\\0')"
+            return kinds.CHARACTERS, form.Call(kinds.CHARACTERS, "t_zeroed", (text,))
         if isinstance(declarator.value, tree.Text) and len(declarator.value.value) >= size:
             length = len(declarator.value.value)
             raise SpecificationError.at(
                 declarator.value.position,
                 f"a text of {length} characters and its zero need `{declarator.name}[{length + 1}]`",
             )
-        return kinds.CHARACTERS, f"e_filled({scope.context}, {zeros}, {text}, {scope.lines.site})"
+        return kinds.CHARACTERS, form.Call(kinds.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:
         assert isinstance(declarator.value, tree.Elements)  # _array_size has looked
         size = len(declarator.value.items)
     array = kinds.Vector(kind, size)
     if declarator.value is None:
-        return array, scope.codecs.zero(array)
+        return array, form.Zero(array)
     if not isinstance(declarator.value, tree.Elements):
         raise SpecificationError.at(declarator.value.position, "an array is initialised by `{…}`")
     return array, elements(scope, declarator.value, array)
@@ -173,15 +177,14 @@ def _evaluate(scope: Scope, node: tree.Statement) -> None:
     expression = node.expression
     level = calls.stream_of(expression)
     if level is not None:
-        scope.lines.add(calls.streamed(scope, node, level, expression, value_of, headed=True).code)
+        scope.evaluate(calls.streamed(scope, node, level, expression, value_of, headed=True).form)
     elif isinstance(expression, tree.Assign):
-        target, code = assignment(scope, expression)
-        scope.lines.extend(store_lines(scope, target, code))
+        write_store(scope, *assignment(scope, expression))
     elif isinstance(expression, tree.Step):
         prefix = tree.Step(expression.position, expression.operator, expression.target, prefix=True)
-        scope.lines.add(value_of(scope, prefix).code)
+        scope.evaluate(value_of(scope, prefix).form)
     else:
-        scope.lines.add(value_of(scope, expression).code)
+        scope.evaluate(value_of(scope, expression).form)
 
 
 def _block(scope: Scope, node: tree.Statement) -> None:
@@ -194,17 +197,16 @@ def _block(scope: Scope, node: tree.Statement) -> None:
 def _if(scope: Scope, node: tree.Statement) -> None:
     assert isinstance(node, tree.If)
     with scope.at(node.condition):
-        scope.lines.add(f"if {condition(value_of(scope, node.condition))}:")
-    loops.write_body(scope, [node.yes], write)
-    if node.no is not None:
-        scope.lines.add("else:")
-        loops.write_body(scope, [node.no], write)
+        test, site = condition(value_of(scope, node.condition)), scope.lines.site
+    yes = loops.body(scope, [node.yes], write)
+    no = () if node.no is None else loops.body(scope, [node.no], write)
+    scope.add(form.If(site, test, yes, no))
 
 
 def _break(scope: Scope, node: tree.Statement) -> None:
     if not scope.loops:
         raise SpecificationError.at(node.position, "`break` stands in a loop or a `switch`")
-    scope.lines.add("break")
+    scope.add(form.Break(scope.lines.site))
 
 
 def _continue(scope: Scope, node: tree.Statement) -> None:
@@ -220,8 +222,8 @@ def _return(scope: Scope, node: tree.Statement) -> None:
         hint = "write `return;` to drop the message" if scope.role == "action" else "write `return;`"
         raise SpecificationError.at(node.value.position, f"there is nobody to return a value to; {hint}")
     if scope.role == "action":
-        scope.lines.add("m.dropped = True")
-    scope.lines.add("return True" if scope.role in ("action", "timer") else "return")
+        scope.add(form.Drop(scope.lines.site, anyway=True))
+    scope.add(form.Leave(scope.lines.site, True if scope.role in ("action", "timer") else None))
 
 
 def _return_value(scope: Scope, node: tree.Return) -> None:
@@ -231,9 +233,9 @@ def _return_value(scope: Scope, node: tree.Return) -> None:
             "this function has no value; write `return;`" if void else f"this function returns {scope.result}"
         )
         raise SpecificationError.at(node.position, hint)
-    code = "None" if node.value is None else converted(scope, node.value, scope.result)
-    handed = "".join(f", {variable.code}" for variable in scope.references)
-    scope.lines.add(f"return ({code}{handed})" if handed else f"return {code}")
+    nothing = form.Literal(kinds.VOID, None)
+    value = nothing if node.value is None else converted(scope, node.value, scope.result)
+    scope.add(form.Return(scope.lines.site, value, tuple(variable.code for variable in scope.references)))
 
 
 # What only specifications have
@@ -242,14 +244,13 @@ def _return_value(scope: Scope, node: tree.Return) -> None:
 def _drop(scope: Scope, node: tree.Statement) -> None:
     if scope.drop_refused is not None:
         raise SpecificationError.at(node.position, f"`DROP;` cannot stand here: {scope.drop_refused}")
-    guard = "if m is not None: " if scope.role == "handler" else ""  # a timeout has no message
-    scope.lines.add(f"{guard}m.dropped = True")
+    scope.add(form.Drop(scope.lines.site, anyway=scope.role != "handler"))  # a timeout has no message
 
 
 def _reset(scope: Scope, node: tree.Statement) -> None:
     if scope.role != "handler":
         raise SpecificationError.at(node.position, "`__RESET;` stands in the handlers of a property")
-    scope.lines.add(f"{scope.context}.turn.reset = True")
+    scope.add(form.Reset(scope.lines.site))
 
 
 def _delete(scope: Scope, node: tree.Statement) -> None:
@@ -266,11 +267,7 @@ def _publish(scope: Scope, node: tree.Statement) -> None:
     value = value_of(scope, node.value)
     if value.type != kind:
         raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is to be published")
-    out = scope.temporary()
-    scope.lines.add(f"{out} = e_bytearray()")
-    scope.lines.add(f"{scope.codecs.encoder(kind)}({value.code}, {out})")
-    arguments = f"{node.topic!r}, {node.type!r}, e_bytes({out}), {scope.lines.site}"
-    scope.lines.add(f"{scope.context}.publish({arguments})")
+    scope.add(form.Publish(scope.lines.site, node.topic, kind, value.form, scope.temporary()))
     scope.published(node.topic, node.type, node.position)
 
 

@@ -1,4 +1,4 @@
-"""Assignments as code: to variables, elements, fields, characters and parts of times.
+"""Assignments: to variables, elements, fields, characters and parts of times.
 
 A parameter that is bound to a field remembers that it was assigned, because only then the field is written.
 """
@@ -14,16 +14,9 @@ from appliance.rosmop.compile.places import (
     root,
 )
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.runtime import texts, times, vectors
+from appliance.rosmop.ir import form
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
-
-FUNCTIONS = {
-    "a_put": vectors.put,
-    "a_slot": vectors.put_slot,
-    "a_character": texts.with_character,
-    "a_part": times.with_part,
-}
 
 
 def require_place(target: Value, what: str) -> Place:
@@ -54,24 +47,27 @@ def note_copy(target: Value, value: Value) -> None:
         variable.copied = variable.copied or isinstance(variable.type, kinds.Characters)
 
 
-def store(scope: Scope, target: Value, code: str) -> str:
+def store(scope: Scope, target: Value, value: form.Expression) -> form.Expression:
     """An expression that assigns and has the value assigned."""
-    stored = _store(scope, require_place(target, "an assignment"), code)
-    flag = mark(scope, target)
-    return f"(({flag} := True), {stored})[1]" if flag else stored
+    stored = _store(scope, require_place(target, "an assignment"), value)
+    return marked(mark(scope, target), stored)
 
 
-def store_lines(scope: Scope, target: Value, code: str) -> list[str]:
-    """Statements that assign."""
+def write_store(scope: Scope, target: Value, value: form.Expression) -> None:
+    """Write the statements that assign."""
     place = require_place(target, "an assignment")
     flag = mark(scope, target)
-    lines = [f"{flag} = True"] if flag else []
-    if isinstance(place, VariablePlace) and place.variable.alias is None:
-        _note(scope, place)
-        return [f"{place.variable.code} = {code}", *lines]
-    if isinstance(place, SlotPlace):
-        return [f"{place.base.code}[{place.slot}] = {code}", *lines]
-    return [_store(scope, place, code), *lines]
+    scope.evaluate(_store(scope, place, value))
+    if flag is not None:
+        scope.evaluate(form.Assign(kinds.BOOL, flag, form.Literal(kinds.BOOL, True)))
+
+
+def marked(flag: str | None, change: form.Expression) -> form.Expression:
+    """An expression that changes a place, which sets the flag for that, if there is one."""
+    if flag is None:
+        return change
+    assigned = form.Assign(kinds.BOOL, flag, form.Literal(kinds.BOOL, True))
+    return form.Sequence(change.type, (assigned, change), 1)
 
 
 def mark(scope: Scope, target: Value) -> str | None:
@@ -87,30 +83,32 @@ def mark(scope: Scope, target: Value) -> str | None:
     return variable.flag
 
 
-def _store(scope: Scope, place: Place, code: str) -> str:
+def _store(scope: Scope, place: Place, value: form.Expression) -> form.Expression:
     if isinstance(place, VariablePlace):
         if place.variable.alias is not None:
-            return _store(scope, require_place(place.variable.alias, "an assignment"), code)
+            return _store(scope, require_place(place.variable.alias, "an assignment"), value)
         _note(scope, place)
-        return f"({place.variable.code} := {code})"
+        return form.Assign(place.variable.type, place.variable.code, value)
     if isinstance(place, ElementPlace):
-        return f"a_put({place.base.code}, {place.index}, {code}, {place.site})"
+        return form.Call(value.type, "a_put", (place.base.form, place.index, value), place.site)
     if isinstance(place, SlotPlace):
-        return f"a_slot({place.base.code}, {place.slot}, {code})"
-    return _store_part(scope, place, code)
+        slot = form.Literal(kinds.INT, place.slot)
+        return form.Call(value.type, "a_slot", (place.base.form, slot, value))
+    return _store_part(scope, place, value)
 
 
-def _store_part(scope: Scope, place: Place, code: str) -> str:
+def _store_part(scope: Scope, place: Place, value: form.Expression) -> form.Expression:
     """Strings and times do not change in place: the whole is stored anew."""
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
-    inner = require_place(place.base, "an assignment")
+    inner, base = require_place(place.base, "an assignment"), place.base.form
     if not place.base.pure:
         raise SpecificationError.at(
             place.base.position, "too much in one step; put the index into a variable first"
         )
     if isinstance(place, PartPlace):
-        return _store(scope, inner, f"a_part({place.base.code}, {place.part!r}, {code}, {place.site})")
-    changed = f"a_character({scope.context}, {place.base.code}, {place.index}, {code}, {place.site})"
+        part = form.Literal(kinds.VOID, place.part)
+        return _store(scope, inner, form.Call(base.type, "a_part", (base, part, value), place.site))
+    changed = form.Call(base.type, "a_character", (base, place.index, value), place.site)
     return _store(scope, inner, changed)
 
 

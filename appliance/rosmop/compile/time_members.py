@@ -1,49 +1,45 @@
 """Member functions of times and durations: `t.toSec()`, `d.fromSec(0.5)`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from appliance.rosmop.compile.conversion import check_convertible, convert
 from appliance.rosmop.compile.invocation import Invocation, Method
 from appliance.rosmop.compile.places import Value
-from appliance.rosmop.runtime import times
+from appliance.rosmop.ir import form
 from appliance.rosmop.types import kinds
-
-FUNCTIONS: dict[str, Callable[..., object]] = {
-    "m_nanoseconds": times.nanoseconds,
-    "m_time": times.time,
-    "m_duration": times.duration,
-}
 
 
 def _seconds(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.DOUBLE, f"({call.base.code} / 1000000000)")
+    return call.value(kinds.DOUBLE, "m_seconds")
 
 
 def _nanoseconds(call: Invocation) -> Value:
     call.count(0)
-    kind = kinds.ULONG if isinstance(call.base.type, kinds.Time) else kinds.LONG
-    return call.value(kind, call.base.code)
+    return call.value(kinds.ULONG if call.base.type == kinds.TIME else kinds.LONG, "m_whole")
 
 
 def _is_zero(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.BOOL, f"({call.base.code} == 0)")
+    return call.value(kinds.BOOL, "m_is_zero")
 
 
 def _set_seconds(call: Invocation) -> Value:
     call.count(1)
     check_convertible(call.arguments[0], kinds.DOUBLE)
-    limit = "m_time" if isinstance(call.base.type, kinds.Time) else "m_duration"
-    seconds = f"m_nanoseconds({call.arguments[0].code}, {call.site})"
-    return call.changes(f"{limit}({seconds}, {call.site})")
+    seconds = form.Call(kinds.LONG, "m_nanoseconds", (call.arguments[0].form,), call.site)
+    return _set(call, seconds)
 
 
 def _set_nanoseconds(call: Invocation) -> Value:
-    limit = "m_time" if isinstance(call.base.type, kinds.Time) else "m_duration"
     call.count(1)
-    return call.changes(f"{limit}({convert(call.scope, call.arguments[0], kinds.LONG)}, {call.site})")
+    return _set(call, convert(call.scope, call.arguments[0], kinds.LONG))
+
+
+def _set(call: Invocation, nanoseconds: form.Expression) -> Value:
+    limit = "m_time" if isinstance(call.base.type, kinds.Time) else "m_duration"
+    return call.changes(form.Call(call.base.type, limit, (nanoseconds,), call.site))
 
 
 MOMENT_METHODS: Mapping[str, Method] = MappingProxyType(

@@ -1,45 +1,33 @@
 """Member functions of vectors, and `[]`: `values.push_back(x)`, `values.at(1)`, `values.erase(…)`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from appliance.rosmop.compile import cursors
-from appliance.rosmop.compile.conversion import convert, number
+from appliance.rosmop.compile.conversion import constant_value, convert, number
 from appliance.rosmop.compile.invocation import Invocation, Method, empty, length
 from appliance.rosmop.compile.places import ElementPlace, Value
-from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
-from appliance.rosmop.runtime import vectors
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 
-FUNCTIONS: dict[str, Callable[..., object]] = {
-    "l_element": vectors.element,
-    "l_append": vectors.append,
-    "l_append_text": vectors.append_text,
-    "l_pop": vectors.pop,
-    "l_resized": vectors.resized,
-    "l_clear": list.clear,
-    "l_len": len,
-}
 
-
-def element_value(scope: Scope, base: Value, index: Value, position: Position, site: int) -> Value:
+def element_value(base: Value, index: Value, position: Position, site: int) -> Value:
     """`base[index]` of a vector."""
     assert isinstance(base.type, kinds.Vector)  # the caller has looked
     kind = base.type
     if not kinds.is_number(index.type):
         raise SpecificationError.at(index.position, f"an index is a number; this is {index.type}")
-    code = number(index.code, index.type, kinds.LONG)
+    at = number(index.form, kinds.LONG)
     known = index.constant
     if kind.length is not None and isinstance(known, int) and not 0 <= known < kind.length:
         raise SpecificationError.at(
             index.position, f"index {known} is past the end of an array of {kind.length} elements"
         )
-    place = ElementPlace(base, code, site) if base.place is not None else None
-    read = f"l_element({base.code}, {code}, {site})"
-    del scope
-    return Value(kind.element, read, position, place, owned=base.owned, pure=base.pure and index.pure)
+    place = ElementPlace(base, at, site) if base.place is not None else None
+    element = form.Call(kind.element, "l_element", (base.form, at), site)
+    return Value(element, position, place, owned=base.owned, pure=base.pure and index.pure)
 
 
 def _vector(call: Invocation) -> kinds.Vector:
@@ -49,49 +37,44 @@ def _vector(call: Invocation) -> kinds.Vector:
 
 def _vector_at(call: Invocation) -> Value:
     call.count(1)
-    return element_value(call.scope, call.base, call.arguments[0], call.position, call.site)
+    return element_value(call.base, call.arguments[0], call.position, call.site)
 
 
 def _vector_front(call: Invocation) -> Value:
     call.count(0)
-    first = Value(kinds.LONG, "0", call.position, constant=0)
-    return element_value(call.scope, call.base, first, call.position, call.site)
+    first = constant_value(call.position, kinds.LONG, 0)
+    return element_value(call.base, first, call.position, call.site)
 
 
 def _vector_back(call: Invocation) -> Value:
     call.count(0)
-    last = Value(kinds.LONG, f"(l_len({call.base.code}) - 1)", call.position, pure=call.base.pure)
-    return element_value(call.scope, call.base, last, call.position, call.site)
+    return element_value(call.base, call.value(kinds.LONG, "l_last"), call.position, call.site)
 
 
 def _push_back(call: Invocation) -> Value:
     call.count(1)
     kind = _vector(call)
     value = convert(call.scope, call.arguments[0], kind.element, call.site)
-    width = call.scope.codecs.width(kind.element)
+    width = form.Literal(kinds.ULONG, call.scope.codecs.width(kind.element))
     function = "l_append_text" if isinstance(kind.element, kinds.String) else "l_append"
-    return call.changes_in_place(
-        f"{function}({call.scope.context}, {call.base.code}, {value}, {width}, {call.site})"
-    )
+    return call.changes_in_place(function, value, width)
 
 
 def _pop_back(call: Invocation) -> Value:
     call.count(0)
-    return call.changes_in_place(f"l_pop({call.base.code}, {call.site})")
+    return call.changes_in_place("l_pop")
 
 
 def _vector_clear(call: Invocation) -> Value:
     call.count(0)
-    return call.changes_in_place(f"l_clear({call.base.code})")
+    return call.changes_in_place("l_clear")
 
 
 def _vector_resize(call: Invocation) -> Value:
     call.count(1)
-    kind = _vector(call)
-    codecs = call.scope.codecs
-    maker, width = codecs.maker(kind.element), codecs.width(kind.element)
-    arguments = f"{call.base.code}, {call.index(0)}, {maker}, {width}, {call.site}"
-    return call.changes_in_place(f"l_resized({call.scope.context}, {arguments})")
+    element = _vector(call).element
+    width = form.Literal(kinds.ULONG, call.scope.codecs.width(element))
+    return call.changes_in_place("l_resized", call.index(0), form.OfType("zero", element), width)
 
 
 def _cursor(call: Invocation) -> Value:
@@ -118,7 +101,7 @@ def _refuse_fixed(call: Invocation) -> None:
 
 def _nothing(call: Invocation) -> Value:
     call.count(1)
-    return Value(kinds.VOID, "None", call.position)
+    return Value(form.Literal(kinds.VOID, None), call.position)
 
 
 VECTOR_METHODS: Mapping[str, Method] = MappingProxyType(

@@ -77,7 +77,7 @@ class Turn:
 class Context:
     """One specification: its name, what it has left of its budget, and where its output goes."""
 
-    __slots__ = ("_allocated", "_measures", "_pending", "budget", "monitor", "throttled", "turn")
+    __slots__ = ("_allocated", "_measures", "_pending", "budget", "live", "monitor", "throttled", "turn")
 
     def __init__(self, monitor: str, turn: Turn, measures: Mapping[str, Measure]) -> None:
         self.monitor = monitor
@@ -85,7 +85,9 @@ class Context:
         self.budget = BUDGET
         self.throttled: dict[int, int] = {}
         self._allocated = 0
-        self._measures = measures  # of the variables of the generated code, by name
+        self._measures = measures  # of the variables of the specifications, by name
+        self.live: Callable[[], list[Mapping[str, object]]] = self._generated
+        """Says which variables have values, once for those that specifications share and once for each call."""
         self._pending = 0
 
     def begin(self) -> None:
@@ -141,18 +143,23 @@ class Context:
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)
-        frame: FrameType | None = sys._getframe(2)  # the locals of the calling actions count, too
-        shared: Mapping[str, object] = {}
-        while frame is not None:
-            if frame.f_globals.get("__rv__") is self._measures:
-                shared = frame.f_globals
-                held += self._held(frame.f_locals)
-            frame = frame.f_back
-        held += self._held(shared)
+        held += sum(map(self._held, self.live()))
         self._allocated = 0
         self.spend(held // (BYTES_PER_INSTRUCTION * 16), site)
         if held > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
+
+    def _generated(self) -> list[Mapping[str, object]]:
+        """The variables of generated code, which are those of Python's frames."""
+        found: list[Mapping[str, object]] = []
+        frame: FrameType | None = sys._getframe(1)
+        shared: Mapping[str, object] = {}
+        while frame is not None:
+            if frame.f_globals.get("__rv__") is self._measures:
+                shared = frame.f_globals
+                found.append(frame.f_locals)
+            frame = frame.f_back
+        return [shared, *found]
 
     def _held(self, variables: Mapping[str, object]) -> int:
         measures = self._measures

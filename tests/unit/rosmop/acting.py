@@ -13,6 +13,7 @@ from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
+from tests.unit.rosmop.interpreted import beside, check_same
 
 STORE: Any = get_typestore(Stores.ROS1_NOETIC)
 PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
@@ -88,9 +89,18 @@ def load(text: str, on_fault: OnFault = "drop", **others: str) -> MonitorSet:
 
 
 def act(body: str, *, before: str = "", data: int = 0) -> Outcome:
-    """What comes of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions."""
+    """What comes of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
+
+    It is the same by generated code and by the interpreter.
+    """
     text = f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
-    return load(text).process("/t", message("std_msgs/Int32", data=data), 1_500_000_000)
+    told = message("std_msgs/Int32", data=data)
+    monitors = load(text)
+    other = beside(monitors)
+    other.start(0)
+    outcome = monitors.process("/t", told, 1_500_000_000)
+    check_same(outcome, other.process("/t", told, 1_500_000_000))
+    return outcome
 
 
 def shown(expression: str, *, conversion: str = "%s", before: str = "", data: int = 0) -> str:

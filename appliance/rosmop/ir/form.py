@@ -1,0 +1,628 @@
+"""The form: typed expressions, statements and functions, without names to look up or types to infer.
+
+Everything is an immutable value. Types are those of `types/kinds.py`; every expression has one, and its operands have
+the types that the operation takes (conversions are written out). Values are as in C++ on a 64-bit machine: integers
+of their width that wrap, floats of 32 or 64 bits, strings of bytes. Times and durations are nanoseconds. Vectors and
+messages are references: assigning one shares it, so copies are written out, too (`Copy`).
+
+Names are of the set of specifications: `g…` variables that specifications share, all others belong to one call of one
+function. A *site* is the number of a place in the text, to tell faults by; -1 is that of the statement.
+
+A message is its bytes, from 0. A `Spot` is a position in it: a distance from the start, or from a position that a
+statement before has found and named. What is read beyond the end is a fault.
+
+What an action does to the world is a list of effects, in order: drop this message (`Drop`, or a `Return` that drops),
+write fields (`WriteBack`), a line of output (`Log`), a message to be published (`Publish`), `Reset` of the property.
+Bounds: `Charge` and `Allocate` take from the budget of instructions and bytes, as do functions that make or look at
+something long; what exceeds them is a fault.
+"""
+
+from dataclasses import dataclass
+
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+# Expressions
+
+
+@dataclass(frozen=True, slots=True)
+class Literal:
+    """A constant. What is no value of the language (None, and names of parts of a time) has the type void."""
+
+    type: Type
+    value: bool | int | float | bytes | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """The value of a variable."""
+
+    type: Type
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Assign:
+    """Give a variable a value; the value."""
+
+    type: Type
+    name: str
+    value: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Convert:
+    """A number as one of another type: integers wrap, floating-point numbers are truncated toward zero within the
+    limits (NaN is 0) or rounded, and what is not zero is true.
+    """
+
+    type: Type
+    value: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """`+ - * / % & | ^ << >>` of numbers of this type; of a shift the right operand may have another.
+
+    Integers wrap, shifts count modulo the width, integer division truncates and is a fault by zero.
+    """
+
+    type: Type
+    operator: str
+    left: "Expression"
+    right: "Expression"
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unary:
+    """`-`, `~` or `abs` of a number; integers wrap."""
+
+    type: Type
+    operator: str
+    value: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A sum or difference of times and durations, exact; a fault beyond what this type holds."""
+
+    type: Type
+    operator: str
+    left: "Expression"
+    right: "Expression"
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class MomentOf:
+    """A time or duration of seconds and nanoseconds (`long`), exact; a fault beyond what this type holds."""
+
+    type: Type
+    seconds: "Expression"
+    nanoseconds: "Expression"
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """`== != < > <= >=` of two values of the same type; vectors and messages are charged by what they hold."""
+
+    operator: str
+    left: "Expression"
+    right: "Expression"
+    site: int
+    type: Type = kinds.BOOL
+
+
+@dataclass(frozen=True, slots=True)
+class CompareTexts:
+    """The same of strings. The left one is charged by its length, unless one of them is known to be `short`, or the
+    right one is a variable that holds few bytes.
+    """
+
+    operator: str
+    left: "Expression"
+    right: "Expression"
+    short: bool
+    site: int
+    type: Type = kinds.BOOL
+
+
+@dataclass(frozen=True, slots=True)
+class Logical:
+    """`and`, `or`: the right operand is looked at only if the left one does not decide."""
+
+    operator: str
+    left: "Expression"
+    right: "Expression"
+    type: Type = kinds.BOOL
+
+
+@dataclass(frozen=True, slots=True)
+class Not:
+    """The opposite."""
+
+    value: "Expression"
+    type: Type = kinds.BOOL
+
+
+@dataclass(frozen=True, slots=True)
+class Conditional:
+    """`test ? yes : no`."""
+
+    type: Type
+    test: "Expression"
+    yes: "Expression"
+    no: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """All items in order; the value is that of the chosen one."""
+
+    type: Type
+    items: "tuple[Expression, ...]"
+    chosen: int
+
+
+@dataclass(frozen=True, slots=True)
+class Discard:
+    """An expression for its effect alone."""
+
+    value: "Expression"
+    type: Type = kinds.VOID
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A field of a message, or a part of what a function hands back, by its number."""
+
+    type: Type
+    base: "Expression"
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Vector:
+    """A vector of these elements, and so many zeros behind them."""
+
+    type: kinds.Vector
+    items: "tuple[Expression, ...]"
+    zeros: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """A zero value, newly made."""
+
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """A copy of a vector or message with all that is in it."""
+
+    type: Type
+    value: "Expression"
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Recast:
+    """A vector of bytes (or of vectors of them) as one of bytes of another kind."""
+
+    type: kinds.Vector
+    value: "Expression"
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class OfType:
+    """What a function is handed to deal with values of a type: how to make a `zero`,
+    `copy` one, `measure` its bytes.
+    """
+
+    what: str
+    of: Type
+    site: int = -1
+    type: Type = kinds.VOID
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A call of a function of `functions.py`."""
+
+    type: Type
+    function: str
+    arguments: "tuple[Expression, ...]"
+    site: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Accumulate:
+    """The sum of a vector's elements from `first` to before `last`, and of `start`: calculated in `wide`, each step
+    converted to the type.
+    """
+
+    type: Type
+    vector: "Expression"
+    first: "Expression"
+    last: "Expression"
+    start: "Expression"
+    wide: Type
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Invoke:
+    """A call of a helper function; with references what comes back is the value and the references' new values.
+
+    `depth`: of a recursive one, whether it is called from a recursive one (a level deeper) or begins.
+    """
+
+    type: Type
+    function: str
+    arguments: "tuple[Expression, ...]"
+    depth: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """Text by a template with conversions, as Python's `%` of bytes has them. `size` is how long it can be without its
+    strings if that is to be charged, else None.
+    """
+
+    template: bytes
+    arguments: "tuple[Expression, ...]"
+    size: int | None
+    site: int
+    type: Type = kinds.STRING
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """Strings one after the other."""
+
+    pieces: "tuple[Expression, ...]"
+    site: int
+    type: Type = kinds.STRING
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A line of output."""
+
+    level: str
+    text: "Expression"
+    site: int
+    type: Type = kinds.VOID
+
+
+@dataclass(frozen=True, slots=True)
+class Throttle:
+    """Whether output at this site is due: the last was at least so many seconds ago."""
+
+    seconds: "Expression"
+    site: int
+    type: Type = kinds.BOOL
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """The time at which the message was received."""
+
+    type: Type = kinds.TIME
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """`MESSAGE`: all of it, with the fields that this action has assigned so far, which `Pending` has named."""
+
+    type: kinds.Record
+    pending: str
+    site: int
+
+
+Expression = (
+    Literal | Read | Assign | Convert | Arithmetic | Unary | Moment | MomentOf | Compare | CompareTexts | Logical | Not
+    | Conditional | Sequence | Discard | Item | Vector | Zero | Copy | Recast | OfType | Call | Accumulate | Invoke
+    | Format | Join | Log | Throttle | Now | Whole
+)  # fmt: skip
+
+
+# Statements
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluate:
+    """An expression for its effect."""
+
+    site: int
+    value: Expression
+
+
+@dataclass(frozen=True, slots=True)
+class If:
+    """`if (test) yes else no`."""
+
+    site: int
+    test: Expression
+    yes: "tuple[Statement, ...]"
+    no: "tuple[Statement, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Again and again, until `Break`."""
+
+    site: int
+    body: "tuple[Statement, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class ForEach:
+    """Once for each element of a vector (also one that the body appends) or character of a string (as a byte)."""
+
+    site: int
+    name: str
+    values: Expression
+    body: "tuple[Statement, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class Break:
+    """Leave the innermost loop."""
+
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Continue:
+    """The innermost loop's next turn."""
+
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Select:
+    """Give a variable the number that the table has for a value, or the default."""
+
+    site: int
+    name: str
+    value: Expression
+    table: tuple[tuple[int, int], ...]
+    default: int
+
+
+@dataclass(frozen=True, slots=True)
+class Return:
+    """The end of a helper function, with its value and those of its references."""
+
+    site: int
+    value: Expression
+    references: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Leave:
+    """The end of anything else. Of an event: whether it happened."""
+
+    site: int
+    happened: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Charge:
+    """Take so many instructions from the budget."""
+
+    site: int
+    instructions: int
+
+
+@dataclass(frozen=True, slots=True)
+class Allocate:
+    """So many bytes are about to be made; None: as many as the message has, if they are many."""
+
+    site: int
+    size: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class LimitDepth:
+    """A fault if this recursive function has been called too often within itself."""
+
+    site: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    """The message is not relayed. `anyway`: there is one; else only if there is (a deadline brings none)."""
+
+    site: int
+    anyway: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """The property begins anew when its handlers have run."""
+
+    site: int
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    """Publish a message; `name` is a variable for its bytes."""
+
+    site: int
+    topic: str
+    kind: kinds.Record
+    value: Expression
+    name: str
+
+
+# Fields of the message
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A position: so many bytes behind a named one, or behind the start."""
+
+    base: str | None
+    offset: int
+
+    def plus(self, more: int) -> "Spot":
+        """So many bytes further."""
+        return Spot(self.base, self.offset + more)
+
+
+@dataclass(frozen=True, slots=True)
+class AfterText:
+    """Name the position behind the string at `at`."""
+
+    site: int
+    name: str
+    at: Spot
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """Name the number of elements of the array at `at`; a fault if so many, of `least` bytes each, are not there."""
+
+    site: int
+    name: str
+    at: Spot
+    least: int
+
+
+@dataclass(frozen=True, slots=True)
+class AfterElements:
+    """Name the position behind so many elements (a number, or a named one) of `size` bytes each."""
+
+    site: int
+    name: str
+    at: Spot
+    count: str | int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Skip:
+    """Name the position behind so many elements of variable size, each of which `skipper` measures (None: strings).
+
+    They are charged; `inner` (within an element that is skipped) even if they are few.
+    """
+
+    site: int
+    name: str
+    at: Spot
+    count: str | int
+    skipper: "Skipper | None"
+    inner: bool
+
+
+@dataclass(frozen=True, slots=True)
+class NotPast:
+    """The event does not happen, and that is told, unless there are more elements than `index`."""
+
+    site: int
+    count: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadNumbers:
+    """Give variables the numbers or times at so many bytes behind `at`, in the order in which they stand there."""
+
+    site: int
+    at: Spot
+    fields: tuple[tuple[str, Type, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadValue:
+    """Give a variable the string, vector or message at `at`, and name the position behind it."""
+
+    site: int
+    name: str
+    end: str
+    at: Spot
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class Require:
+    """The event does not happen unless this is true."""
+
+    site: int
+    test: Expression
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """A field that gets a value (of the field's type) if `flag` is set; `end` names where one of variable size ends.
+
+    `path` leads to it from the whole message: numbers of fields and elements, `sec` or `nsec` at the end.
+    """
+
+    flag: str
+    value: Expression
+    at: Spot
+    end: str | None
+    path: tuple[int | str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """Name the fields that this action may assign, for `Whole`."""
+
+    site: int
+    name: str
+    writes: tuple[Write, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteBack:
+    """Put the fields that were assigned into the message, all of them or, with a fault, none; `name` is a variable for
+    what is spliced. Of a dropped message none is written, and the event has happened.
+    """
+
+    site: int
+    writes: tuple[Write, ...]
+    name: str
+
+
+Statement = (
+    Evaluate | If | Loop | ForEach | Break | Continue | Select | Return | Leave | Charge | Allocate | LimitDepth | Drop
+    | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue | Require
+    | Pending | WriteBack
+)  # fmt: skip
+
+
+# Functions
+
+
+@dataclass(frozen=True, slots=True)
+class Skipper:
+    """Where an element that begins at the position `p` ends."""
+
+    name: str
+    body: tuple[Statement, ...]
+    end: Spot
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """A function: of an event (`message` is looked at; it happens from the statement `happens` on), a handler, a timer,
+    a helper function, or a stage of the beginning.
+
+    `context` is whose budget it takes from. `shared` are the variables of the set that it assigns.
+    """
+
+    name: str
+    context: str
+    parameters: tuple[str, ...]
+    body: tuple[Statement, ...]
+    shared: tuple[str, ...] = ()
+    happens: int | None = None

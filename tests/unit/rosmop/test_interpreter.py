@@ -1,0 +1,137 @@
+"""The interpreter of the intermediate form does what generated code does: bytes, records, faults, state.
+
+`acting.act` compares the two for every action that the tests of the language run: so with the C++ compiler's answers.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.ros.definitions import Definitions
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.ir.values import Values
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.messages import Messages as MessageTypes
+from tests.unit.rosmop.acting import message
+from tests.unit.rosmop.interpreted import beside, check_same
+from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
+
+MONITORS = Path(__file__).parents[3] / "monitors"
+FEW = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
+    """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
+    other = beside(monitors)
+    check_same(monitors.start(0), other.start(0))
+    for number, (topic, body) in enumerate(traffic):
+        time = number * step_ns
+        check_same(
+            monitors.process(topic, bytearray(body), time), other.process(topic, bytearray(body), time)
+        )
+    for one in monitors._compiled.specifications:
+        for code in one.variables.values():
+            known, found = (each._compiled.namespace[code] for each in (monitors, other))
+            assert repr(known) == repr(found)  # a NaN is one, too
+
+
+@FEW
+@given(
+    seed=st.integers(0, 1 << 30),
+    on_fault=st.sampled_from(["drop", "pass"]),
+    step_ns=st.sampled_from([1, 700_000]),
+)
+def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_ns: int) -> None:
+    """Actions, conditions, helper functions, loops, timers and properties, on messages that are not always whole."""
+    sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
+    messages = Messages(seed)
+    together = [(one.topic, body) for one in (messages.traffic() for _ in range(4)) for body in one.bodies()]
+    try:
+        monitors = MonitorSet.load(sources, definitions(), on_fault)
+    except SpecificationError:
+        return  # a draw that means nothing
+    check(monitors, together, step_ns)
+
+
+def shipped() -> MonitorSet:
+    """All specifications of `monitors/`."""
+    trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
+    own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
+    sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
+    return MonitorSet.load(sources, standard_definitions().extended(own))
+
+
+def a_value(values: Values, kind: kinds.Type) -> st.SearchStrategy[Any]:
+    """Any value of a type."""
+    if isinstance(kind, kinds.Record):
+        return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
+    if isinstance(kind, kinds.Vector):
+        most = 4 if kind.length is None else kind.length
+        return st.lists(a_value(values, kind.element), min_size=kind.length or 0, max_size=most)
+    if isinstance(kind, kinds.Integer):
+        return st.integers(kind.least, kind.most)
+    known: dict[kinds.Type, st.SearchStrategy[Any]] = {
+        kinds.BOOL: st.booleans(),
+        kinds.STRING: st.sampled_from([b"turret_tilt", b"turret_pan", b"", b"x"]),
+        kinds.FLOAT: st.floats(width=32),
+        kinds.DOUBLE: st.floats() | st.floats(-2, 2),
+        kinds.TIME: st.integers(0, 1 << 40),
+        kinds.DURATION: st.integers(-(1 << 40), 1 << 40),
+    }
+    return known[kind]
+
+
+@FEW
+@given(data=st.data())
+def test_shipped_specifications(data: st.DataObject) -> None:
+    """Any messages on their topics, cut short now and then."""
+    monitors = shipped()
+    values = Values(MessageTypes(monitors.definitions))
+    traffic = []
+    for topic in data.draw(st.lists(st.sampled_from(sorted(monitors.topics)), min_size=1, max_size=12)):
+        kind = kinds.Record(monitors.topics[topic])
+        body = bytearray()
+        values.encode(kind, data.draw(a_value(values, kind)), body)
+        end = data.draw(st.just(len(body)) | st.integers(0, len(body)))
+        traffic.append((topic, bytes(body[:end])))
+    check(monitors, traffic, 50_000_000)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        'if (names.size() > 1) { names[0] = "other"; position.push_back(1.5); }',
+        "position[5] = 1;",
+        "stamp.sec = 7; stamp.nsec += 1;",
+        "v = MESSAGE; v.velocity.clear(); PUBLISH(/out, sensor_msgs/JointState, v);",
+        "std::vector<double> all(3, 2.5); all.insert(all.begin() + 1, position.size()); position = all;",
+        "for (auto &name : names) { name += 'x'; }",
+        "double sum = 0; for (double p : position) { if (p < 0) { continue; } sum += p; } position[0] = sum;",
+        "switch (names.size()) { case 0: return; case 1: n = 1; case 2: n += 2; break; default: n = -1; } f(n);",
+        "std::sort(position.begin(), position.end()); n = std::accumulate(position.begin(), position.end(), 0);",
+        "std::string s = names[0]; while (true) { s += s; }",
+        "n = deep(0);",
+        "n = deep(1); position.resize(n);",
+        "swap(position[0], position[1]);",
+    ],
+)
+def test_values_that_grow_and_fields_of_any_size(body: str) -> None:
+    """Vectors, strings, whole messages, references, recursion, the bounds of memory and work."""
+    text = f"""s() {{ int n = 0; sensor_msgs::JointState v;
+    void f(int &x) {{ x = x * 3; }}
+    void swap(double &a, double &b) {{ double c = a; a = b; b = c; }}
+    int deep(int down) {{ if (down == 0) {{ return deep(0); }} return down > 50 ? 5 : deep(down + 1) + 1; }}
+    event e(std::vector<std::string> names, double[] position, ros::Time stamp) /j sensor_msgs/JointState
+    '{{name:names, position:position, header.stamp:stamp}}' {{ {body} ROS_INFO("%d %f", n, position[0]); }} }}"""
+    monitors = MonitorSet.load({"x.rv": text}, standard_definitions())
+    told = [
+        message("sensor_msgs/JointState", name=["a", "b"], position=[0.5, -1.0]),
+        message("sensor_msgs/JointState", name=["a"], position=[3.0], velocity=[1.0]),
+        message("sensor_msgs/JointState"),
+    ]
+    check(monitors, [("/j", body) for body in told], 1)
