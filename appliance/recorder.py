@@ -80,7 +80,7 @@ class Recorder:
         `reads`: the call changes nothing, so that its repetitions are counted when it is allowed.
         """
         record_id = self._ids.next()
-        word = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
+        word = decision.word
         duration = time.monotonic_ns() - asker.arrived
         self.meter.decided(category, word, duration / 1e9)
         detail: dict[str, Any] = {"call": method, **asked_of}

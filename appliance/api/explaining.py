@@ -6,7 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from appliance.api.access import Bearer
-from appliance.api.judgement import explanation, word_of
+from appliance.api.judgement import explanation
 from appliance.api.policy_models import Explained, LostRule, Question, RuleText
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
@@ -21,14 +21,10 @@ def routes(services: Services) -> APIRouter:
 
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(services.control, PolicyWanted(), bearer)
-        text, file = (
-            (question.text, "policy") if question.text is not None else (current["text"], current["file"])
-        )
         async with services.judging:
             found = await asyncio.to_thread(
                 explanation,
-                text,
-                file,
+                question.text,
                 current,
                 host=question.host,
                 node=question.node,
@@ -69,7 +65,7 @@ def _explained(found: Explanation) -> Explained:
         caller_id=request.caller_id,
         category=request.category.value,
         resource=request.resource,
-        decision=word_of(decision),
+        decision=decision.word,
         rule=_rule(decision.rule) if decision.rule else None,
         reason=decision.reason,
         told=found.told,

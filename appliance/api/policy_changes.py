@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from appliance.api.access import Bearer, Role
 from appliance.api.bodies import WRONG_TYPE, DryRun, read_body, text_or
-from appliance.api.judgement import Judgement, judge, word_of
+from appliance.api.judgement import Judgement, judge_change
 from appliance.api.policy import TAGGED
 from appliance.api.policy_models import Change, Confirmed, Ended, Loaded, PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_revision
@@ -27,7 +27,6 @@ from appliance.channel.admin import (
     PolicyWanted,
     RegistrationsWanted,
 )
-from appliance.policy.diff import endings
 
 _CHANGES: dict[int | str, dict[str, Any]] = {
     **TAGGED,
@@ -124,7 +123,7 @@ class _Changing:
         live = (await ask(self._control, RegistrationsWanted(), bearer))["registrations"]
         try:
             async with self._services.judging:
-                judgement = await asyncio.to_thread(judge, order.text, current, live)
+                judgement = await asyncio.to_thread(judge_change, order.text, current, live)
         except ProblemError as refusal:
             if dry_run:
                 raise
@@ -143,7 +142,7 @@ class _Changing:
             body = await self.order(order, bearer, response)
         except ProblemError as said:
             raise refusal if said.kind == "refused" else said from None
-        return _report(Judgement([], []), body, loaded=True)
+        return _report(Judgement([], [], []), body, loaded=True)
 
 
 def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Report:
@@ -153,8 +152,8 @@ def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Rep
             caller_id=one.request.caller_id,
             category=one.request.category.value,
             resource=one.request.resource,
-            now=word_of(one.old),
-            then=word_of(one.new),
+            now=one.old.word,
+            then=one.new.word,
             reason=one.new.reason,
         )
         for one in judgement.changes
@@ -167,5 +166,5 @@ def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Rep
         confirm_by=known["confirm_by"],
         warnings=judgement.warnings,
         changes=changes,
-        ends=[Ended.model_validate(asdict(one)) for one in endings(judgement.changes)],
+        ends=[Ended.model_validate(asdict(one)) for one in judgement.ends],
     )

@@ -73,7 +73,7 @@ class Ended(Model):
     host: str
     caller_id: str = Field(description="empty: a client that gave no name")
     what: Literal["publication", "subscription", "service", "call", "parameter"]
-    resource: str = Field(description="empty: all of this kind that the node has")
+    resource: str
     reason: str
 
 
@@ -87,7 +87,7 @@ class Report(Model):
     confirm_by: float | None
     warnings: list[Finding]
     changes: list[Change]
-    ends: list[Ended] = Field(description="of `changes`, what is live and ends by it")
+    ends: list[Ended] = Field(description="what is live and ends by it")
 
 
 class Loaded(Model):

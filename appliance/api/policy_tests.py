@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from appliance.api.judgement import tested, word_of
+from appliance.api.judgement import judge_text
 from appliance.api.roles import Viewer, ask
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyWanted
@@ -58,7 +58,7 @@ def routes(services: Services) -> APIRouter:
         """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
         current = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging:
-            ran = await asyncio.to_thread(tested, draft.text, current)
+            ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
         cases = [
             Case(
                 file=one.file,
@@ -69,7 +69,7 @@ def routes(services: Services) -> APIRouter:
                 category=one.request.category.value,
                 resource=one.request.resource,
                 expected="allow" if one.expected else "deny",
-                decision=word_of(one.decision),
+                decision=one.decision.word,
                 reason=one.decision.reason,
                 passed=one.passed,
             )

@@ -66,9 +66,7 @@ class PolicyRevisions(AdminRequest, frozen=True, tag="policy revisions"):
 
 
 class RegistrationsWanted(AdminRequest, frozen=True, tag="registrations"):
-    """What is live now (publications, subscriptions, services, calls, parameters), as rows of requests:
-    host, caller_id, category, resource.
-    """
+    """What is live now and a change of the policy may end, as rows of `appliance.policy.Live`."""
 
 
 class GraphWanted(AdminRequest, frozen=True, tag="graph"):

@@ -30,19 +30,12 @@ from appliance.hosts.table import (
 )
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.policies import Loaded, Policies, PolicyRefusedError, RevisionChangedError
-from appliance.specifications.allocation import TOPIC
+from appliance.policy import Known, Live
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import MonitorsChangedError, UnknownMonitorError
 from appliance.store.state import RevisionRow, StateStore
 from appliance.store.tokens import TokenRow
 
-# What is live, and the requests that it needs: the category, and the resource where it is another than its own.
-_LIVE: dict[Kind, tuple[tuple[str, str], ...]] = {
-    Kind.PUBLICATION: (("publish", ""),),
-    Kind.SUBSCRIPTION: (("subscribe", ""),),
-    Kind.SERVICE: (("offer", ""),),
-    Kind.PARAMETER: (("read", ""), ("command", "subscribeParam")),
-}
 _View = (
     admin.StatusWanted
     | admin.PolicyRevisions
@@ -62,7 +55,8 @@ class UnknownThingError(Exception):
 class Administration:
     """Carries out requests; `lag()` is the audit log's, in records and seconds.
 
-    `forwarded()` is how its forwarding to a syslog receiver stands; None when it is not forwarded.
+    `forwarded()` is how its forwarding to a syslog receiver stands; None when it is not forwarded. `live()` is what a
+    change of the policy may end.
     """
 
     def __init__(
@@ -80,6 +74,7 @@ class Administration:
         audit_degraded: Callable[[], str | None],
         queued_deliveries: Callable[[], int],
         forwarded: Callable[[], dict[str, Any] | None],
+        live: Callable[[], list[Live]],
     ) -> None:
         self._parts = parts
         self._policies = policies
@@ -93,6 +88,7 @@ class Administration:
         self._audit_degraded = audit_degraded
         self._queued_deliveries = queued_deliveries
         self._forwarded = forwarded
+        self._live = live
         self._started = time.time()
         self._changing = asyncio.Lock()
 
@@ -135,7 +131,7 @@ class Administration:
             ):
                 return await change_monitors(self._parts.monitors, request, who)
             case admin.PolicyWanted(revision):
-                return await asyncio.to_thread(self._policy, revision)
+                return await asyncio.to_thread(self._policy, revision, self._policies.known)
             case _:
                 return self._look(request)
 
@@ -146,7 +142,7 @@ class Administration:
             case admin.PolicyRevisions():
                 return {"revisions": [self._revision(row) for row in self._policies.revisions()]}
             case admin.RegistrationsWanted():
-                return {"registrations": self._registrations()}
+                return {"registrations": [live.fields() for live in self._live()]}
             case admin.GraphWanted():
                 return graph_of(self._parts)
             case admin.MonitorsWanted(texts):
@@ -188,7 +184,7 @@ class Administration:
                 )
                 return _loaded(await loading)
 
-    def _policy(self, revision: int | None) -> dict[str, Any]:
+    def _policy(self, revision: int | None, known: Known) -> dict[str, Any]:
         row = self._policies.revision_row(revision)
         if row is None:
             raise UnknownThingError(f"there is no revision {revision}")
@@ -199,22 +195,8 @@ class Administration:
             "policy_file": str(self._policies.file),
             "confirm_by": self._policies.confirm_by,
             "warnings": [str(one) for one in self._policies.current.warnings],
-            "robot": [str(one) for one in self._policies.robot],
-            "hosts": {name: str(address) for name, address in self._policies.hosts.items()},
-            "cases_file": str(self._policies.cases_file),
-            **self._cases(),
+            **self._policies.with_cases(known).fields(),
         }
-
-    def _cases(self) -> dict[str, str | None]:
-        """The tests of the policy; `cases_error` when there are some that cannot be read."""
-        try:
-            return {
-                "cases": self._policies.cases_file.read_text(encoding="utf-8"), "cases_error": None,
-            }  # fmt: skip
-        except FileNotFoundError:
-            return {"cases": None, "cases_error": None}
-        except (OSError, UnicodeDecodeError) as error:
-            return {"cases": None, "cases_error": f"the policy's tests cannot be read: {error}"}
 
     def _revision(self, row: RevisionRow) -> dict[str, Any]:
         return {
@@ -273,22 +255,6 @@ class Administration:
                 "forwarding": self._forwarded(),
             },
         }
-
-    def _registrations(self) -> list[dict[str, Any]]:
-        """Everything live that a policy may end, as the requests that it was granted by."""
-        rows = [
-            (str(incarnation.host), incarnation.name, category, resource or registration.resource)
-            for incarnation, registration in self._parts.registry.in_order()
-            if not incarnation.own
-            for category, resource in _LIVE[registration.kind]
-        ]
-        rows += [
-            (row.host, row.caller_id, "call", row.resource)
-            for row in self._parts.relay.permissions()
-            if row.kind != TOPIC  # a subscription is one already
-        ]
-        names = ("host", "caller_id", "category", "resource")
-        return [dict(zip(names, row, strict=True)) for row in dict.fromkeys(rows)]
 
 
 def _trouble(error: TokenRefusedError | HostRefusedError) -> admin.Trouble:

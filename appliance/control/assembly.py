@@ -132,6 +132,7 @@ class Parts:
     places: Places
     delivery: Delivery
     relay: RelayControl
+    revocation: Revocation
     mediation: Mediation
     graph: Graph
     rosmaster: RosMaster
@@ -402,6 +403,7 @@ def _finish(base: Foundation, wires: _Wires, reach: _Reach, books: _Books) -> Pa
         places=reach.places,
         delivery=reach.delivery,
         relay=relay,
+        revocation=books.revocation,
         mediation=reach.mediation,
         graph=reach.graph,
         rosmaster=books.rosmaster,

@@ -229,6 +229,7 @@ class _Control:
             audit_degraded=lambda: self._audit.degraded,
             queued_deliveries=lambda: parts.delivery.waiting,
             forwarded=self._forwarded.status,
+            live=parts.revocation.live,
         )
         self._rest = RestLink(
             administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof

@@ -7,14 +7,13 @@ and says everything that is wrong with it. Every policy that came into force is 
 import asyncio
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.policy import Policy, PolicyError, compile_policy
-from appliance.policy.cases import run_cases
+from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
 from appliance.recorder import Recorder
@@ -111,12 +110,11 @@ class Policies:
         revisions = self._store.revisions()
         last = revisions[0] if revisions else None
         if last is not None and (restarted or last.who != _DISK):
-            self._enforce(self._compile(last.text, last.file), last)
+            self._enforce(self._judged(last.text, last.file, self.known), last)
             self._resume_confirmation()
             return
-        text = self._read()
-        policy = self._compile(text, str(self.file))
-        if last is not None and last.text == text:
+        policy = self._judged(self._read(), str(self.file), self.known)
+        if last is not None and last.text == policy.text:
             self._enforce(policy, last)
             self._resume_confirmation()
         else:
@@ -154,7 +152,7 @@ class Policies:
         if self._current is None:
             return 0
         try:
-            self._current = self._compile(self._current.text, self._current.file)
+            self._current = self._judged(self._current.text, self._current.file, self.known)
         except PolicyRefusedError as error:  # the same text: only a defect could make it wrong
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
@@ -173,7 +171,7 @@ class Policies:
             raise PolicyRefusedError(
                 [f"there is no revision {revision or 'before this one'}; kept are: {known}"]
             )
-        policy = self._compile(row.text, row.file)
+        policy = self._judged(row.text, row.file, self.known)
         revoked = self._keep(policy, who=who, note=f"rolled back to revision {row.revision}")
         return self._answer(policy, before, revoked, None)
 
@@ -196,19 +194,21 @@ class Policies:
         return next((row for row in self._store.revisions() if row.revision == revision), None)
 
     @property
-    def cases_file(self) -> Path:
-        """Where the tests of the policy are, if it has some."""
-        return self.file.with_name(f"{self.file.name}.tests.yaml")
+    def known(self) -> Known:
+        """What a policy means now: the hosts and the robot."""
+        return Known(dict(self._hosts()), self._robot)
 
-    @property
-    def robot(self) -> Collection[Address | Network]:
-        """What the group `robot` stands for."""
-        return self._robot
-
-    @property
-    def hosts(self) -> Mapping[str, Address]:
-        """What `host:NAME` stands for."""
-        return self._hosts()
+    def with_cases(self, known: Known) -> Known:
+        """The same with the test cases beside the file, which are read now: a new policy is judged with them."""
+        cases = self.file.with_name(f"{self.file.name}.tests.yaml")
+        text = error = None
+        try:
+            text = cases.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            pass
+        except (OSError, UnicodeDecodeError) as fault:
+            error = f"the policy's tests cannot be read: {_said(fault)}"
+        return replace(known, cases_file=str(cases), cases=text, cases_error=error)
 
     # --- inside ---
 
@@ -217,20 +217,15 @@ class Policies:
         before = self.revision
         try:
             while True:
-                hosts = dict(self._hosts())
-                policy = await asyncio.to_thread(self._prepare, read, file, hosts)
-                if self._hosts() == hosts:
+                known = self.known
+                policy = await asyncio.to_thread(self._tested, read, file, known)
+                if self._hosts() == known.hosts:
                     break
         except PolicyRefusedError as error:
             self._refused(error, who)
             raise
         if self.revision != before:  # a signal, or a confirmation that did not come in time
             raise RevisionChangedError(before, self.revision)
-        return policy
-
-    def _prepare(self, read: Callable[[], str], file: str, hosts: Mapping[str, Address]) -> Policy:
-        policy = self._compile(read(), file, hosts)
-        self._test(policy)
         return policy
 
     def _refused(self, error: PolicyRefusedError, who: str) -> None:
@@ -248,29 +243,14 @@ class Policies:
         except (OSError, UnicodeDecodeError) as error:
             raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 
-    def _compile(self, text: str, file: str, hosts: Mapping[str, Address] | None = None) -> Policy:
-        known = self._hosts() if hosts is None else hosts
-        try:
-            return compile_policy(text, file=file, hosts=known, robot=self._robot)
-        except PolicyError as error:
-            raise PolicyRefusedError([str(one) for one in error.findings]) from error
+    def _tested(self, read: Callable[[], str], file: str, known: Known) -> Policy:
+        return self._judged(read(), file, self.with_cases(known))
 
-    def _test(self, policy: Policy) -> None:
-        cases = self.cases_file
+    def _judged(self, text: str, file: str, known: Known) -> Policy:
         try:
-            text = cases.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            return
-        except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError(
-                [f"{cases}: the policy's tests cannot be read: {_said(error)}"]
-            ) from error
-        try:
-            failed = [str(one) for one in run_cases(policy, text, str(cases)) if not one.passed]
+            return judge(text, file, known).accepted()
         except PolicyError as error:
             raise PolicyRefusedError([str(one) for one in error.findings]) from error
-        if failed:
-            raise PolicyRefusedError(failed)
 
     def _next_number(self) -> int:
         return max([self.revision, *(row.revision for row in self._store.revisions())]) + 1

@@ -5,9 +5,11 @@ No I/O and no clock: that is what makes a decision testable, explainable and pro
 
 from appliance.policy.cases import CaseResult, run_cases
 from appliance.policy.compiler import compile_policy
-from appliance.policy.diff import Difference, Ending, diff, endings
+from appliance.policy.diff import Difference, diff
 from appliance.policy.explain import Explanation, explain
 from appliance.policy.findings import Finding, PolicyError, Severity
+from appliance.policy.judging import Judged, Known, judge
+from appliance.policy.live import Ending, Live, endings
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.policy import Policy
 
@@ -20,6 +22,9 @@ __all__ = [
     "Ending",
     "Explanation",
     "Finding",
+    "Judged",
+    "Known",
+    "Live",
     "Policy",
     "PolicyError",
     "Request",
@@ -29,5 +34,6 @@ __all__ = [
     "diff",
     "endings",
     "explain",
+    "judge",
     "run_cases",
 ]

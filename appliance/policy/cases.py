@@ -20,7 +20,7 @@ import yaml
 
 from appliance.policy.actions import BadWordError, find_hosts, parse_action
 from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.findings import Finding, Findings, Severity, meant, quoted
 from appliance.policy.hosts import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
@@ -52,8 +52,14 @@ class CaseResult:
 
     def __str__(self) -> str:
         """`landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
+        return f"{self.file}:{self.line}:{self.column}: {self.finding.text}"
+
+    @property
+    def finding(self) -> Finding:
+        """What is wrong, if it did not pass."""
         expected = "allow" if self.expected else "deny"
-        return f"{self.file}:{self.line}:{self.column}: expected {expected}: {self.decision.reason}"
+        text = f"expected {expected}: {self.decision.reason}"
+        return Finding(self.file, self.line, self.column, Severity.ERROR, text)
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:

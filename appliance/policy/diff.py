@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from appliance.policy.model import Category, Decision, Request
+from appliance.policy.model import Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of
 
@@ -30,38 +30,6 @@ class Difference:
         if self.limited:
             return "limited" if self.limited < 0 else "limited less"
         return "granted" if self.granted else "denied"
-
-
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """Something live that a policy would end: `what` of the caller, about `resource` (empty: all of that kind)."""
-
-    host: str
-    caller_id: str
-    what: str
-    resource: str
-    reason: str
-
-
-_LIVE = {
-    Category.PUBLISH: "publication", Category.SUBSCRIBE: "subscription", Category.OFFER: "service",
-    Category.CALL: "call", Category.READ: "parameter",
-}  # fmt: skip
-_LIVE_BY_COMMAND = {"subscribeParam": "parameter"}
-
-
-def endings(differences: Iterable["Difference"]) -> list[Ending]:
-    """What ends, where the requests that the differences are of stand for what is live."""
-    return [
-        Ending(
-            str(request.host), request.caller_id, what, "" if command else request.resource, one.new.reason
-        )
-        for one in differences
-        if one.old.allowed and not one.new.allowed
-        for request, command in [(one.request, one.request.category is Category.COMMAND)]
-        for what in [_LIVE_BY_COMMAND.get(request.resource) if command else _LIVE.get(request.category)]
-        if what is not None
-    ]
 
 
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:

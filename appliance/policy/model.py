@@ -7,6 +7,7 @@
 import enum
 import ipaddress
 from dataclasses import dataclass
+from typing import Literal
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
@@ -67,6 +68,11 @@ class Decision:
     reason: str
     would_deny: bool = False
     told: str | None = None
+
+    @property
+    def word(self) -> Literal["allow", "deny", "would deny"]:
+        """The answer in the audit log's words."""
+        return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 
 TELLS = ("rule", "full", "id")

@@ -88,6 +88,12 @@ def rights_of_call(
     return rights_of(request, touched)
 
 
+def rights_to_keep(request: Request, call: str, resource: str, *, namespace: bool) -> list[Right]:
+    """Everything that keeping what this call gave needs; `namespace`: a parameter that holds others."""
+    touch = _TOUCHES.get(call)
+    return rights_of(request, [] if touch is None else [Right(_of(request, touch, resource), namespace)])
+
+
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
     """Everything that a deed needs, with what it touches."""
     rights = [Right(request)]
@@ -107,14 +113,6 @@ def right_to_read(request: Request, value: Value) -> Right:
 def right_to_find(request: Request) -> Right:
     """The right to be told that a parameter of this name is there, and nothing of what is below it."""
     return Right(request, alone=True)
-
-
-def decide_call(
-    policy: Policy, call: str, host: Address, caller_id: str, *, resource: str, tree: Tree
-) -> Decision:
-    """The answer to a whole call that brings no value: for what is live, or seems to be, by the call that gave it."""
-    request = request_of(call, host, caller_id, resource)
-    return decide(policy, rights_of_call(request, call, resource, tree=tree))
 
 
 def needs_node(request: Request) -> bool:

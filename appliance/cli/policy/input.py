@@ -3,6 +3,7 @@
 import ipaddress
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import RegistrationsWanted
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
-from appliance.policy import Address, Category, Policy, Request, compile_policy
+from appliance.policy import Address, Category, Known, Live, Policy, Request
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
 
@@ -40,11 +41,11 @@ def read_text(file: Path) -> str:
         raise usage_error(f"cannot read {file}: {error.strerror}") from error
 
 
-def compile_file(file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
-    """The policy in a file; raises `PolicyError`."""
-    networks = networks_of(robot)
+def known_of(robot: list[str] | None, enrolled: list[str] | None, running: Known | None = None) -> Known:
+    """What the options say, before what the running appliance knows."""
+    known = running or Known()
     hosts = dict(_enrolled(text) for text in enrolled or ())
-    return compile_policy(read_text(file), file=str(file), hosts=hosts, robot=networks)
+    return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
@@ -97,14 +98,9 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
-def registrations_now(appliance: Appliance) -> Iterator[Request]:
-    """What is registered at the running appliance; nothing when none runs with the state directory."""
-    try:
-        answer = appliance.ask(RegistrationsWanted())
-    except NotRunningError:
-        return
-    for row in answer.body.get("registrations", ()):
-        yield request_of(row["host"], row["caller_id"], row["category"], row["resource"])
+def live_now(appliance: Appliance) -> list[Live]:
+    """What is live at the running appliance. Raises `NotRunningError`."""
+    return [Live.of(row) for row in appliance.ask(RegistrationsWanted()).body.get("registrations", ())]
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:

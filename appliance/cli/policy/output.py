@@ -33,6 +33,5 @@ def request_fields(request: Request) -> dict[str, object]:
 def decision_fields(decision: Decision) -> dict[str, object]:
     """A decision as the audit log writes it."""
     rule = decision.rule
-    answer = "would deny" if decision.would_deny else "allow" if decision.allowed else "deny"
     place = {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line} if rule else None
-    return {"decision": answer, "rule": place, "reason": decision.reason}
+    return {"decision": decision.word, "rule": place, "reason": decision.reason}

@@ -1,18 +1,17 @@
 """What a policy would do to the running appliance: `rosrv policy check --state` (or `--api`). Nothing is changed.
 
-Over the socket it is judged here, with the hosts and the robot that the appliance knows; over REST it is a dry run.
+Over the socket it is judged here, with the hosts, the robot and the test cases that a reload would judge it with; over
+REST it is a dry run.
 """
 
-import ipaddress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from appliance.channel.admin import AdminAnswer, PolicyWanted
-from appliance.cli.policy.input import compile_file, read_text, registrations_now
+from appliance.cli.policy.input import known_of, live_now, read_text
 from appliance.cli.running import Appliance, body_or_exit
-from appliance.policy import Address, Ending, Finding, PolicyError, Severity, compile_policy, diff, endings
-from appliance.policy.hosts import Network, canonical_address
+from appliance.policy import Ending, Finding, Known, PolicyError, Severity, endings, judge
 
 
 @dataclass(frozen=True)
@@ -29,23 +28,12 @@ def try_policy(
     """Try a file; `robot` and `enrolled` go before what the appliance knows. Raises `NotRunningError`."""
     if appliance.remote:
         return _by_dry_run(appliance, file)
-    body = appliance.ask(PolicyWanted()).body
-    known = [f"{name}={address}" for name, address in body["hosts"].items()]
-    robots = robot or body["robot"]
+    known = known_of(robot, enrolled, Known.of(appliance.ask(PolicyWanted()).body))
     try:
-        new = compile_file(file, robots, [*known, *(enrolled or ())])
+        policy = judge(read_text(file), str(file), known).accepted()
     except PolicyError as error:
         return Trial(error.findings, [])
-    now = compile_policy(body["text"], file=body["file"], hosts=_hosts(body), robot=_robots(body))
-    return Trial(list(new.warnings), endings(diff(now, new, registrations_now(appliance))))
-
-
-def _hosts(body: dict[str, Any]) -> dict[str, Address]:
-    return {name: canonical_address(ipaddress.ip_address(one)) for name, one in body["hosts"].items()}
-
-
-def _robots(body: dict[str, Any]) -> list[Network]:
-    return [ipaddress.ip_network(one) for one in body["robot"]]
+    return Trial(list(policy.warnings), endings(policy, live_now(appliance)))
 
 
 def _by_dry_run(appliance: Appliance, file: Path) -> Trial:

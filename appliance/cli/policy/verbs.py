@@ -3,10 +3,11 @@
 Exit status: 0 allowed, right, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
 """
 
+import contextlib
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -15,10 +16,10 @@ from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.policy.input import (
     Enrolled,
     Robot,
-    compile_file,
     find_host,
+    known_of,
+    live_now,
     read_text,
-    registrations_now,
     requests_of_audit_log,
     requests_of_file,
     usage_error,
@@ -31,12 +32,12 @@ from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
     Category,
     Difference,
-    Policy,
+    Judged,
     PolicyError,
     Request,
     diff,
     explain,
-    run_cases,
+    judge,
 )
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.explain import Explanation, render
@@ -86,9 +87,7 @@ def check(
             say_json({"ends": ending.what, **{k: v for k, v in asdict(ending).items() if k != "what"}})
         else:
             whose = f"{ending.caller_id or 'a client'} on {ending.host}"
-            say(
-                f"would end: {ending.what} {ending.resource or '(all)'} of {whose}: {ending.reason}", "yellow"
-            )
+            say(f"would end: {ending.what} {ending.resource} of {whose}: {ending.reason}", "yellow")
     if trial.ends and not as_json:
         say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
     raise typer.Exit(1 if errors else 0)
@@ -101,7 +100,7 @@ def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: 
         except NotRunningError as error:
             typer.echo(f"rosrv policy: {error}; checked without it", err=True)
     try:
-        return Trial(list(compile_file(file, robot, enrolled).warnings), [])
+        return Trial(list(_judge(file, robot, enrolled).policy.warnings), [])
     except PolicyError as error:
         return Trial(error.findings, [])
 
@@ -141,7 +140,7 @@ def explain_request(
     chosen = [(category, name) for category, name in asked.items() if name is not None]
     if len(chosen) != 1:
         raise usage_error("say one thing that the host does: --publish TOPIC, --command CALL, …")
-    policy = _compile_or_exit(file, robot, enrolled)
+    policy = _judge_or_exit(file, robot, enrolled).policy
     category, name = chosen[0]
     try:
         request = Request(find_host(host, policy), node, category, check_resource(category, name))
@@ -199,13 +198,10 @@ def test(
 
     Example: rosrv policy test policies/landshark.ini
     """
-    policy = _compile_or_exit(file, robot, enrolled)
     beside = cases or file.with_name(file.name + ".tests.yaml")
-    text = read_text(beside)
-    try:
-        results = run_cases(policy, text, str(beside))
-    except PolicyError as error:
-        _refuse(error)
+    results = _judge_or_exit(file, robot, enrolled, beside).results
+    if not results:  # a file of cases has at least one
+        read_text(beside)
     failed = [result for result in results if not result.passed]
     for result in results if as_json else failed:
         if as_json:
@@ -244,7 +240,7 @@ def compare(
         raise usage_error(
             "say where the requests are: --state DIR or --api URL (the audit log), or --requests FILE"
         )
-    before, after = _compile_or_exit(old, robot, enrolled), _compile_or_exit(new, robot, enrolled)
+    before, after = (_judge_or_exit(file, robot, enrolled).policy for file in (old, new))
     differences = diff(before, after, _requests(requests, appliance))
     for difference in differences:
         if as_json:
@@ -262,7 +258,9 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
         yield from requests_of_file(file)
     else:
         yield from requests_of_audit_log(appliance)
-        yield from registrations_now(appliance)
+        with contextlib.suppress(NotRunningError):
+            for live in live_now(appliance):
+                yield from live.requests()
 
 
 def _difference_lines(difference: Difference) -> Iterator[str]:
@@ -283,14 +281,21 @@ def _difference_fields(difference: Difference) -> dict[str, object]:
     }
 
 
-def _compile_or_exit(file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
+def _judge(
+    file: Path, robot: list[str] | None, enrolled: list[str] | None, cases: Path | None = None
+) -> Judged:
+    known, text = known_of(robot, enrolled), read_text(file)
+    if cases is not None and cases.exists():
+        known = replace(known, cases_file=str(cases), cases=read_text(cases))
+    return judge(text, str(file), known)
+
+
+def _judge_or_exit(
+    file: Path, robot: list[str] | None, enrolled: list[str] | None, cases: Path | None = None
+) -> Judged:
     try:
-        return compile_file(file, robot, enrolled)
+        return _judge(file, robot, enrolled, cases)
     except PolicyError as error:
-        _refuse(error)
-
-
-def _refuse(error: PolicyError) -> NoReturn:
-    for finding in error.findings:
-        typer.echo(printable(str(finding)), err=True)
-    raise typer.Exit(1) from error
+        for finding in error.findings:
+            typer.echo(printable(str(finding)), err=True)
+        raise typer.Exit(1) from error

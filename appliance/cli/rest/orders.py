@@ -97,10 +97,12 @@ def _replaced(body: dict[str, Any]) -> dict[str, Any]:
 
 
 def _registrations(graph: dict[str, Any]) -> list[dict[str, str]]:
-    words = {"publishes": "publish", "subscribes": "subscribe", "offers": "offer"}
+    calls = {
+        "publishes": "registerPublisher", "subscribes": "registerSubscriber", "offers": "registerService",
+    }  # fmt: skip
     return [
-        {"host": node["host"], "caller_id": node["name"], "category": category, "resource": resource}
+        {"host": node["host"], "caller_id": node["name"], "call": call, "resource": resource}
         for node in graph["nodes"]
-        for field, category in words.items()
+        for field, call in calls.items()
         for resource in node[field]
     ]

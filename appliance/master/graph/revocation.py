@@ -18,8 +18,8 @@ from appliance.master.graph.registry import Incarnation, Kind, Life, Registratio
 from appliance.master.reach.own_node import OWN, ROSOUT
 from appliance.master.reach.relays import RelayControl
 from appliance.policy import Policy
+from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision
-from appliance.policy.rights import decide_call
 from appliance.recorder import Recorder
 from appliance.ros.parameter_tree import Tree
 from appliance.rpc.client import CallFailedError
@@ -56,6 +56,17 @@ class Revocation:
         self._parameters = parameters
         self._put_back = put_back
         self._last: asyncio.Task[None] | None = None
+
+    def live(self) -> list[Live]:
+        """What `redecide` decides: all that nodes have by the policy."""
+        return [
+            *(
+                self._registered(incarnation, registration.kind, registration.resource)
+                for incarnation, registration in self._registrations()
+                if not incarnation.own
+            ),
+            *(self._permitted(row) for row in self._relay.permissions() if not self._is_own(row)),
+        ]
 
     def redecide(self) -> int:
         """Take back what the running policy no longer allows; how much that was. What it grants again is put back."""
@@ -147,17 +158,23 @@ class Revocation:
         if incarnation.own:
             known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
-        return self._may_have(CALLS[kind][0], incarnation.host, incarnation.name, resource)
+        return may_keep(self._policy(), self._registered(incarnation, kind, resource))
 
     def _decide_permission(self, row: PermissionRow) -> Decision:
-        holder = self._registry.holder(row.caller_id)
-        if row.kind == TOPIC and holder is not None and holder.own:
+        if self._is_own(row):
             return Decision(True, None, OWN)
-        call = "requestTopic" if row.kind == TOPIC else "lookupService"
-        return self._may_have(call, ipaddress.ip_address(row.host), row.caller_id, row.resource)
+        return may_keep(self._policy(), self._permitted(row))
 
-    def _may_have(self, call: str, host: Address, caller_id: str, resource: str) -> Decision:
-        return decide_call(self._policy(), call, host, caller_id, resource=resource, tree=self._parameters())
+    def _is_own(self, row: PermissionRow) -> bool:
+        holder = self._registry.holder(row.caller_id)
+        return row.kind == TOPIC and holder is not None and holder.own
+
+    def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
+        return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self._parameters())
+
+    def _permitted(self, row: PermissionRow) -> Live:
+        call = "requestTopic" if row.kind == TOPIC else "lookupService"
+        return Live(ipaddress.ip_address(row.host), row.caller_id, call, row.resource)
 
     def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
         self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))

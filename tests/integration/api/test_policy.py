@@ -140,7 +140,7 @@ def test_a_dry_run_says_all_that_would_end_and_whose(
     ends = rest.post("/v1/policy?dry_run=1", nothing).json["ends"]
     expected = {
         ("publication", "/scan", "/driver"), ("subscription", "/cmd_vel", "/driver"),
-        ("service", "/reset", "/driver"), ("parameter", "/limits/speed", "/driver"), ("parameter", "", "/driver"),
+        ("service", "/reset", "/driver"), ("parameter", "/limits/speed", "/driver"),
         ("call", "/reset", "/ui"),
     }  # fmt: skip
     assert {(one["what"], one["resource"], one["caller_id"]) for one in ends} == expected

@@ -11,8 +11,8 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master import policies as policies_module
 from appliance.master.policies import Policies, RevisionChangedError
+from appliance.policy import judging
 from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
@@ -110,7 +110,7 @@ class Slow:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
         self.rounds = 0
         self.begun, self.over = threading.Event(), threading.Event()
-        monkeypatch.setattr(policies_module, "run_cases", self._run)
+        monkeypatch.setattr(judging, "run_cases", self._run)
         appliance.file.with_name("policy.ini.tests.yaml").write_text("cases: []\n")
 
     def _run(self, *_given: object) -> list[object]:

@@ -19,10 +19,11 @@ from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registrar import CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
-from appliance.policy import Policy, compile_policy, diff, explain, run_cases
+from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.learn import Observation, learn
+from appliance.policy.live import may_keep
 from appliance.policy.model import Category, Decision, Request
-from appliance.policy.rights import decide_call, needs_node
+from appliance.policy.rights import needs_node
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value
@@ -180,7 +181,7 @@ async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> N
         assert world.revocation.may_have(node, kind, resource) == verdict
         for live, name in (("topic", "requestTopic"), ("service", "lookupService")):
             given_by = MASTER_CALLS.get(name) or NODE_CALLS[name]
-            may = decide_call(world.current, name, HOST, NAME, resource=THING, tree={}).allowed
+            may = may_keep(world.current, Live(HOST, NAME, name, THING)).allowed
             assert may == gate_says(world.current, given_by, {}).allowed, live
 
 

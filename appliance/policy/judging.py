@@ -1,0 +1,71 @@
+"""Whether a policy can be taken: text and test cases, judged alike for a load, a dry run and the command line."""
+
+import ipaddress
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Self
+
+from appliance.policy.cases import CaseResult, run_cases
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import Finding, PolicyError, Severity
+from appliance.policy.hosts import Network
+from appliance.policy.model import Address
+from appliance.policy.policy import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What a policy is judged with: whom `host:NAME` and `robot` mean, and the text of its test cases.
+
+    `cases` is None where it has no cases; `cases_error` is why they could not be read, which refuses the policy.
+    """
+
+    hosts: Mapping[str, Address] = field(default_factory=dict)
+    robot: Collection[Address | Network] = ()
+    cases_file: str = ""
+    cases: str | None = None
+    cases_error: str | None = None
+
+    @classmethod
+    def of(cls, fields: Mapping[str, Any]) -> Self:
+        """From `fields`, among which others may be."""
+        return cls(
+            {name: ipaddress.ip_address(address) for name, address in fields["hosts"].items()},
+            [ipaddress.ip_network(place) for place in fields["robot"]],
+            *(fields[name] for name in ("cases_file", "cases", "cases_error")),
+        )
+
+    def fields(self) -> dict[str, Any]:
+        """For another process."""
+        return {
+            "hosts": {name: str(address) for name, address in self.hosts.items()},
+            "robot": [str(place) for place in self.robot],
+            "cases_file": self.cases_file,
+            "cases": self.cases,
+            "cases_error": self.cases_error,
+        }
+
+
+class Judged(NamedTuple):
+    """A policy that can be compiled, and what its test cases say of it."""
+
+    policy: Policy
+    results: list[CaseResult]
+
+    def accepted(self) -> Policy:
+        """The policy; raises `PolicyError` with each case that it fails."""
+        failed = [result.finding for result in self.results if not result.passed]
+        if failed:
+            raise PolicyError(failed)
+        return self.policy
+
+
+def judge(text: str, file: str, known: Known) -> Judged:
+    """Compile a policy (`file` names it in findings and rules) and run its cases.
+
+    Raises `PolicyError` with all that is wrong with the text, or else with the cases.
+    """
+    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+    if known.cases_error is not None:
+        raise PolicyError([Finding(known.cases_file, 1, 1, Severity.ERROR, known.cases_error)])
+    return Judged(policy, [] if known.cases is None else run_cases(policy, known.cases, known.cases_file))
