@@ -59,12 +59,9 @@ def _rule(rule: Rule) -> RuleText:
 
 
 def _explained(found: Explanation) -> Explained:
-    request, decision = found.request, found.decision
+    decision = found.decision
     return Explained(
-        host=str(request.host),
-        caller_id=request.caller_id,
-        category=request.category.value,
-        resource=request.resource,
+        **found.request.fields(),
         decision=decision.word,
         rule=_rule(decision.rule) if decision.rule else None,
         reason=decision.reason,

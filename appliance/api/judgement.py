@@ -5,7 +5,7 @@ Everything is a pure function of texts; it runs in a thread, and a stranger's lo
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from appliance.api.problems import Finding, ProblemError
@@ -81,10 +81,7 @@ def explanation(
 
 
 def _findings_of(findings: Iterable[Any]) -> list[Finding]:
-    return [
-        Finding(file=one.file, line=one.line, column=one.column, severity=one.severity.value, text=one.text)
-        for one in findings
-    ]
+    return [Finding(**asdict(finding)) for finding in findings]
 
 
 def _refused(error: PolicyError) -> ProblemError:

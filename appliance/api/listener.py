@@ -1,30 +1,33 @@
-"""Connections of REST: uvicorn's protocol with limits that it does not have itself.
+"""Connections of REST: bounded by the front that RVMaster has too, served by uvicorn.
 
-Invariants:
+uvicorn speaks HTTP and ASGI behind the front and is used through what it offers only: its configuration makes the
+protocol of a connection, which is handed what the front lets pass. Invariants beside those of `rpc/front`:
 
-1. A connection has a place among the arrivals before anything is made for it, TLS included; else it is closed at once.
-2. A connection whose TLS handshake, or whose next request's headers, take longer than `header_seconds` is closed;
-   so is one whose headers are longer than `_HEAD_BYTES` (uvicorn would keep all of them).
-3. Whoever sends anything after an answer has as long to begin, and to end the headers of, the next request: neither
-   an empty line nor the rest of a body keeps a connection open.
-4. At most `_MOST_PIPELINED` requests of a connection wait behind the one that is being answered.
+1. A connection has a place before anything is made for it, TLS included; else it is closed at once.
+2. A peer is known here that has shown a good token lately, or is on this machine; every other is a stranger. A stranger
+   makes room for whoever has none, whatever it is doing; a known peer only for another of them, and only with what has
+   waited for a second.
+3. Whoever sends anything after an answer has as long to begin, and to end the head of, the next request: neither an
+   empty line nor the rest of a body keeps a connection open.
 """
 
 import asyncio
 import errno
+import math
 import socket
 import ssl
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Coroutine
+from typing import Any, cast
 
 import structlog
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.config import Config
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
-from appliance.api.arrivals import Arrival, Arrivals
+from appliance.api.rates import peer_key
 from appliance.config import ApiLimits
+from appliance.rpc.front import Front, HttpLimits
+from appliance.rpc.visitors import Stage, Visitors
 from appliance.shares.descriptors import connections_within
 from appliance.shares.pool import Standing
 from appliance.shares.table import REST_CONNECTIONS
@@ -34,106 +37,97 @@ _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE = 0.2  # when the process has no descriptor left
 _BACKLOG = 256
 _KEEP_ALIVE_SECONDS = 30
-_HEAD_BYTES = 64 << 10
-_MOST_PIPELINED = 16
 _END_SECONDS = 1.0
+_CONNECTION = "rosrv.connection"  # the key of a request's state that has its connection
 
 
-class GuardedProtocol(HttpToolsProtocol):
-    """One connection."""
+class _Connection(Front):
+    """One connection: what the front lets pass goes to uvicorn's protocol."""
 
-    def __init__(
-        self,
-        config: Config,
-        state: ServerState,
-        arrivals: Arrivals,
-        arrival: Arrival,
-        header_seconds: float,
-    ) -> None:
-        super().__init__(config, state, {})
-        self._arrivals = arrivals
-        self._arrival = arrival
-        self._header_seconds = header_seconds
-        self._open = False
-        self._deadline: asyncio.TimerHandle | None = None
-        self._head = 0  # bytes that came since headers are expected
-        self._leftover = False  # what came after an answer has not begun a request yet
+    most_waiting = 16
+    _uvicorn = asyncio.Protocol()  # until there is one
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
-        """Serve a new connection."""
-        if transport.get_extra_info("peername") is None:  # gone already
-            transport.abort()
-            return
-        self._open = True
-        # asyncio does it for sockets that were made with the protocol's number only; else an answer's body waits 40 ms.
-        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        super().connection_made(transport)
-        self._expect_headers()
+    def __init__(self, listener: "Listener", sock: socket.socket) -> None:
+        super().__init__(listener.limits, listener.visitors, sock)
+        self._listener = listener
+        self._unanswered = 0  # requests whose head is there
+        self._rests = False  # since the last answer nothing has come
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Count the connection out."""
-        self._arrivals.go(self._arrival)
-        if not self._open:
-            return
-        self._open = False
-        self._headers_are_there()
-        super().connection_lost(exc)
+    @property
+    def is_quiet(self) -> bool:
+        return not self._unanswered
+
+    @property
+    def waiting(self) -> int:
+        return self._unanswered - 1
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if self.open(cast(asyncio.Transport, transport)):
+            # As uvicorn's own parser has it: what comes after the last request of a connection is passed over.
+            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
+            self._uvicorn = self._listener.protocol_of(self)
+            self._uvicorn.connection_made(transport)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self.leave()
+        self._uvicorn.connection_lost(error)
 
     def data_received(self, data: bytes) -> None:
-        """Parse what came."""
-        if not self._open:
-            return
-        if self._deadline is not None and not self._leftover:
-            self._head += len(data)
+        if self._rests:
+            self._rests = False
+            self.allow(self.limits.head_seconds)
         super().data_received(data)
-        if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
-            # uvicorn has just put its own timer off; what came may be no request at all.
-            self._leftover = True
-            self._expect_headers()
-        if self._deadline is not None and self._head > _HEAD_BYTES:
-            self.transport.abort()
+        if not self.closing:
+            self._uvicorn.data_received(data)
 
-    def on_message_begin(self) -> None:
-        """A request begins."""
-        super().on_message_begin()
-        if self._leftover:
-            self._headers_are_there()
-        self._expect_headers()
+    def pause_writing(self) -> None:
+        self._uvicorn.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._uvicorn.resume_writing()
 
     def on_headers_complete(self) -> None:
-        """Its headers are there. Raises ValueError for one too many, which the parser makes a 400 of."""
-        if len(self.pipeline) >= _MOST_PIPELINED:
-            raise ValueError("too many requests wait")
-        self._headers_are_there()
-        self._arrivals.served(self._arrival)
         super().on_headers_complete()
+        self._unanswered += 1
+        self.deadline = math.inf  # body and answer have deadlines of their own (`api/gate`)
+        self.visitors.file(self, Stage.SERVED)
 
-    def on_response_complete(self) -> None:
+    def answered(self) -> None:
         """An answer is sent."""
-        super().on_response_complete()
-        if self._open and not self.pipeline:
-            self._arrivals.waits(self._arrival)
+        self._unanswered -= 1
+        if self._unanswered:
+            return
+        begun = self.in_request and not self.head_done
+        self._rests = not begun
+        self.allow(self.limits.head_seconds if begun else self.limits.idle_seconds)
+        self.visitors.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
-    def _expect_headers(self) -> None:
-        if self._deadline is None:
-            self._deadline = self.loop.call_later(self._header_seconds, self.transport.abort)
+    def reject(self, status: bytes, _what: str) -> None:
+        """Say no more than the status; who sends a head without end is cut off."""
+        if not status.startswith(b"400"):
+            self.abort()
+            return
+        self.closing = True
+        self.transport.write(b"HTTP/1.1 %b\r\nContent-Length: 0\r\nConnection: close\r\n\r\n" % status)
+        self.transport.close()
+        self.allow(self.limits.linger_seconds)
 
-    def _headers_are_there(self) -> None:
-        if self._deadline is not None:
-            self._deadline.cancel()
-            self._deadline = None
-            self._head = 0
-            self._leftover = False
+
+def _patience(standing: Standing, stage: Stage, _own: bool) -> float:
+    if standing is Standing.STRANGER:
+        return 0.0
+    return math.inf if stage is Stage.SERVED else 1.0
 
 
 class Listener:
     """Serves `app` on a listening socket. `standing(peer)` says whether a peer has shown a good token lately."""
 
     def __init__(self, app: ASGIApp, limits: ApiLimits, standing: Callable[[str], Standing]) -> None:
-        self._limits = limits
+        self._app = app
         self._config = Config(
-            app,
-            http=GuardedProtocol,
+            self._serve,
+            interface="asgi3",
+            http="httptools",
             ws="none",
             lifespan="off",
             log_config=None,
@@ -141,35 +135,56 @@ class Listener:
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=_KEEP_ALIVE_SECONDS,
-            h11_max_incomplete_event_size=None,
         )
         self._config.load()
         self._state = ServerState()
+        self.limits = HttpLimits(head_seconds=limits.header_seconds, idle_seconds=_KEEP_ALIVE_SECONDS)
         bounds = REST_CONNECTIONS.bounds.sized(
             connections_within(limits.connections), limits.connections_per_host
         )
-        self.arrivals = Arrivals(bounds, standing)
-        self._opening: set[asyncio.Task[None]] = set()
-        self._accepting: asyncio.Task[None] | None = None
+        self.visitors: Visitors[str] = Visitors(standing, connections=bounds, patience=_patience)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
+        """What speaks HTTP and ASGI for this connection, made as uvicorn's own server makes it."""
+        make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
+        return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Tell the request's connection when its answer is sent."""
+        connection: _Connection = scope["state"].pop(_CONNECTION)
+
+        async def sending(message: Message) -> None:
+            await send(message)
+            if message["type"] == "http.response.body" and not message.get("more_body"):
+                connection.answered()
+
+        await self._app(scope, receive, sending)
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def start(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
         """Begin to accept."""
         sock.setblocking(False)
         sock.listen(_BACKLOG)
-        self._accepting = asyncio.get_running_loop().create_task(self._accept(sock, context))
+        self._begin(self._accept(sock, context))
+        self._begin(self.visitors.sweep())
 
     async def stop(self) -> None:
         """Stop accepting, let what is being answered finish for a second, close the rest."""
-        tasks = [*self._opening, *filter(None, [self._accepting])]
+        tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        for connection in list(self._state.connections):
-            connection.shutdown()
+        for protocol in list(self._state.connections):
+            protocol.shutdown()
         if self._state.tasks:
             await asyncio.wait(list(self._state.tasks), timeout=_END_SECONDS)
-        for connection in list(self._state.connections):
-            connection.transport.abort()
+        for connection in self.visitors.connections:
+            connection.abort()
 
     async def _accept(self, listening: socket.socket, context: ssl.SSLContext | None) -> None:
         loop = asyncio.get_running_loop()
@@ -182,35 +197,25 @@ class Listener:
                         _log.error("REST cannot accept a connection", reason=str(error))
                         await asyncio.sleep(_PAUSE)
                     continue
-                arrival = self.arrivals.come(sock, address[0])
-                if arrival is None:
+                connection = _Connection(self, sock)
+                if self.visitors.enter(connection, peer_key(address[0])):
                     sock.close()
-                    continue
-                task = loop.create_task(self._open(arrival, context))
-                self._opening.add(task)
-                task.add_done_callback(self._opening.discard)
+                else:
+                    self._begin(self._open(connection, sock, context))
 
-    async def _open(self, arrival: Arrival, context: ssl.SSLContext | None) -> None:
+    async def _open(
+        self, connection: _Connection, sock: socket.socket, context: ssl.SSLContext | None
+    ) -> None:
         """Hand the connection to its protocol, after the handshake if there is one."""
-        timeouts: dict[str, Any] = {}
-        if context is not None:
-            timeouts = {
-                "ssl_handshake_timeout": self._limits.header_seconds,
-                "ssl_shutdown_timeout": _END_SECONDS,
-            }
+        # The handshake has the front's deadline.
+        timeouts = {} if context is None else {"ssl_shutdown_timeout": _END_SECONDS}
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: GuardedProtocol(
-                    self._config, self._state, self.arrivals, arrival, self._limits.header_seconds
-                ),
-                arrival.socket,
-                ssl=context,
-                **timeouts,
+                lambda: connection, sock, ssl=context, **timeouts
             )
         except OSError:  # it is gone, or what it says is no TLS
-            self.arrivals.go(arrival)
-            arrival.socket.close()
+            connection.leave()
+            sock.close()
         except BaseException:
-            self.arrivals.go(arrival)
-            arrival.cut()
+            connection.abort()
             raise

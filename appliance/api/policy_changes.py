@@ -148,10 +148,7 @@ class _Changing:
 def _report(judgement: Judgement, known: dict[str, Any], *, loaded: bool) -> Report:
     changes = [
         Change(
-            host=str(one.request.host),
-            caller_id=one.request.caller_id,
-            category=one.request.category.value,
-            resource=one.request.resource,
+            **one.request.fields(),
             now=one.old.word,
             then=one.new.word,
             reason=one.new.reason,

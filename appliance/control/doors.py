@@ -15,8 +15,8 @@ from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Limits, build_fault
-from appliance.rpc.paced_turns import PacedTurns
-from appliance.rpc.server import Handler, HttpLimits, HttpServer, Peer, Refusal
+from appliance.rpc.front import HttpLimits
+from appliance.rpc.server import Handler, HttpServer, Peer, Refusal
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
 from appliance.shares.descriptors import connections_within
@@ -47,8 +47,8 @@ class Doors:
                 connections_within(limits.connections), limits.connections_per_host
             ),
         )
-        self.turns = PacedTurns(
-            RVMASTER_REQUESTS.bounds, standing, recorder.pause, lambda host: policy().named_as(host)
+        self.turns = Turns(
+            RVMASTER_REQUESTS.bounds, standing, lambda host: policy().named_as(host), recorder.pause
         )
         self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
@@ -65,7 +65,7 @@ class Doors:
             limits=self.http,
             visitors=self.visitors if guarded else self._own_visitors,
             turns=self.turns if guarded else self._own_turns,
-            refuse=self.refuse if guarded else _refuse_nobody,
+            refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
         )
         self._servers.append(server)
@@ -139,7 +139,3 @@ _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
 
 def _own_node(_host: Address) -> Standing:
     return Standing.REGISTERED
-
-
-def _refuse_nobody(_peer: Peer) -> Refusal | None:
-    return None

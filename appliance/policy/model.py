@@ -38,6 +38,15 @@ class Request:
     category: Category
     resource: str
 
+    def fields(self) -> dict[str, str]:
+        """As the audit log writes it."""
+        return {
+            "host": str(self.host),
+            "caller_id": self.caller_id,
+            "category": self.category.value,
+            "resource": self.resource,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Rule:

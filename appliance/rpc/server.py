@@ -1,21 +1,19 @@
 """HTTP for XML-RPC: requests off a listening socket, under limits, one at a time per connection.
 
-httptools (llhttp) parses; this module bounds. Invariants:
+`Front` parses and bounds heads. Invariants beside its own:
 
-1. Nothing is buffered beyond the limits: head 64 KiB within 10 s, body by `Limits.body`, one request in
-   flight per connection (reading pauses meanwhile; up to 512 that came with it in one piece wait), one response in the
-   write buffer (the next request is not served before it is sent).
-2. A connection that makes no progress is closed by the sweep, whatever state it is in.
-3. An address that no rule names is answered before its body is read, but for the beginning: what it asked for is told
+1. Nothing is buffered beyond the limits: body by `Limits.body`, one request in flight per connection (reading pauses
+   meanwhile; up to 512 that came with it in one piece wait), one response in the write buffer (the next request is not
+   served before it is sent).
+2. An address that no rule names is answered before its body is read, but for the beginning: what it asked for is told
    in the refusal's record.
-4. Connections, the bytes that they hold (`visitors`) and requests being served (`turns`) have shares for each host,
+3. Connections, the bytes that they hold (`visitors`) and requests being served (`turns`) have shares for each host,
    for strangers, and for hosts with a registration.
-5. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
-6. Who goes over a limit is told so, in a fault that says which; of connections that are too many, a few at a time.
+4. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
+5. Who goes over a limit is told so, in a fault that says which; of connections that are too many, a few at a time.
 """
 
 import asyncio
-import ipaddress
 import socket
 import struct
 import time
@@ -24,11 +22,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import cast
 
-import httptools
 import structlog
 
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import build_fault
+from appliance.rpc.front import Front, HttpLimits, plain_address
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Stage, Visitors
 
@@ -36,31 +34,12 @@ _log = structlog.get_logger()
 
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
 
-# A head of many short fields is as long as the bytes it came in.
-_FIELD_FRAMING = len(": \r\n")
 # ROS clients send the next request after the answer. More is read than that, but not so much that it takes long.
 _MOST_PIPELINED = 512
 # What a request counts beside its body and its path: ten times its memory, because thousands of small ones take time.
 _REQUEST_BYTES = 4096
 _BEGINNING = 4096  # bytes of a body that are looked at to say what was refused
 _BEGINNING_SECONDS = 1.0  # that they are waited for
-
-
-@dataclass(frozen=True, slots=True)
-class HttpLimits:
-    """Bounds of the HTTP layer; bytes and seconds."""
-
-    head_bytes: int = 64 << 10
-    head_seconds: float = 10.0
-    body_bytes: int = 16 << 20
-    stall_seconds: float = 30.0
-    idle_seconds: float = 300.0
-    linger_seconds: float = 2.0
-
-    @property
-    def framing_bytes(self) -> int:
-        """What a request may have beside its body: the head, chunk sizes, trailers."""
-        return self.head_bytes + self.body_bytes // 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +90,7 @@ class HttpServer:
         handler: Handler,
         *,
         limits: HttpLimits,
-        visitors: Visitors,
+        visitors: Visitors[Address],
         turns: Turns,
         refuse: Callable[[Peer], Refusal | None] = lambda peer: None,  # noqa: ARG005 - names the parameter
         troubled: Callable[[Peer, str], None] = lambda peer, reason: None,  # noqa: ARG005 - same
@@ -140,142 +119,105 @@ class HttpServer:
             connection.abort()
 
 
-class _Connection(asyncio.Protocol):
-    """One connection: feeds the parser, serves its requests one after the other."""
+class _Connection(Front):
+    """One connection: serves its requests one after the other."""
+
+    most_waiting = _MOST_PIPELINED
 
     def __init__(self, server: HttpServer) -> None:
+        super().__init__(server.limits, server.visitors)
         self.server = server
-        self._limits = server.limits
-        self.deadline = time.monotonic() + server.limits.head_seconds
         self._counted = False
         self._busy: asyncio.Task[None] | None = None
         self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
-        self._received = 0  # bytes of the request that is being read, framing included
         self._body = bytearray()
-        self._in_request = False
-        self._head_done = False
         self._unsent = 0  # bytes of an answer that the peer does not take, as they were counted
         self._refusal: Refusal | None = None
-        self._patience: asyncio.TimerHandle | None = (
-            None  # until that answer does not wait for the body any more
-        )
+        self._patience: asyncio.TimerHandle | None = None  # until that answer waits for the body no longer
         self._writable = True
-        self._closing = False
 
     # --- asyncio.Protocol ---
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport = cast(asyncio.Transport, transport)
-        peername, sockname = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
-        if not peername:  # gone before it was accepted
-            self._closing = True
-            transport.abort()
+        if not self.open(cast(asyncio.Transport, transport)):
             return
+        peername, sockname = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
         host = plain_address(peername[0])
         self.peer = Peer(host, str(host), str(plain_address(sockname[0])))
         self.server.connections.add(self)
-        too_many = self.server.visitors.enter(self, host)
+        too_many = self.visitors.enter(self, host)
         if too_many:
             self._turn_away(too_many)
             return
         self._counted = True
-        sock = transport.get_extra_info("socket")
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._parser = httptools.HttpRequestParser(self)
 
     def connection_lost(self, _error: Exception | None) -> None:
-        self._leave()
+        self.leave()
 
     def data_received(self, data: bytes) -> None:
-        if not self._closing:
-            self._feed(data)
-        if not self._closing:
-            self._bound(len(data))
-
-    def _feed(self, data: bytes) -> None:
-        try:
-            self._parser.feed_data(data)
-        except httptools.HttpParserUpgrade:
-            pass  # refused when its head was complete
-        except httptools.HttpParserError as error:
-            if not self._closing:
-                self._reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
-
-    def _bound(self, size: int) -> None:
-        if not self._in_request:
+        super().data_received(data)
+        if self.closing or not (self.in_request and self.head_done):
             return
-        self._received += size
-        if not self._head_done:
-            if self._received > self._limits.head_bytes:
-                self._reject(b"431 Request Header Fields Too Large", "sent a request head beyond the limit")
-        elif self._received - len(self._body) > self._limits.framing_bytes:
-            self._reject(b"400 Bad Request", "sent more chunk sizes and trailers than a request may have")
-        elif self._busy is None and self._writable:
-            self.deadline = time.monotonic() + self._limits.stall_seconds
+        if self.received - len(self._body) > self.limits.framing_bytes:
+            self.reject(b"400 Bad Request", "sent more chunk sizes and trailers than a request may have")
+        elif self.is_quiet:
+            self.allow(self.limits.stall_seconds)
+
+    @property
+    def is_quiet(self) -> bool:
+        """As `Front`; an answer that is not taken is not given yet."""
+        return self._busy is None and self._writable
+
+    @property
+    def waiting(self) -> int:
+        """As `Front`."""
+        return len(self._pending)
 
     def pause_writing(self) -> None:
         self._writable = False
-        self.deadline = time.monotonic() + self._limits.stall_seconds
+        self.allow(self.limits.stall_seconds)
 
     def resume_writing(self) -> None:
         self._writable = True
         self._release(self._unsent)
         self._unsent = 0
-        if not self._closing and self._busy is None:
+        if not self.closing and self._busy is None:
             self._go_on()
 
     # --- httptools callbacks ---
 
     def on_message_begin(self) -> None:
-        if len(self._pending) >= _MOST_PIPELINED:
-            self._reject(
-                b"400 Bad Request", f"sent {_MOST_PIPELINED} requests more while one was being answered"
-            )
-        if self._closing:
-            raise ConnectionAbortedError  # what else came is not looked at
+        super().on_message_begin()
         self._url = b""
-        self._received = 0
-        self._head_bytes = 0
-        self._in_request = True
-        self._head_done = False
         self._expects = False
-        if self._busy is None:
-            self.server.visitors.file(self, Stage.UNFINISHED)
-        if self._busy is None and self._writable:
-            self.deadline = time.monotonic() + self._limits.head_seconds
 
     def on_url(self, url: bytes) -> None:
         self._url += url
-        self._count_head(len(url))
+        super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        self._count_head(len(name) + len(value) + _FIELD_FRAMING)
-        if self._closing:
+        super().on_header(name, value)
+        if self.closing:
             return
         lowered = name.lower()
-        if lowered == b"content-length" and value.isdigit() and int(value) > self._limits.body_bytes:
-            self._reject(
+        if lowered == b"content-length" and value.isdigit() and int(value) > self.limits.body_bytes:
+            self.reject(
                 b"413 Content Too Large",
-                f"announced a body of {int(value)} bytes; the limit is {self._limits.body_bytes}",
+                f"announced a body of {int(value)} bytes; the limit is {self.limits.body_bytes}",
             )
         elif lowered == b"expect" and value.lower() == b"100-continue":
             self._expects = True
 
-    def _count_head(self, size: int) -> None:
-        self._head_bytes += size
-        if self._head_bytes > self._limits.head_bytes and not self._closing:
-            self._reject(b"431 Request Header Fields Too Large", "sent a request head beyond the limit")
-
     def on_headers_complete(self) -> None:
-        self._head_done = True
-        if self._closing:
+        super().on_headers_complete()
+        if self.closing:
             return
-        if self._parser.get_method() != b"POST":
-            self._reject(b"405 Method Not Allowed", "did not POST")
+        if self.parser.get_method() != b"POST":
+            self.reject(b"405 Method Not Allowed", "did not POST")
             return
-        if self._parser.should_upgrade():
-            self._reject(b"501 Not Implemented", "asked for another protocol")
+        if self.parser.should_upgrade():
+            self.reject(b"501 Not Implemented", "asked for another protocol")
             return
         self._refusal = self.server.refuse(self.peer)
         if self._expects and self._refusal is not None:
@@ -284,40 +226,40 @@ class _Connection(asyncio.Protocol):
             later = asyncio.get_running_loop().call_later
             self._patience = later(_BEGINNING_SECONDS, self._refuse_request, self._refusal)
         elif self._expects:
-            self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+            self.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, piece: bytes) -> None:
-        if self._closing:
+        if self.closing:
             return
-        if len(self._body) + len(piece) > self._limits.body_bytes:
-            self._reject(b"413 Content Too Large", f"sent a body beyond {self._limits.body_bytes} bytes")
+        if len(self._body) + len(piece) > self.limits.body_bytes:
+            self.reject(b"413 Content Too Large", f"sent a body beyond {self.limits.body_bytes} bytes")
             return
-        too_much = self.server.visitors.hold(self.peer.host, len(piece))
+        too_much = self.visitors.hold(self.peer.host, len(piece))
         if too_much:
-            self._reject(b"503 Service Unavailable", f"sent a body while {too_much}")
+            self.reject(b"503 Service Unavailable", f"sent a body while {too_much}")
             return
         self._body += piece
         if self._refusal is not None and len(self._body) >= _BEGINNING:
             self._refuse_request(self._refusal)
 
     def on_message_complete(self) -> None:
-        if self._closing:
+        if self.closing:
             return
         if self._refusal is not None:
             self._refuse_request(self._refusal)
             return
-        too_much = self.server.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
+        too_much = self.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
         if too_much:
-            self._reject(b"503 Service Unavailable", f"sent a request while {too_much}")
+            self.reject(b"503 Service Unavailable", f"sent a request while {too_much}")
             return
-        self._in_request = False
+        super().on_message_complete()
         body, self._body = bytes(self._body), bytearray()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), body, time.monotonic_ns())
-        self._pending.append((request, self._parser.should_keep_alive()))
-        if self._busy is None and self._writable:
+        self._pending.append((request, self.parser.should_keep_alive()))
+        if self.is_quiet:
             self._serve_next()
         else:
-            self._transport.pause_reading()
+            self.transport.pause_reading()
 
     def _refuse_request(self, refusal: Refusal) -> None:
         """Answer without having read more than the beginning of the body."""
@@ -330,9 +272,8 @@ class _Connection(asyncio.Protocol):
         """Bytes that are held for it and that its end sets free: not those of a request that is being served."""
         return len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending)
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
         """Count for nothing any more, once; what is being served goes on, and its answer is thrown away."""
-        self._closing = True
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -340,7 +281,7 @@ class _Connection(asyncio.Protocol):
             self._counted = False
             self._release(self.holding)
             self._body, self._unsent = bytearray(), 0
-        self.server.visitors.leave(self)
+        super().leave()
         self._pending.clear()
         if self._busy is not None and self._waiting:
             self._busy.cancel()
@@ -349,13 +290,13 @@ class _Connection(asyncio.Protocol):
 
     def _go_on(self) -> None:
         """The answer is sent: the next request, if it is there, or wait for one."""
-        self.deadline = time.monotonic() + self._limits.idle_seconds
+        self.allow(self.limits.idle_seconds)
         if self._pending:
             self._serve_next()
-        elif not self._transport.is_closing():
-            if not self._in_request:
-                self.server.visitors.file(self, Stage.IDLE)
-            self._transport.resume_reading()
+        elif not self.transport.is_closing():
+            if not self.in_request:
+                self.visitors.file(self, Stage.IDLE)
+            self.transport.resume_reading()
 
     def _serve_next(self) -> None:
         request, keep = self._pending.popleft()
@@ -371,7 +312,7 @@ class _Connection(asyncio.Protocol):
         finally:
             self._busy = None
             self._release(_held_by(request))
-        if self._closing:
+        if self.closing:
             return
         self._write(status, body, keep=keep)
         if not self._writable:
@@ -386,7 +327,7 @@ class _Connection(asyncio.Protocol):
             await turns.enter(host)
         finally:
             self._waiting = False
-        self.server.visitors.file(self, Stage.SERVED)
+        self.visitors.file(self, Stage.SERVED)
         try:
             return b"200 OK", await self.server.handler(request)
         except NoAnswerError:
@@ -396,11 +337,11 @@ class _Connection(asyncio.Protocol):
             return b"500 Internal Server Error", b""
         finally:
             turns.leave(host)
-            self.server.visitors.file(self, Stage.UNFINISHED)  # until its answer is taken
+            self.visitors.file(self, Stage.UNFINISHED)  # until its answer is taken
 
     def _hold_unsent(self) -> None:
-        unsent = self._transport.get_write_buffer_size()
-        too_much = self.server.visitors.hold(self.peer.host, unsent)
+        unsent = self.transport.get_write_buffer_size()
+        too_much = self.visitors.hold(self.peer.host, unsent)
         if too_much:
             self.server.troubled(self.peer, f"an answer is not taken while {too_much}")
             self.abort()
@@ -408,7 +349,7 @@ class _Connection(asyncio.Protocol):
         self._unsent = unsent
 
     def _release(self, size: int) -> None:
-        self.server.visitors.release(self.peer.host, size)
+        self.visitors.release(self.peer.host, size)
 
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
         """Send a response. `unread`: the request was not read to its end, and what comes of it is thrown away,
@@ -416,22 +357,23 @@ class _Connection(asyncio.Protocol):
         """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
-        if self._transport.is_closing():
+        if self.transport.is_closing():
             return
-        self._transport.write(head % (status, len(body), connection) + body)
+        self.transport.write(head % (status, len(body), connection) + body)
         if keep:
             return
-        self._closing = True
+        self.closing = True
         if unread:
             self._release(len(self._body))
             self._body = bytearray()
-            self.deadline = time.monotonic() + self._limits.linger_seconds
-            self._transport.write_eof()
+            self.allow(self.limits.linger_seconds)
+            self.transport.write_eof()
         else:
-            self.deadline = time.monotonic() + self._limits.stall_seconds
-            self._transport.close()
+            self.allow(self.limits.stall_seconds)
+            self.transport.close()
 
-    def _reject(self, status: bytes, what: str) -> None:
+    def reject(self, status: bytes, what: str) -> None:
+        """Tell the peer which limit it went over, in a fault."""
         self._refuse(status, f"{self.peer.text} {what}")
 
     def _refuse(self, status: bytes, why: str) -> None:
@@ -440,46 +382,33 @@ class _Connection(asyncio.Protocol):
 
     def _turn_away(self, why: str) -> None:
         """One connection too many: it is told so, if not too many are being told."""
-        if self.server.visitors.turn_away(self, self.peer.host):
+        if self.visitors.turn_away(self, self.peer.host):
             self._refuse(b"503 Service Unavailable", why)
         else:
-            self._closing = True
+            self.closing = True
             self.server.troubled(self.peer, why)
-            self._transport.abort()
+            self.transport.abort()
 
     def expire(self) -> None:
         """Called by the sweep when the deadline passed."""
-        unsent = self._transport.get_write_buffer_size()
+        unsent = self.transport.get_write_buffer_size()
         if unsent < self._unsent:  # slow, but it moves
             self._release(self._unsent - unsent)
             self._unsent = unsent
-            self.deadline = time.monotonic() + self._limits.stall_seconds
+            self.allow(self.limits.stall_seconds)
             return
-        if not self._closing and self._in_request and not self._head_done:
+        if not self.closing and self.in_request and not self.head_done:
             self.server.troubled(self.peer, f"{self.peer.text} did not finish a request in time")
         self.abort()
 
     def _reset(self) -> None:
         """Cut the connection so that the peer sees it broken, not ended."""
-        self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.abort()
-
-    def abort(self) -> None:
-        """Cut the connection now; it counts for nothing from here on."""
-        self._leave()
-        self._transport.abort()
 
 
 def _held_by(request: HttpRequest) -> int:
     return _REQUEST_BYTES + len(request.path) + len(request.body)
-
-
-def plain_address(text: str) -> Address:
-    """The address without scope, an IPv4 address in IPv6 clothes as the IPv4 address it is."""
-    address = ipaddress.ip_address(text.partition("%")[0])
-    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-        return address.ipv4_mapped
-    return address
 
 
 def listen(host: str, port: int) -> socket.socket:

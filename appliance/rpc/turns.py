@@ -25,7 +25,9 @@ class Turns:
     """Slots for requests being served, within the shares of `bounds`; who gets none waits in turn.
 
     Whenever a slot is free, everybody who waits does so because of his host's share, or that of hosts like it.
-    `alike(host)` is the same for hosts that take their turns as one.
+    `alike(host)` is the same for hosts that take their turns as one. `pause(host)` is for how many seconds a host that
+    owes for its audit records waits before it is asked again, without a slot: who waits for its own debt keeps nothing
+    that others need.
     """
 
     def __init__(
@@ -33,16 +35,20 @@ class Turns:
         bounds: Bounds,
         standing: Callable[[Address], Standing],
         alike: Callable[[Address], Hashable] = itself,
+        pause: Callable[[str], float] = lambda _host: 0.0,
     ) -> None:
         self._slots: Pool[Address] = Pool("requests being served", bounds, standing)
         self._alike = alike
+        self._pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
         self._taken: Counter[Hashable] = Counter()  # by hosts that are alike
         self._taken_as: dict[Address, Hashable] = {}
         self._waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
-        """Take a slot, waiting for this host's turn when there is none."""
+        """Take a slot, once this host's records are paid, waiting for its turn when there is none."""
+        while seconds := self._pause(str(host)):
+            await asyncio.sleep(seconds)
         kind = self._alike(host)
         if self._take(host, kind):
             return

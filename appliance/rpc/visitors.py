@@ -1,28 +1,27 @@
-"""Who is connected to control's listeners, what the connections hold, and who makes room when there is none.
+"""Who is connected to listeners, what the connections hold, and who makes room when there is none.
 
 Invariants:
 
 1. Connections, the bytes they hold (bodies that are not answered, answers that are not taken) and those that are being
    told that they are too many are pools of `appliance/shares`: no number of addresses has more than its class may.
 2. A host that is within its own share and finds its class or the whole full gets the place of another connection, if
-   there is one: of the lowest standing that is not above its own, an idle one before one whose request is not whole,
-   and the one that is so for the longest. An idle one costs its client nothing: ROS clients connect again.
-3. Of its own standing only what is idle, or unfinished for `_PATIENCE` seconds, makes room; never what is served.
-4. Where bytes are short, the connection that holds most of a host that holds more makes room.
+   there is one: of the lowest standing that is not above its own, an idle one before one whose request is not whole and
+   that before one that is served, and the one that is so for the longest. `patience` says for how long it is so at
+   least: at RVMaster an idle one costs its client nothing (ROS clients connect again), of its own standing what is
+   unfinished makes room after a second, and what is served never does.
+3. Where bytes are short, the connection that holds most of a host that holds more makes room.
 """
 
 import asyncio
+import math
 import time
 from collections.abc import Callable
 from enum import Enum
-from typing import Protocol
+from typing import Generic, Protocol
 
-from appliance.policy.model import Address
-from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.shares.pool import Bounds, Holder, Pool, Standing
 from appliance.shares.queue import Queue
 from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
-
-_PATIENCE = 1.0
 
 
 class Stage(Enum):
@@ -54,34 +53,44 @@ class Connection(Protocol):
         """End now, and `leave`."""
 
 
-class Visitors:
-    """All connections of every listener that shares it. `standing` says what is known of a host now."""
+Patience = Callable[[Standing, Stage, bool], float]
+"""Seconds that a connection of this standing keeps its place at this stage (True: from hosts of its own standing)."""
+
+
+def _of_ros(_standing: Standing, stage: Stage, own: bool) -> float:
+    if stage is Stage.SERVED:
+        return math.inf
+    return 1.0 if own and stage is Stage.UNFINISHED else 0.0
+
+
+class Visitors(Generic[Holder]):
+    """All connections of every listener that shares it, by host. `standing` says what is known of a host now."""
 
     def __init__(
         self,
-        standing: Callable[[Address], Standing],
+        standing: Callable[[Holder], Standing],
         *,
         connections: Bounds = RVMASTER_CONNECTIONS.bounds,
         held: Bounds = RVMASTER_BYTES.bounds,
         farewells: Bounds = RVMASTER_FAREWELLS.bounds,
+        patience: Patience = _of_ros,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._standing = standing
+        self._patience = patience
         self._clock = clock
-        self.connected: Pool[Address] = Pool("connections open", connections, standing)
-        self.held: Pool[Address] = Pool("bytes in requests and answers under way", held, standing)
-        self.farewells: Pool[Address] = Pool("connections that are turned away", farewells, standing)
-        self._of: dict[Connection, tuple[Address, Pool[Address]]] = {}
-        self._queues: dict[Stage, Queue[Address, Connection]] = {
-            stage: Queue(standing) for stage in (Stage.IDLE, Stage.UNFINISHED)
-        }
+        self.connected: Pool[Holder] = Pool("connections open", connections, standing)
+        self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, standing)
+        self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
+        self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
+        self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
 
     @property
     def connections(self) -> frozenset[Connection]:
         """All that are here, those that are being turned away included."""
         return frozenset(self._of)
 
-    def enter(self, connection: Connection, host: Address) -> str:
+    def enter(self, connection: Connection, host: Holder) -> str:
         """Count a connection in; why not, when there is no room and nobody makes it."""
         why = self._take(self.connected, host, 1)
         if not why:
@@ -89,7 +98,7 @@ class Visitors:
             self.file(connection, Stage.UNFINISHED)
         return why
 
-    def turn_away(self, connection: Connection, host: Address) -> bool:
+    def turn_away(self, connection: Connection, host: Holder) -> bool:
         """Whether a connection that is too many may stay until it was told so; it is counted then."""
         if self.farewells.take(host):
             return False
@@ -111,14 +120,13 @@ class Visitors:
             return
         for queue in self._queues.values():
             queue.remove(connection)
-        if stage in self._queues:
-            self._queues[stage].put(connection, host, self._clock())
+        self._queues[stage].put(connection, host, self._clock())
 
-    def hold(self, host: Address, size: int) -> str:
+    def hold(self, host: Holder, size: int) -> str:
         """Count bytes in that are kept for a host; why not (nothing is counted) when it is too much."""
         return self._take(self.held, host, size)
 
-    def release(self, host: Address, size: int) -> None:
+    def release(self, host: Holder, size: int) -> None:
         """Count bytes out."""
         self.held.give_back(host, size)
 
@@ -130,7 +138,7 @@ class Visitors:
             for connection in [one for one in self._of if one.deadline < now]:
                 connection.expire()
 
-    def _take(self, pool: Pool[Address], host: Address, amount: int) -> str:
+    def _take(self, pool: Pool[Holder], host: Holder, amount: int) -> str:
         why = pool.take(host, amount)
         while why and pool.held(host) + amount <= pool.bounds.host:
             victim = self._to_make_room(host) if pool is self.connected else self._to_free_bytes(host)
@@ -140,7 +148,7 @@ class Visitors:
             why = pool.take(host, amount)
         return why
 
-    def _to_make_room(self, host: Address) -> Connection | None:
+    def _to_make_room(self, host: Holder) -> Connection | None:
         """The connection whose place this host may have."""
         mine = self._standing(host)
         for standing in Standing:
@@ -148,14 +156,12 @@ class Visitors:
                 return None
             for stage, queue in self._queues.items():
                 found = queue.longest(standing)
-                if found is None:
-                    continue
-                patient = stage is Stage.UNFINISHED and standing is mine
-                if not (patient and self._clock() - found[2] < _PATIENCE):
+                patience = self._patience(standing, stage, standing is mine)
+                if found is not None and self._clock() - found[2] >= patience:
                     return found[0]
         return None
 
-    def _to_free_bytes(self, host: Address) -> Connection | None:
+    def _to_free_bytes(self, host: Holder) -> Connection | None:
         """The connection that holds most of all that may be ended for this host."""
         mine, most = self._standing(host), self.held.held(host)
         able = [

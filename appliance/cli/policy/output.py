@@ -1,33 +1,17 @@
-"""How the policy verbs show findings, requests and decisions."""
+"""How the policy verbs show findings and decisions."""
+
+from dataclasses import asdict
 
 from appliance.cli.output import say, say_json
-from appliance.policy import Decision, Finding, Request
+from appliance.policy import Decision, Finding
 
 
 def say_finding(finding: Finding, *, as_json: bool) -> None:
     """Write an error or a warning."""
     if as_json:
-        say_json(
-            {
-                "file": finding.file,
-                "line": finding.line,
-                "column": finding.column,
-                "severity": finding.severity,
-                "text": finding.text,
-            }
-        )
+        say_json(asdict(finding))
     else:
         say(str(finding), "red" if finding.severity == "error" else "yellow")
-
-
-def request_fields(request: Request) -> dict[str, object]:
-    """A request as the audit log writes it."""
-    return {
-        "host": str(request.host),
-        "caller_id": request.caller_id,
-        "category": request.category,
-        "resource": request.resource,
-    }
 
 
 def decision_fields(decision: Decision) -> dict[str, object]:

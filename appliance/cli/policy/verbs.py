@@ -25,7 +25,7 @@ from appliance.cli.policy.input import (
     usage_error,
 )
 from appliance.cli.policy.learning import learn_policy
-from appliance.cli.policy.output import decision_fields, request_fields, say_finding
+from appliance.cli.policy.output import decision_fields, say_finding
 from appliance.cli.policy.running import confirm, reload, revisions, rollback
 from appliance.cli.policy.trial import Trial, try_policy
 from appliance.cli.running import Appliance, speaks
@@ -84,7 +84,8 @@ def check(
         )
     for ending in trial.ends:
         if as_json:
-            say_json({"ends": ending.what, **{k: v for k, v in asdict(ending).items() if k != "what"}})
+            fields = asdict(ending)
+            say_json({"ends": fields.pop("what"), **fields})
         else:
             whose = f"{ending.caller_id or 'a client'} on {ending.host}"
             say(f"would end: {ending.what} {ending.resource} of {whose}: {ending.reason}", "yellow")
@@ -159,7 +160,7 @@ def explain_request(
 
 def _explanation_fields(explanation: Explanation) -> dict[str, object]:
     fields: dict[str, object] = {
-        **request_fields(explanation.request),
+        **explanation.request.fields(),
         **decision_fields(explanation.decision),
         "told": explanation.told,
         "through": list(explanation.through),
@@ -207,9 +208,7 @@ def test(
         if as_json:
             place = {"file": result.file, "line": result.line, "column": result.column}
             expected = {"passed": result.passed, "expected": "allow" if result.expected else "deny"}
-            say_json(
-                {**place, **expected, **request_fields(result.request), **decision_fields(result.decision)}
-            )
+            say_json({**place, **expected, **result.request.fields(), **decision_fields(result.decision)})
         else:
             say(str(result), "red")
     if not as_json:
@@ -274,7 +273,7 @@ def _difference_lines(difference: Difference) -> Iterator[str]:
 
 def _difference_fields(difference: Difference) -> dict[str, object]:
     return {
-        **request_fields(difference.request),
+        **difference.request.fields(),
         "count": difference.count,
         "old": decision_fields(difference.old),
         "new": decision_fields(difference.new),

@@ -11,7 +11,8 @@ from collections.abc import Awaitable, Callable, Sequence
 import structlog
 
 from appliance.policy.model import Address
-from appliance.rpc.server import Peer, plain_address
+from appliance.rpc.front import plain_address
+from appliance.rpc.server import Peer
 
 _log = structlog.get_logger()
 _ANSWER_SECONDS = 3.0

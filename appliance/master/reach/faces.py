@@ -13,7 +13,8 @@ from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
 from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
-from appliance.rpc.server import Handler, HttpLimits, HttpRequest, HttpServer, Peer, Refusal
+from appliance.rpc.front import HttpLimits
+from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
 
@@ -34,7 +35,7 @@ class Faces:
         serve: Callable[[Incarnation], Handler],
         address_for: Callable[[Peer], str],
         limits: HttpLimits,
-        visitors: Visitors,
+        visitors: Visitors[Address],
         turns: Turns,
         refuse: Callable[[Peer], Refusal | None],
         troubled: Callable[[Peer, str], None],

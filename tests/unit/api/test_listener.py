@@ -223,7 +223,7 @@ def test_strangers_in_the_handshake_make_room(tmp_path: Path) -> None:
         silent = [socket.create_connection(where, source_address=(f"127.0.1.{n}", 0)) for n in range(1, 61)]
         trust = ssl.create_default_context(cafile=tmp_path / "certificate.pem")
         trust.check_hostname = False
-        pool = listener.arrivals.connected
+        pool = listener.visitors.connected
         for _ in range(12):
             reader, writer = await asyncio.open_connection(*where, ssl=trust)
             assert await served(reader, writer)
@@ -255,7 +255,7 @@ def test_a_handshake_that_fails_leaves_nothing(tmp_path: Path) -> None:
         peers[1].sendall(b"\x16\x03\x01")
         peers[1].close()
         await asyncio.sleep(0)
-        while listener.arrivals.connected.total or not await at_end(peers[2]):
+        while listener.visitors.connected.total or not await at_end(peers[2]):
             await asyncio.sleep(0.01)
         for peer in peers:
             peer.close()

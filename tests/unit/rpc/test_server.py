@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 import uvloop
 
+from appliance.policy.model import Address
 from appliance.ros.xmlrpc import FaultReceived, parse_response
+from appliance.rpc.front import HttpLimits, plain_address
 from appliance.rpc.server import (
     Handler,
-    HttpLimits,
     HttpRequest,
     HttpServer,
     NoAnswerError,
     Peer,
     listen,
-    plain_address,
 )
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
@@ -117,7 +117,7 @@ class Server:
     ) -> None:
         self.requests: list[HttpRequest] = []
         self.troubles: list[str] = []
-        self.visitors = Visitors(
+        self.visitors: Visitors[Address] = Visitors(
             _named, connections=shares.connections, held=shares.held, farewells=shares.farewells
         )
         self.turns = Turns(shares.requests, _named)

@@ -161,3 +161,32 @@ def test_many_addresses_of_one_network_take_turns_as_one() -> None:
         await asyncio.gather(*stuck, *tasks, return_exceptions=True)
 
     asyncio.run(test())
+
+
+def test_who_owes_waits_outside_the_slots() -> None:
+    """However many requests of a host in debt wait, every slot is free for others; paid, they are served."""
+
+    debtor, payer = ipaddress.ip_address("10.0.0.66"), ipaddress.ip_address("10.0.0.1")
+
+    async def test() -> None:
+        debts = {str(debtor): 0.01}
+        bounds = Bounds(1, 1, 0, 0)
+        turns = Turns(bounds, lambda _host: Standing.REGISTERED, pause=lambda host: debts.get(host, 0.0))
+        waiting = [asyncio.create_task(turns.enter(debtor)) for _ in range(50)]
+        for _ in range(100):
+            async with asyncio.timeout(20.0):
+                await turns.enter(payer)
+            turns.leave(payer)
+            await asyncio.sleep(0)
+        assert not any(task.done() for task in waiting)
+        debts.clear()
+        for _ in waiting:
+            async with asyncio.timeout(20.0):
+                await asyncio.wait(
+                    [task for task in waiting if not task.done()] or waiting, return_when="FIRST_COMPLETED"
+                )
+            turns.leave(debtor)
+        async with asyncio.timeout(20.0):
+            await asyncio.gather(*waiting)
+
+    asyncio.run(test())

@@ -1,6 +1,7 @@
 """Connections by host and standing: who has room, and who makes it."""
 
 import ipaddress
+import math
 from dataclasses import dataclass, field
 
 from hypothesis import given
@@ -38,7 +39,7 @@ class Standings:
 class Guest:
     """A connection of a test."""
 
-    visitors: Visitors
+    visitors: Visitors[Address]
     host: Address
     deadline: float = 0.0
     holding: int = 0
@@ -61,7 +62,7 @@ class Guest:
         return why
 
 
-def books(standings: Standings, connections: Bounds, held: Bounds | None = None) -> Visitors:
+def books(standings: Standings, connections: Bounds, held: Bounds | None = None) -> Visitors[Address]:
     """The books of a test."""
     bytes_ = held or Bounds(1000, 1000, 0, 0)
     return Visitors(
@@ -69,7 +70,7 @@ def books(standings: Standings, connections: Bounds, held: Bounds | None = None)
     )
 
 
-def come(visitors: Visitors, host: Address, stage: Stage = Stage.IDLE) -> Guest | None:
+def come(visitors: Visitors[Address], host: Address, stage: Stage = Stage.IDLE) -> Guest | None:
     """A connection of this host, at this stage; None when it is turned away."""
     connection = Guest(visitors, host)
     if visitors.enter(connection, host):
@@ -197,3 +198,21 @@ def test_no_order_of_events_loses_count(steps: list[tuple[int, Stage | None, Sta
             here.append(connection)
         here = [one for one in here if not one.cut]
         assert visitors.connected.total == len(here) == len(visitors.connections) <= 6
+
+
+def test_a_listener_says_who_makes_room_while_it_is_served() -> None:
+    """Where strangers have no patience to claim, one that is being served makes room; a known host's never does."""
+    standings = Standings({ROBOT: Standing.REGISTERED, OTHER: Standing.REGISTERED})
+    visitors: Visitors[Address] = Visitors(
+        standings,
+        connections=Bounds(1, 1, 1, 0),
+        patience=lambda standing, _stage, _own: math.inf if standing is Standing.REGISTERED else 0.0,
+        clock=standings.clock,
+    )
+    stranger = come(visitors, guest(0), Stage.SERVED)
+    assert stranger is not None
+    robot = come(visitors, ROBOT, Stage.SERVED)
+    assert stranger.cut
+    assert robot is not None
+    assert come(visitors, OTHER) is None
+    assert not robot.cut
