@@ -2,5 +2,5 @@
 
 `form.py` is the form: what a checked specification is reduced to. `functions.py` are the functions that it may call.
 `interpreter.py` runs it, plainly and slowly: that is what a specification means, and what every faster way of running
-one is held against.
+one is held against. `module.py` writes its scalar part as a WebAssembly module.
 """

@@ -14,7 +14,9 @@ from appliance.rosmop.runtime.times import with_part
 Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
-_MAX_EMPTY = 1_000_000  # elements without bytes that one array may have
+MAX_EMPTY = 1_000_000
+"""Elements without bytes that one array may have."""
+
 _MAX_DECODED = 1_000_000  # elements that are decoded one by one
 _FEW = 64  # elements that cost less than an instruction's worth of counting them
 
@@ -36,7 +38,7 @@ def text_end(buffer: Buffer, start: int) -> int:
 def count(buffer: Buffer, start: int, least: int) -> int:
     """How many elements the array at `start` has; each takes at least so many bytes."""
     number: int = _LENGTH.unpack_from(buffer, start)[0]
-    if number * least > len(buffer) - start - 4 or (not least and number > _MAX_EMPTY):
+    if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
         raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
     return number
 
