@@ -170,20 +170,12 @@ class TunnelProcess:
             last = raw.decode("utf-8", "replace").rstrip() or last
             refusal = self._refusals.read(last)
             if refusal is not None and refusal.packet:
-                self._count_packet(refusal)
+                if refusal in self._packets or len(self._packets) < REFUSED_SOURCES:
+                    self._packets[refusal] += 1
             elif refusal is not None and self._may_tell():
                 self._tell(messages.TunnelRefused(refusal.remote, refusal.reason))
         status = await charon.wait()
         raise CharonError(f"charon ended (status {status}), last it said: {last}")
-
-    def _count_packet(self, refusal: Refusal) -> None:
-        if refusal in self._packets or len(self._packets) < REFUSED_SOURCES:
-            self._packets[refusal] += 1
-
-    def _tell_packets(self) -> None:
-        for refusal, count in self._packets.items():
-            self._tell(messages.TunnelRefused(refusal.remote, refusal.reason, count))
-        self._packets.clear()
 
     def _may_tell(self) -> bool:
         second, count = int(time.monotonic()), self._second[1]
@@ -193,7 +185,9 @@ class TunnelProcess:
     async def _report(self) -> None:
         while True:
             await asyncio.sleep(REPORT_SECONDS)
-            self._tell_packets()
+            for refusal, count in self._packets.items():
+                self._tell(messages.TunnelRefused(refusal.remote, refusal.reason, count))
+            self._packets.clear()
             if self._vici is not None and not self._changed.is_set():
                 await self._say_how_it_stands(self._vici)
 
