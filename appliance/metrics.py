@@ -10,7 +10,7 @@ import bisect
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from appliance.channel.messages import DELAY_BOUNDS
 
@@ -143,6 +143,10 @@ class Histogram:
         self.counts[bisect.bisect_left(BOUNDS, seconds)] += 1
         self.sum += seconds
 
+    def values(self) -> tuple[list[int], float]:
+        """The counts and the sum."""
+        return self.counts, self.sum
+
 
 class Meter:
     """The counters of RVMaster, since it started."""
@@ -160,14 +164,6 @@ class Meter:
     def called(self, call: str, seconds: float) -> None:
         """A call of the table was answered (`call` must not be a stranger's text)."""
         self.calls.setdefault(call, Histogram()).observe(seconds)
-
-    def values(self) -> dict[str, Any]:
-        """Everything, in plain values."""
-        return {
-            "decisions": [[*labels, count] for labels, count in self.decisions.items()],
-            "decision_seconds": [self.decision_seconds.counts, self.decision_seconds.sum],
-            "calls": [[call, one.counts, one.sum] for call, one in self.calls.items()],
-        }
 
 
 def markdown() -> str:

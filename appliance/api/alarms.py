@@ -1,84 +1,87 @@
 """What stands open now and should be looked at, read from the status: pure, and the same for every page."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from collections.abc import Iterator
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import msgspec
 
+from appliance.channel.answers.described import told
+from appliance.channel.answers.status import Status
 from appliance.channel.serving import no_relay, probe_failed
 
 
-class Alarm(BaseModel):
+class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """A condition that holds now. `kind` is a stable name; it goes by itself when the condition does."""
 
-    model_config = ConfigDict(extra="forbid")
     kind: str
     severity: Literal["alarm", "warning", "notice"]
-    text: str = Field(description="what is the matter and what to do, for a person")
+    text: Annotated[str, told("what is the matter and what to do, for a person")]
     about: Literal["system", "policy", "monitors", "hosts", "audit"]
 
 
-def open_alarms(status: Mapping[str, Any]) -> list[Alarm]:
+def open_alarms(status: Status) -> list[Alarm]:
     """The open conditions, the gravest first."""
     order = ("alarm", "warning", "notice")
     found = [*_system(status), *_audit(status), *_policy(status), *_monitors(status), *_hosts(status)]
     return sorted(found, key=lambda one: order.index(one.severity))
 
 
-def _system(status: Mapping[str, Any]) -> Iterator[Alarm]:
+def _system(status: Status) -> Iterator[Alarm]:
     if probe_failed(status):
-        text = f"the hidden ROS Master can be reached past the appliance; nodes are not served: {status['probe']}"
+        text = (
+            f"the hidden ROS Master can be reached past the appliance; nodes are not served: {status.probe}"
+        )
         yield Alarm(kind="probe", severity="alarm", text=text, about="system")
-    relay = no_relay(status["relay"])
+    relay = no_relay(status.relay)
     if relay is not None:
         text = f"{relay}, until it is back"
         yield Alarm(kind="relay", severity="alarm", text=text, about="system")
-    if status["rosmaster"] != "reachable":
+    if status.rosmaster != "reachable":
         text = "the ROS Master behind the appliance is being rebuilt; calls of nodes wait"
         yield Alarm(kind="rosmaster", severity="warning", text=text, about="system")
 
 
-def _audit(status: Mapping[str, Any]) -> Iterator[Alarm]:
-    audit = status["audit"]
-    if audit["failed"] is not None:
-        text = f"the audit log cannot be written: {audit['failed']}"
+def _audit(status: Status) -> Iterator[Alarm]:
+    audit = status.audit
+    if audit.failed is not None:
+        text = f"the audit log cannot be written: {audit.failed}"
         yield Alarm(kind="audit-failed", severity="alarm", text=text, about="audit")
-    if audit["degraded"] is not None:
-        yield Alarm(kind="audit-degraded", severity="warning", text=str(audit["degraded"]), about="audit")
-    forwarding = audit["forwarding"]
-    if forwarding is not None and forwarding["trouble"]:
+    if audit.degraded is not None:
+        yield Alarm(kind="audit-degraded", severity="warning", text=audit.degraded, about="audit")
+    forwarding = audit.forwarding
+    if forwarding is not None and forwarding.trouble:
         text = (
-            f"the audit log is not forwarded to {forwarding['to']}, {forwarding['behind']} records wait:"
-            f" {forwarding['trouble']}"
+            f"the audit log is not forwarded to {forwarding.to}, {forwarding.behind} records wait:"
+            f" {forwarding.trouble}"
         )
         yield Alarm(kind="audit-not-forwarded", severity="warning", text=text, about="audit")
 
 
-def _policy(status: Mapping[str, Any]) -> Iterator[Alarm]:
-    policy = status["policy"]
-    if policy["confirm_by"] is not None:
-        text = f"revision {policy['revision']} goes back by itself unless it is confirmed"
+def _policy(status: Status) -> Iterator[Alarm]:
+    policy = status.policy
+    if policy.confirm_by is not None:
+        text = f"revision {policy.revision} goes back by itself unless it is confirmed"
         yield Alarm(kind="policy-unconfirmed", severity="warning", text=text, about="policy")
-    if policy["differs_from_file"]:
-        text = f"revision {policy['revision']} is not what {policy['file']} says"
+    if policy.differs_from_file:
+        text = f"revision {policy.revision} is not what {policy.file} says"
         yield Alarm(kind="policy-differs", severity="notice", text=text, about="policy")
 
 
-def _monitors(status: Mapping[str, Any]) -> Iterator[Alarm]:
-    monitors = status.get("monitors", {})
-    for name in monitors.get("held", []):
+def _monitors(status: Status) -> Iterator[Alarm]:
+    monitors = status.monitors
+    for name in monitors.held:
         text = f"{name} holds its topics after a restart of the relay: resume it when that is safe"
         yield Alarm(kind=f"monitor-held:{name}", severity="alarm", text=text, about="monitors")
-    for name in monitors.get("failing", []):
+    for name in monitors.failing:
         text = f"{name} is failing: its actions faulted again and again"
         yield Alarm(kind=f"monitor-failing:{name}", severity="alarm", text=text, about="monitors")
-    for line in monitors.get("refused", []):
-        yield Alarm(kind="monitors-refused", severity="warning", text=str(line), about="monitors")
-    if monitors.get("differs_from_folder"):
-        text = f"revision {monitors['revision']} of the specifications is not what their folder has"
+    for line in monitors.refused:
+        yield Alarm(kind="monitors-refused", severity="warning", text=line, about="monitors")
+    if monitors.differs_from_folder:
+        text = f"revision {monitors.revision} of the specifications is not what their folder has"
         yield Alarm(kind="monitors-differ", severity="notice", text=text, about="monitors")
 
 
-def _hosts(status: Mapping[str, Any]) -> Iterator[Alarm]:
-    for line in status.get("ipsec", {}).get("troubles", []):
-        yield Alarm(kind="ipsec", severity="warning", text=str(line), about="hosts")
+def _hosts(status: Status) -> Iterator[Alarm]:
+    for line in status.ipsec.troubles:
+        yield Alarm(kind="ipsec", severity="warning", text=line, about="hosts")

@@ -1,7 +1,5 @@
 """The REST application: routes, how their errors are answered, and the contract (OpenAPI) made from them."""
 
-from typing import Any
-
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
@@ -113,8 +111,6 @@ async def _of_http(request: Request, error: Exception) -> Response:
         case 405:
             allowed = {"Allow": ", ".join(sorted(_methods(request)))}
             problem = ProblemError(405, "wrong-method", "this cannot be done here", headers=allowed)
-        case 400:  # FastAPI's word for a body that is not even text
-            problem = ProblemError(422, "not-json", "the body is not JSON in UTF-8")
         case status:
             problem = ProblemError(status, "bad-request", str(error.detail), headers=error.headers)
     return _answer(request, problem)
@@ -132,21 +128,6 @@ def _methods(request: Request) -> set[str]:
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
     errors = error.errors()
-    for one in errors:
-        if one["type"] == "json_invalid":
-            return _answer(request, _not_json(str(error.body), one))
     bad = [BadInput(where=".".join(map(str, one["loc"])), text=str(one["msg"])) for one in errors]
     detail = "; ".join(f"{one.where}: {one.text}" for one in bad[:5])
     return _answer(request, ProblemError(422, "bad-input", detail, errors=bad))
-
-
-def _not_json(body: str, one: Any) -> ProblemError:
-    position = one["loc"][-1] if isinstance(one["loc"][-1], int) else 0
-    before = body[:position]
-    return ProblemError(
-        422,
-        "not-json",
-        f"the body is not JSON: {one.get('ctx', {}).get('error', one['msg'])}",
-        line=before.count("\n") + 1,
-        column=position - (before.rfind("\n") + 1) + 1,
-    )

@@ -12,19 +12,20 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
-from pydantic import BaseModel, ConfigDict
+from fastapi import Depends, Header, Path, Query, Request, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer
+from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of
-from appliance.audit.copies import signed_checkpoints
+from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import Chain, evidence, evidence_line
+from appliance.audit.findings import Verification
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import Entry, as_json, as_object
 from appliance.audit.query import Filter, FilterError
@@ -67,69 +68,10 @@ _SHOWN = {
 }
 
 
-class LogFinding(BaseModel):
-    """One thing that is wrong; `first` and `last` are sequences of records, or numbers of checkpoints."""
-
-    model_config = ConfigDict(extra="forbid")
-    kind: str
-    first: int
-    last: int
-    message: str
-
-
-class LogElsewhere(BaseModel):
-    """What checkpoints kept on another machine prove; null over REST, which is not given any."""
-
-    model_config = ConfigDict(extra="forbid")
-    checkpoints: int
-    through: int
-    time: int
-    other_logs: list[str]
-
-
-class LogCheckpoint(BaseModel):
-    """A signed checkpoint; `time` is nanoseconds since the epoch, hashes, signature and key are hexadecimal.
-
-    `removed`: up to which record the log's beginning is removed; checkpoints of before they said so have none.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-    log: str
-    number: int
-    sequence: int
-    hash: str
-    time: int
-    previous: str
-    signature: str
-    key: str
-    removed: int | None = None
-
-
-class LogCheckpoints(BaseModel):
+class LogCheckpoints(msgspec.Struct, frozen=True):
     """Signed checkpoints in order; ask again after the last number for more."""
 
-    model_config = ConfigDict(extra="forbid")
-    checkpoints: list[LogCheckpoint]
-
-
-class Verified(BaseModel):
-    """Whether the log is complete and unchanged; the fields are those of `rosrv audit verify --json`."""
-
-    model_config = ConfigDict(extra="forbid")
-    ok: bool
-    log: str
-    records: int
-    first: int
-    last: int
-    removed: int
-    checkpoints: int
-    signed_checkpoints: int
-    signed_through: int
-    unsealed: int
-    key: str | None
-    findings: list[LogFinding]
-    elsewhere: LogElsewhere | None
-    removal: str
+    checkpoints: list[SignedCheckpoint]
 
 
 def _wanted(
@@ -219,9 +161,9 @@ class Desk:
             turns.release()
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1/audit", tags=["audit"])
+    router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = Desk(services)
 
     @router.get("", operation_id="search_audit", responses=_json(_PAGE), dependencies=[VIEWER])
@@ -255,25 +197,23 @@ def routes(services: Services) -> APIRouter:
         following = _follow(services, desk, follower, bearer)
         return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
-    @router.get("/verify", operation_id="verify_audit", response_model=Verified, dependencies=[OPERATOR])
-    async def verify_audit() -> JSONResponse:
+    @router.get("/verify", operation_id="verify_audit", dependencies=[OPERATOR])
+    async def verify_audit() -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
         What the signer remembers is not looked at: `rosrv audit verify` on the machine does that too.
         """
         async with desk.turn(desk.verification, "verifications"):
-            return JSONResponse(msgspec.to_builtins(await desk.in_thread(verify, desk.path)))
+            return await desk.in_thread(verify, desk.path)
 
-    @router.get(
-        "/checkpoints", operation_id="audit_checkpoints", response_model=LogCheckpoints, dependencies=[VIEWER]
-    )
+    @router.get("/checkpoints", operation_id="audit_checkpoints", dependencies=[VIEWER])
     async def audit_checkpoints(
         after: Annotated[int, Query(ge=0, le=10**18, description="only those with a greater number")] = 0,
         limit: Limit = 1000,
-    ) -> JSONResponse:
+    ) -> LogCheckpoints:
         """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
         found = await desk.read(signed_checkpoints, desk.path, after, limit)
-        return JSONResponse({"checkpoints": msgspec.to_builtins(found)})
+        return LogCheckpoints(found)
 
     @router.get(
         "/export",
@@ -307,14 +247,14 @@ def routes(services: Services) -> APIRouter:
     return router
 
 
-_UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"description": "There is no such record."}}
+_UNKNOWN: Responses = {404: {"description": "There is no such record."}}
 
 
-def _json(schema: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+def _json(schema: dict[str, Any]) -> Responses:
     return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
 
 
-def _text(media_type: str, description: str) -> dict[int | str, dict[str, Any]]:
+def _text(media_type: str, description: str) -> Responses:
     return {200: {"description": description, "content": {media_type: {"schema": {"type": "string"}}}}}
 
 

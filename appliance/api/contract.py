@@ -7,6 +7,7 @@ from fastapi.openapi.utils import get_openapi
 
 from appliance.api.audit import RECORD
 from appliance.api.problems import MEDIA_TYPE, Problem
+from appliance.api.routing import CONTRACT
 
 # What the gate may answer to any call.
 _ALWAYS = {
@@ -23,7 +24,7 @@ _WITH_TOKEN = {
 _NOT_HTTP = (
     "What came is not HTTP, or its first line or headers are too long (64 KiB); the server's own words."
 )
-_REFERENCE = {"$ref": "#/components/schemas/Problem"}
+_REFERENCE = CONTRACT.reference(Problem)
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
@@ -44,9 +45,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components = document.setdefault("components", {}).setdefault("schemas", {})
     for name in ("HTTPValidationError", "ValidationError"):
         components.pop(name, None)
-    schema = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
-    components.update(schema.pop("$defs", {}))
-    components["Problem"] = schema
+    components |= CONTRACT.components()
     components["AuditRecord"] = RECORD
     for path in document["paths"].values():
         for operation in path.values():

@@ -18,7 +18,7 @@ import structlog
 
 from appliance.api.access import Bearer
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AdminRequest, RestChange
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, RestChange, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 
 _log = structlog.get_logger()
@@ -31,7 +31,7 @@ class ControlAwayError(Exception):
     """Control cannot be asked now; the text says why, for whoever called."""
 
 
-def _made(number: int, request: AdminRequest, bearer: Bearer | None) -> messages.RequestMade:
+def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> messages.RequestMade:
     shown = bearer.shown if bearer is not None else ""
     asked = bearer.asked if bearer is not None and isinstance(request, RestChange) else None
     return messages.RequestMade(number, request, shown, asked)  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
@@ -43,7 +43,7 @@ class ControlLink:
     def __init__(self, tokens_stated: Callable[[list[messages.TokenKept]], None]) -> None:
         self._tokens_stated = tokens_stated
         self._channel: Channel | None = None
-        self._open: dict[int, asyncio.Future[AdminAnswer]] = {}
+        self._open: dict[int, asyncio.Future[bytes]] = {}
         self._number = 0
         self._kept: deque[messages.RestCalled] = deque()
         self._dropped = 0
@@ -83,8 +83,8 @@ class ControlLink:
                 self._channel.send(messages.RestServed(self._pin))
 
     async def ask(
-        self, request: AdminRequest, bearer: Bearer | None, seconds: float = ANSWER_SECONDS
-    ) -> AdminAnswer:
+        self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = ANSWER_SECONDS
+    ) -> AdminAnswer[A]:
         """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`."""
         if self._channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
@@ -92,12 +92,12 @@ class ControlLink:
             raise ControlAwayError("too many requests wait for the appliance: try again")
         self._number += 1
         number = self._number
-        answer: asyncio.Future[AdminAnswer] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._open[number] = answer
         try:
             self._channel.send(_made(number, request, bearer))
             async with asyncio.timeout(seconds):
-                return await answer
+                return decode(await answer, request)
         except TimeoutError:
             raise ControlAwayError(f"the appliance did not answer within {seconds:g} s") from None
         except (ChannelFullError, ChannelClosedError):

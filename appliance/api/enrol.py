@@ -13,18 +13,20 @@ Invariants:
 import base64
 import binascii
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Header, Path, Request, Response
+from fastapi import Header, Path, Request, Response
 
 from appliance.api.hosts import SLOW_SECONDS
-from appliance.api.hosts_models import HOST_NAME, Enrolled, Enrolment, NewCertificate, Renewal
+from appliance.api.hosts_models import HOST_NAME, Enrolled, Enrolment, Renewal
 from appliance.api.kits import Wishes, kit_of
 from appliance.api.problems import ProblemError
 from appliance.api.rates import Buckets
 from appliance.api.roles import answered
+from appliance.api.routing import Responses, Routes, answer, body, content
 from appliance.api.services import Services
 from appliance.channel.admin import (
+    A,
     AdminRequest,
     AuthorityWanted,
     HostEnrol,
@@ -32,46 +34,45 @@ from appliance.channel.admin import (
     HostRenewItself,
     RevocationsWanted,
 )
+from appliance.channel.answers.hosts import NewCertificate
 from appliance.ipsec.kit import archive, members
 
 _ALL = "all"
 _ALL_PER_MINUTE = 60
 _ARCHIVE = {"application/gzip": {"schema": {"type": "string", "format": "binary"}}}
-_Responses = dict[int | str, dict[str, Any]]
-_KIT: _Responses = {
+_KIT: Responses = {
     200: {
         "description": "Enrolled; with `Accept: application/gzip` the kit as an archive",
-        "model": Enrolled,
-        "content": _ARCHIVE,
+        "content": content(Enrolled) | _ARCHIVE,
     },
     403: {"description": "The token is wrong, was used, or has ended."},
     503: {"description": "The appliance cannot answer now."},
 }
-_TUNNEL: _Responses = {
+_TUNNEL: Responses = {
     403: {"description": "Not from this host's tunnel, or not signed by its key."},
     503: {"description": "The appliance cannot answer now."},
 }
-_PEM: _Responses = {
+_PEM: Responses = {
     200: {"description": "PEM", "content": {"application/x-pem-file": {"schema": {"type": "string"}}}},
     503: {"description": "The appliance cannot answer now."},
 }
 OneName = Annotated[str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host")]
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(tags=["hosts"])
+    router = Routes(tags=["hosts"])
     _add_enrolment(router, services)
     _add_renewal(router, services)
     return router
 
 
-def _add_enrolment(router: APIRouter, services: Services) -> None:
+def _add_enrolment(router: Routes, services: Services) -> None:
     patience = _Patience(services.settings.api_limits.failures_per_minute)
 
     @router.post("/v1/enrol", operation_id="enrol", responses=_KIT, response_class=Response)
     async def enrol(
-        brought: Enrolment,
+        brought: Annotated[Enrolment, body(Enrolment)],
         request: Request,
         accept: Annotated[str, Header(max_length=200)] = "application/json",
     ) -> Response:
@@ -79,31 +80,42 @@ def _add_enrolment(router: APIRouter, services: Services) -> None:
         peer = _peer(request)
         patience.require(peer)
         try:
-            body = await _ask(services, HostEnrol(brought.token, brought.request, peer))
+            parts = await _ask(services, HostEnrol(brought.token, brought.request, peer))
         except ProblemError as problem:
             if problem.status == 403:
                 patience.failed(peer)
             raise
-        kit = kit_of(body, Wishes.of(body["kit"]), None)
+        kit = kit_of(parts, Wishes.of(parts.kept), None)
         if "application/gzip" in accept:
             return Response(archive(kit), media_type="application/gzip")
-        names = Enrolled.model_fields.keys() & body.keys()
         files = {path: text for path, text, _mode in members(kit)}
-        enrolled = Enrolled.model_validate({name: body[name] for name in names} | {"files": files})
-        return Response(enrolled.model_dump_json(), media_type="application/json")
+        return answer(
+            Enrolled(
+                name=parts.name,
+                address=parts.address,
+                appliance=parts.appliance,
+                master=parts.master,
+                serial=parts.serial,
+                expires=parts.expires,
+                certificate=parts.certificate,
+                authority=parts.authority,
+                warning=parts.warning,
+                files=files,
+            )
+        )
 
 
-def _add_renewal(router: APIRouter, services: Services) -> None:
+def _add_renewal(router: Routes, services: Services) -> None:
     @router.post("/v1/hosts/{name}/renew", operation_id="renew_host", responses=_TUNNEL)
-    async def renew(name: OneName, renewal: Renewal, request: Request) -> NewCertificate:
+    async def renew(
+        name: OneName, renewal: Annotated[Renewal, body(Renewal)], request: Request
+    ) -> NewCertificate:
         """For a host in its tunnel: a certificate for a new key, asked for by its present key."""
         try:
             proof = base64.b64decode(renewal.proof, validate=True)
         except binascii.Error as error:
             raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
-        order = HostRenewItself(name, renewal.request, proof, _peer(request))
-        body = await _ask(services, order)
-        return NewCertificate.model_validate({field: body[field] for field in NewCertificate.model_fields})
+        return await _ask(services, HostRenewItself(name, renewal.request, proof, _peer(request)))
 
     @router.post("/v1/hosts/{name}/renewed", operation_id="host_renewed", responses=_TUNNEL, status_code=204)
     async def renewed(name: OneName, request: Request) -> None:
@@ -113,14 +125,14 @@ def _add_renewal(router: APIRouter, services: Services) -> None:
     @router.get("/v1/revocations", operation_id="revocations", responses=_PEM, response_class=Response)
     async def revocations() -> Response:
         """The signed list of revoked certificates (CRL)."""
-        body = await _ask(services, RevocationsWanted())
-        return Response(body["revocations"], media_type="application/x-pem-file")
+        listed = await _ask(services, RevocationsWanted())
+        return Response(listed.revocations, media_type="application/x-pem-file")
 
     @router.get("/v1/authority", operation_id="authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
         """The certificate of the appliance's authority."""
-        body = await _ask(services, AuthorityWanted())
-        return Response(body["authority"], media_type="application/x-pem-file")
+        own = await _ask(services, AuthorityWanted())
+        return Response(own.authority, media_type="application/x-pem-file")
 
 
 class _Patience:
@@ -152,7 +164,7 @@ class _Patience:
         self._all.take(_ALL, now)
 
 
-async def _ask(services: Services, order: AdminRequest) -> dict[str, Any]:
+async def _ask(services: Services, order: AdminRequest[A]) -> A:
     answer = await services.control.ask(order, None, SLOW_SECONDS)
     if not answer.ok and answer.trouble == "forbidden":
         raise ProblemError(403, "not-recognised", answer.error)

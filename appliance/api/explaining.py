@@ -3,21 +3,22 @@
 import asyncio
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import Query
 
 from appliance.api.access import Bearer
 from appliance.api.judgement import explanation
 from appliance.api.policy_models import Explained, LostRule, Question, RuleText
 from appliance.api.roles import Viewer, ask
+from appliance.api.routing import Routes, body
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyWanted
 from appliance.policy.explain import Explanation
 from appliance.policy.model import Category, Rule
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1/policy", tags=["policy"])
+    router = Routes(prefix="/v1/policy", tags=["policy"])
 
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(services.control, PolicyWanted(), bearer)
@@ -47,7 +48,7 @@ def routes(services: Services) -> APIRouter:
         return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
 
     @router.post("/explain", operation_id="explain_under")
-    async def explain_under(question: Question, bearer: Viewer) -> Explained:
+    async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
         """The same under another text, which is not loaded."""
         return await explained(question, bearer)
 

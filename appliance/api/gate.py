@@ -25,8 +25,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from appliance.api.access import Bearer, Doorkeeper
-from appliance.api.bodies import is_dry
 from appliance.api.console import is_console
+from appliance.api.dry_runs import is_dry
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect
 from appliance.api.rates import Buckets

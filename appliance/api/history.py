@@ -8,13 +8,16 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+import msgspec
 
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel.admin import MetricsWanted
+from appliance.channel.answers.described import told
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.status import Status
 
 BUSY_SECONDS = 2.0
 IDLE_SECONDS = 10.0
@@ -25,25 +28,24 @@ _KINDS = ("verdict", "drop", "change", "fault")
 _AWAY = "RVMaster does not answer"
 
 
-class Sample(BaseModel):
+class Sample(msgspec.Struct, frozen=True, kw_only=True):
     """Counters at one moment, since RVMaster started; after its restart they begin anew."""
 
-    model_config = ConfigDict(extra="forbid")
-    time: float = Field(description="seconds since the epoch")
-    allowed: int = Field(description="decisions of the policy")
-    denied: int = Field(description="decisions of the policy, `would deny` included")
-    messages: int = Field(description="relayed")
-    bytes: int = Field(description="relayed")
-    dropped: int = Field(description="messages that slow subscribers did not get")
+    time: Annotated[float, told("seconds since the epoch")]
+    allowed: Annotated[int, told("decisions of the policy")]
+    denied: Annotated[int, told("decisions of the policy, `would deny` included")]
+    messages: Annotated[int, told("relayed")]
+    bytes: Annotated[int, told("relayed")]
+    dropped: Annotated[int, told("messages that slow subscribers did not get")]
     nodes: int
-    monitors: dict[str, list[int]] = Field(description="of each monitor: verdicts, drops, changes, faults")
+    monitors: Annotated[dict[str, list[int]], told("of each monitor: verdicts, drops, changes, faults")]
 
 
 class Seen(NamedTuple):
     """What control said last: its status, or why there is none."""
 
     number: int
-    status: dict[str, Any] | None
+    status: Status | None
     sample: Sample | None
     away: str | None
 
@@ -51,7 +53,7 @@ class Seen(NamedTuple):
 class History:
     """Takes the samples. `measures()` is control's answer to `MetricsWanted`."""
 
-    def __init__(self, measures: Callable[[], Awaitable[dict[str, Any]]]) -> None:
+    def __init__(self, measures: Callable[[], Awaitable[Measures]]) -> None:
         self._measures = measures
         self._samples: deque[Sample] = deque(maxlen=_MOST)
         self._followers = 0
@@ -106,7 +108,7 @@ class History:
         status, sample, away = None, None, None
         try:
             body = await self._measures()
-            status, sample = body["status"], sample_of(body, time.time())
+            status, sample = body.status, sample_of(body, time.time())
         except ControlAwayError as error:
             away = str(error)
         if sample is not None:
@@ -121,22 +123,22 @@ class History:
         self._samples.append(sample)
 
 
-async def measures_of(control: ControlLink) -> dict[str, Any]:
+async def measures_of(control: ControlLink) -> Measures:
     """Control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error)
-    return answer.body
+    return answer.given()
 
 
-def sample_of(body: Mapping[str, Any], now: float) -> Sample:
+def sample_of(body: Measures, now: float) -> Sample:
     """A sample out of control's answer to `MetricsWanted`."""
     decided = {"allow": 0, "deny": 0, "would deny": 0}
-    for _category, outcome, count in body["decisions"]:
+    for _category, outcome, count in body.decisions:
         decided[outcome] = decided.get(outcome, 0) + count
-    rows = list(body["relayed"].values())
+    rows = list(body.relayed.values())
     monitors: dict[str, list[int]] = {}
-    for kind, name, count in body["monitors"]:
+    for kind, name, count in body.monitors:
         if kind in _KINDS:
             monitors.setdefault(name, [0] * len(_KINDS))[_KINDS.index(kind)] = count
     return Sample(
@@ -146,6 +148,6 @@ def sample_of(body: Mapping[str, Any], now: float) -> Sample:
         messages=sum(row[0] for row in rows),
         bytes=sum(row[1] for row in rows),
         dropped=sum(row[2] for row in rows),
-        nodes=body["nodes"]["live"],
+        nodes=body.nodes["live"],
         monitors=monitors,
     )

@@ -4,11 +4,15 @@ Everything is a pure function of texts; it runs in a thread, and a stranger's lo
 `current` is control's answer to `PolicyWanted`, and a text of None the policy in force.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import msgspec
+
 from appliance.api.problems import Finding, ProblemError
+from appliance.channel.answers.graph import Registration
+from appliance.channel.answers.policy import PolicyKnown
 from appliance.policy import (
     Category,
     Difference,
@@ -38,28 +42,26 @@ class Judgement:
     ends: list[Ending]
 
 
-def judge_change(
-    text: str, current: Mapping[str, Any], registrations: Iterable[Mapping[str, Any]]
-) -> Judgement:
+def judge_change(text: str, current: PolicyKnown, registrations: Iterable[Registration]) -> Judgement:
     """Judge a new text beside the policy in force. Raises `ProblemError` with every finding when it is refused."""
-    known = Known.of(current)
-    before = compile_policy(current["text"], file=current["file"], hosts=known.hosts, robot=known.robot)
+    known = Known.of(msgspec.structs.asdict(current))
+    before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:
         policy = judge(text, "policy", known).accepted()
     except PolicyError as error:
         raise _refused(error) from error
-    live = [Live.of(row) for row in registrations]
+    live = [Live.of(msgspec.structs.asdict(row)) for row in registrations]
     changes = diff(before, policy, (request for thing in live for request in thing.requests()))
     return Judgement(_findings_of(policy.warnings), changes, endings(policy, live))
 
 
-def judge_text(text: str | None, current: Mapping[str, Any], *, cases: bool) -> Judged:
+def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:
     """A text, with the cases beside the policy file if they matter, whether it passes them or not.
 
     Raises `ProblemError` with every finding when the text or the cases cannot be understood.
     """
-    text, file = (current["text"], current["file"]) if text is None else (text, "policy")
-    known = Known.of(current)
+    text, file = (current.text, current.file) if text is None else (text, "policy")
+    known = Known.of(msgspec.structs.asdict(current))
     try:
         return judge(text, file, known if cases else Known(known.hosts, known.robot))
     except PolicyError as error:
@@ -67,7 +69,7 @@ def judge_text(text: str | None, current: Mapping[str, Any], *, cases: bool) -> 
 
 
 def explanation(
-    text: str | None, current: Mapping[str, Any], *, host: str, node: str, category: Category, resource: str
+    text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> Explanation:
     """Why a request is decided as it is. Raises `ProblemError` when the request makes no sense."""
     policy = judge_text(text, current, cases=False).policy

@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from appliance.ipsec.enrolment import Enrolment
+from appliance.channel.answers.hosts import KitParts
 from appliance.ipsec.kit import Kit, Rest
 from appliance.network.protect import parse_ports, parse_services, protection
 
@@ -32,36 +31,24 @@ class Wishes:
         return cls(kept["endpoint"], kept["ports"], tuple(filter(None, kept["open"].split(","))))
 
 
-def kit_of(body: Mapping[str, Any], wishes: Wishes, key: str | None) -> Kit:
+def kit_of(body: KitParts, wishes: Wishes, key: str | None) -> Kit:
     """The kit of a host that control has enrolled; `key` None: the host has it."""
     return Kit(
-        name=body["name"],
-        address=body["address"],
-        appliance=body["appliance"],
+        name=body.name,
+        address=body.address,
+        appliance=body.appliance,
         endpoint=wishes.endpoint,
-        master=body["master"],
-        certificate=body["certificate"],
-        authority=body["authority"],
+        master=body.master,
+        certificate=body.certificate,
+        authority=body.authority,
         key=key,
         protect=protection(
-            [body["appliance"]], parse_ports(wishes.ports), parse_services(wishes.opened), tunnelled=True
+            [body.appliance], parse_ports(wishes.ports), parse_services(wishes.opened), tunnelled=True
         ),
         rest=rest_of(body),
     )
 
 
-def enrolment_of(body: Mapping[str, Any], wishes: Wishes) -> Enrolment:
-    """How a host with a one-time token comes to its kit.
-
-    Raises `ValueError` when REST cannot be reached from other machines.
-    """
-    port, pin = body["rest_port"], body["pin"]
-    if port is None or not pin:
-        raise ValueError(body["rest_trouble"] or "REST is not there yet: try again in a second")
-    endpoint = f"[{wishes.endpoint}]" if ":" in wishes.endpoint else wishes.endpoint
-    return Enrolment(body["name"], f"https://{endpoint}:{port}", pin, body["authority_fingerprint"])
-
-
-def rest_of(body: Mapping[str, Any]) -> Rest | None:
+def rest_of(body: KitParts) -> Rest | None:
     """Where a host in its tunnel renews its certificate; None: it cannot."""
-    return Rest(body["rest_url"], body["pin"]) if body["rest_url"] and body["pin"] else None
+    return Rest(body.rest_url, body.pin) if body.rest_url and body.pin else None

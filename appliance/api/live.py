@@ -7,21 +7,23 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, ConfigDict
+import msgspec
+from fastapi import Query, Request, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from appliance.api.access import Bearer
-from appliance.api.alarms import open_alarms
+from appliance.api.alarms import Alarm, open_alarms
 from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, History, Sample, Seen
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
+from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of
 from appliance.channel.admin import GraphWanted
+from appliance.channel.answers.status import Status
 from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
@@ -35,7 +37,7 @@ _EVENT = {
     },
     "required": ["event", "data"],
 }
-_TEXT: dict[int | str, dict[str, Any]] = {
+_TEXT: Responses = {
     200: {
         "description": "Events `now`, `graph`, `away`, `end`.",
         "content": {"text/event-stream": {"schema": _EVENT}},
@@ -43,16 +45,21 @@ _TEXT: dict[int | str, dict[str, Any]] = {
 }
 
 
-class Hour(BaseModel):
+class Hour(msgspec.Struct, frozen=True):
     """The last hour's samples, the newest last."""
 
-    model_config = ConfigDict(extra="forbid")
     samples: list[Sample]
 
 
-def routes(services: Services, history: History) -> APIRouter:
+class _Now(msgspec.Struct, frozen=True):
+    status: Status
+    alarms: list[Alarm]
+    sample: Sample
+
+
+def routes(services: Services, history: History) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1", tags=["status"])
+    router = Routes(prefix="/v1", tags=["status"])
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
@@ -60,7 +67,7 @@ def routes(services: Services, history: History) -> APIRouter:
         points: Annotated[int, Query(ge=2, le=1800, description="at most so many samples")] = 360,
     ) -> Hour:
         """Decisions, relayed messages and what monitors did over the last hour, as counters."""
-        return Hour(samples=history.samples(points))
+        return Hour(history.samples(points))
 
     @router.get("/live", operation_id="live_state", responses=_TEXT)
     async def live(
@@ -108,15 +115,13 @@ async def _follow(
 def _told(seen: Seen) -> ServerSentEvent:
     if seen.status is None or seen.sample is None:
         return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
-    alarms = [one.model_dump() for one in open_alarms(seen.status)]
-    body = {"status": seen.status, "alarms": alarms, "sample": seen.sample.model_dump()}
-    return ServerSentEvent(event="now", data=json.dumps(body))
+    now = _Now(seen.status, open_alarms(seen.status), seen.sample)
+    return ServerSentEvent(event="now", data=msgspec.json.encode(now).decode())
 
 
 async def _graph(services: Services, bearer: Bearer) -> ServerSentEvent | None:
     try:
-        return ServerSentEvent(
-            event="graph", data=json.dumps(await ask(services.control, GraphWanted(), bearer))
-        )
+        graph = await ask(services.control, GraphWanted(), bearer)
+        return ServerSentEvent(event="graph", data=msgspec.json.encode(graph).decode())
     except (ProblemError, ControlAwayError):
         return None  # said by the next `away`

@@ -3,11 +3,10 @@
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.core import Metric as Family
@@ -16,14 +15,18 @@ from prometheus_client.utils import floatToGoString
 from starlette.responses import Response
 
 from appliance.api.roles import Viewer, ask
+from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
+from appliance.channel.answers.hosts import Host
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.status import ForwardingState, ProcessInfo
 from appliance.channel.serving import no_relay, probe_failed, process_names
 from appliance.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]
-_TEXT: dict[int | str, dict[str, Any]] = {
+_TEXT: Responses = {
     200: {
         "description": "Prometheus's text format",
         "content": {"text/plain": {"schema": {"type": "string"}}},
@@ -31,15 +34,14 @@ _TEXT: dict[int | str, dict[str, Any]] = {
 }
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The route, at the two places where it is looked for."""
-    router = APIRouter(tags=["metrics"])
+    router = Routes(tags=["metrics"])
 
     async def metrics(bearer: Viewer) -> Response:
         """What is measured, in Prometheus's text format; docs/metrics.md lists it."""
         body = await ask(services.control, MetricsWanted(), bearer)
-        body["rest"] = [(labels, count) for labels, count in services.journal.calls.items()]
-        return Response(rendered(body), media_type=CONTENT_TYPE_LATEST)
+        return Response(rendered(body, services.journal.calls), media_type=CONTENT_TYPE_LATEST)
 
     for prefix, name in (("", ""), ("/v1", "_v1")):
         router.add_api_route(
@@ -52,18 +54,18 @@ def routes(services: Services) -> APIRouter:
     return router
 
 
-def rendered(body: dict[str, Any]) -> bytes:
-    """Control's answer to `MetricsWanted` as Prometheus reads it."""
+def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
+    """Control's measures, and the calls of REST by method and status, as Prometheus reads them."""
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Once(body))
+    registry.register(_Once(body, calls))
     return generate_latest(registry)
 
 
 class _Once(Collector):
     """Gives the families of one answer."""
 
-    def __init__(self, body: dict[str, Any]) -> None:
-        self._samples = _samples(body)
+    def __init__(self, body: Measures, calls: Mapping[tuple[str, str], int]) -> None:
+        self._samples = {**_samples(body), "rosrv_rest_calls_total": calls.items()}
 
     def collect(self) -> Iterator[Family]:
         for metric in METRICS:
@@ -92,100 +94,99 @@ def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str
     return buckets
 
 
-def _samples(body: dict[str, Any]) -> dict[str, _Samples]:
-    status = body["status"]
-    policy, audit, monitors = status["policy"], status["audit"], status["monitors"]
-    relayed = body["relayed"]
+def _samples(body: Measures) -> dict[str, _Samples]:
+    status = body.status
+    policy, audit, monitors = status.policy, status.audit, status.monitors
+    relayed = body.relayed
     return {
-        "rosrv_info": [((status["version"],), 1)],
-        "rosrv_start_time_seconds": [((), status["since"])],
-        "rosrv_decisions_total": [((one[0], one[1]), one[2]) for one in body["decisions"]],
-        "rosrv_decision_seconds": [((), body["decision_seconds"])],
-        "rosrv_master_call_seconds": [((one[0],), (one[1], one[2])) for one in body["calls"]],
+        "rosrv_info": [((status.version,), 1)],
+        "rosrv_start_time_seconds": [((), status.since)],
+        "rosrv_decisions_total": [
+            ((category, outcome), count) for category, outcome, count in body.decisions
+        ],
+        "rosrv_decision_seconds": [((), body.decision_seconds)],
+        "rosrv_master_call_seconds": [((call,), observed) for call, observed in body.calls],
         "rosrv_probe_failed": [((), probe_failed(status))],
-        "rosrv_relay_connected": [((), no_relay(status["relay"]) is None)],
-        "rosrv_relay_connections": [((kind,), count) for kind, count in body["connections"].items()],
+        "rosrv_relay_connected": [((), no_relay(status.relay) is None)],
+        "rosrv_relay_connections": [((kind,), count) for kind, count in body.connections.items()],
         "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
         "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
         "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
-        "rosrv_relay_limited_total": [((name, part), count) for name, part, count in body["limited"]],
-        "rosrv_relay_memory_bytes": [((what,), size) for what, size in body["memory"].items()],
-        "rosrv_relay_delay_seconds": [
-            ((name,), (row[:-1], row[-1])) for name, row in body["delayed"].items()
-        ],
-        "rosrv_monitor_dropped_total": [((name,), row[0]) for name, row in body["drop_at"].items()],
-        "rosrv_monitor_changed_total": [((name,), row[0]) for name, row in body["change_at"].items()],
-        "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body["monitors"]],
+        "rosrv_relay_limited_total": [((name, part), count) for name, part, count in body.limited],
+        "rosrv_relay_memory_bytes": [((what,), size) for what, size in body.memory.items()],
+        "rosrv_relay_delay_seconds": [((name,), (row[:-1], row[-1])) for name, row in body.delayed.items()],
+        "rosrv_monitor_dropped_total": [((name,), count) for name, count in body.drop_at.items()],
+        "rosrv_monitor_changed_total": [((name,), count) for name, count in body.change_at.items()],
+        "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body.monitors],
         "rosrv_monitors": [
-            (("enabled",), monitors["enabled"]),
-            (("disabled",), monitors["loaded"] - monitors["enabled"]),
-            (("holding",), len(monitors["held"])),
-            (("failing",), len(monitors["failing"])),
+            (("enabled",), monitors.enabled),
+            (("disabled",), monitors.loaded - monitors.enabled),
+            (("holding",), len(monitors.held)),
+            (("failing",), len(monitors.failing)),
         ],
-        "rosrv_nodes": [((state,), count) for state, count in body["nodes"].items()],
-        "rosrv_registrations": [((kind,), count) for kind, count in body["registrations"].items()],
-        "rosrv_rosmaster_reachable": [((), status["rosmaster"] == "reachable")],
-        "rosrv_delivery_queue": [((), body["queued_deliveries"])],
-        **_tunnels(body["hosts"]),
-        "rosrv_ipsec_troubles": [((), len(status["ipsec"]["troubles"]))],
-        "rosrv_audit_queue": [((), audit["lag_records"])],
-        "rosrv_audit_lag_seconds": [((), audit["lag_seconds"])],
-        "rosrv_audit_failed": [((), audit["failed"] is not None)],
-        "rosrv_audit_degraded": [((), audit["degraded"] is not None)],
-        **_forwarding(audit["forwarding"]),
-        "rosrv_policy_revision": [((), policy["revision"])],
-        "rosrv_policy_differs_from_file": [((), policy["differs_from_file"])],
-        "rosrv_process_restarts_total": [
-            ((name,), one["restarts"]) for name, one in _named(status["processes"])
-        ],
-        "rosrv_process_resident_bytes": list(_memory(status["processes"])),
-        "rosrv_rest_calls_total": body["rest"],
+        "rosrv_nodes": [((state,), count) for state, count in body.nodes.items()],
+        "rosrv_registrations": [((kind,), count) for kind, count in body.registrations.items()],
+        "rosrv_rosmaster_reachable": [((), status.rosmaster == "reachable")],
+        "rosrv_delivery_queue": [((), body.queued_deliveries)],
+        **_tunnels(body.hosts),
+        "rosrv_ipsec_troubles": [((), len(status.ipsec.troubles))],
+        "rosrv_audit_queue": [((), audit.lag_records)],
+        "rosrv_audit_lag_seconds": [((), audit.lag_seconds)],
+        "rosrv_audit_failed": [((), audit.failed is not None)],
+        "rosrv_audit_degraded": [((), audit.degraded is not None)],
+        **_forwarding(audit.forwarding),
+        "rosrv_policy_revision": [((), policy.revision)],
+        "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
+        "rosrv_process_restarts_total": [((name,), one.restarts) for name, one in _named(status.processes)],
+        "rosrv_process_resident_bytes": list(_memory(status.processes)),
     }
 
 
-def _forwarding(forwarding: dict[str, Any] | None) -> dict[str, _Samples]:
+def _forwarding(forwarding: ForwardingState | None) -> dict[str, _Samples]:
     if forwarding is None:
         names = ("up", "sent_total", "lag_records", "lag_seconds", "missed_total")
         return {f"rosrv_syslog_{name}": [] for name in names}
     return {
-        "rosrv_syslog_up": [((), not forwarding["trouble"])],
-        "rosrv_syslog_sent_total": [((), forwarding["sent"])],
-        "rosrv_syslog_lag_records": [((), forwarding["behind"])],
-        "rosrv_syslog_lag_seconds": [((), forwarding["seconds"])],
-        "rosrv_syslog_missed_total": [((), forwarding["missed"])],
+        "rosrv_syslog_up": [((), not forwarding.trouble)],
+        "rosrv_syslog_sent_total": [((), forwarding.sent)],
+        "rosrv_syslog_lag_records": [((), forwarding.behind)],
+        "rosrv_syslog_lag_seconds": [((), forwarding.seconds)],
+        "rosrv_syslog_missed_total": [((), forwarding.missed)],
     }
 
 
 _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 
-def _tunnels(hosts: list[dict[str, Any]]) -> dict[str, _Samples]:
+def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
     """Of the hosts that may come; a revoked one is only counted."""
-    enrolled = [one for one in hosts if one["serial"] is not None and one["revoked"] is None]
+    enrolled = [one for one in hosts if one.serial is not None and one.revoked is None]
     now = time.time()
     return {
-        "rosrv_tunnel_up": [((one["name"],), one["remote"] is not None) for one in enrolled],
-        "rosrv_tunnel_age_seconds": [((one["name"],), one["seconds"] or 0) for one in enrolled],
+        "rosrv_tunnel_up": [((one.name,), one.remote is not None) for one in enrolled],
+        "rosrv_tunnel_age_seconds": [((one.name,), one.seconds or 0) for one in enrolled],
         "rosrv_tunnel_bytes": [
-            ((one["name"], direction), one[f"bytes_{direction}"] or 0)
+            ((one.name, direction), count or 0)
             for one in enrolled
-            for direction in ("in", "out")
+            for direction, count in (("in", one.bytes_in), ("out", one.bytes_out))
         ],
-        "rosrv_host_certificate_expiry_seconds": [((one["name"],), one["expires"] - now) for one in enrolled],
-        "rosrv_host_ports_open": [((one["name"],), _PORTS[one["ports"]["state"]]) for one in enrolled],
-        "rosrv_hosts": [((state,), count) for state, count in Counter(one["state"] for one in hosts).items()],
+        "rosrv_host_certificate_expiry_seconds": [
+            ((one.name,), one.expires - now) for one in enrolled if one.expires is not None
+        ],
+        "rosrv_host_ports_open": [((one.name,), _PORTS[one.ports.state]) for one in enrolled],
+        "rosrv_hosts": [((state,), count) for state, count in Counter(one.state for one in hosts).items()],
     }
 
 
-def _named(processes: Sequence[dict[str, Any]]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
     """A series of each: two of one role would be one series twice."""
     return zip(process_names(processes), processes, strict=True)
 
 
-def _memory(processes: Sequence[dict[str, Any]]) -> Iterator[tuple[tuple[str, ...], float]]:
+def _memory(processes: Sequence[ProcessInfo]) -> Iterator[tuple[tuple[str, ...], float]]:
     for name, one in _named(processes):
         try:
-            pages = Path(f"/proc/{one['pid']}/statm").read_text().split()[1]
+            pages = Path(f"/proc/{one.pid}/statm").read_text().split()[1]
         except OSError:
             continue  # it ended just now
         yield (name,), float(int(pages) * _PAGE_BYTES)

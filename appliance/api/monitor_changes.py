@@ -5,30 +5,26 @@ Loading and removing is for admins, switching and going back to the folder for o
 """
 
 import asyncio
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query
+from msgspec.structs import asdict
+from pydantic import StringConstraints
 
 from appliance.api.access import Bearer, Role
-from appliance.api.bodies import WRONG_TYPE, DryRun, read_body, text_or
 from appliance.api.control import ControlLink
-from appliance.api.monitor_judgement import Draft, findings_of, judge, refusal
-from appliance.api.monitor_models import (
-    Name,
-    NewSpecifications,
-    NewText,
-    Replaced,
-    Switch,
-    Switched,
-    SwitchMany,
-)
-from appliance.api.monitors import TAGGED, UNKNOWN, OneName
+from appliance.api.dry_runs import DryRun
+from appliance.api.monitor_judgement import findings_of, judge, refusal
+from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
+from appliance.api.monitors import UNKNOWN, OneName
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, answered, ask
+from appliance.api.routing import ETAG, Responses, Routes, Tagged, body
 from appliance.api.services import Services
 from appliance.channel.admin import (
-    MonitorChange,
+    A,
+    AdminRequest,
     MonitorLoad,
     MonitorReload,
     MonitorRemove,
@@ -37,183 +33,172 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
+from appliance.channel.answers import monitors as answers
+from appliance.channel.answers.monitors import Switched
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
-_CHANGES: dict[int | str, dict[str, Any]] = {
-    **TAGGED,
+_CHANGES: Responses = {
     412: {
         "description": "The monitors were changed, switched or resumed since they had the ETag of If-Match.",
-        "headers": TAGGED[200]["headers"],
+        "headers": ETAG,
     },
     428: {"description": "If-Match is missing."},
 }
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1/monitors", tags=["monitors"])
-    changing = _Changing(services)
-    _add_texts(router, changing)
-    _add_switches(router, changing)
+    router = Routes(prefix="/v1/monitors", tags=["monitors"])
+    _add_texts(router, services)
+    _add_switches(router, services.control)
     return router
 
 
-def _add_texts(router: APIRouter, changing: "_Changing") -> None:
+def _add_texts(router: Routes, services: Services) -> None:
+    control = services.control
+
     @router.post("", operation_id="load_monitors", responses=_CHANGES)
     async def load_monitors(
-        new: NewSpecifications,
+        new: Annotated[NewSpecifications, body(NewSpecifications)],
         bearer: Operator,
-        response: Response,
         if_match: IfMatch = None,
         dry_run: DryRun = False,
-    ) -> Replaced:
+    ) -> Tagged[Replaced]:
         """Compile and load specifications; those in files of the same name are replaced, in one swap. For admins.
 
         A text with an error changes nothing: the answer (422) has every finding with its line and column.
         """
         _may_load(bearer, dry_run=dry_run)
         order = MonitorLoad(new.files, new.definitions, new.note, _expected(if_match, dry_run=dry_run))
-        return await changing.load(order, bearer, response, dry_run=dry_run)
+        return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
-    @router.put(
-        "/{name}",
-        operation_id="replace_monitor",
-        responses=_CHANGES | UNKNOWN | WRONG_TYPE,
-        openapi_extra=text_or(NewText),
-    )
+    @router.put("/{name}", operation_id="replace_monitor", responses=_CHANGES | UNKNOWN)
     async def replace_monitor(
         *,
         name: OneName,
-        request: Request,
+        new: Annotated[NewText, body(NewText, text="the specification")],
         bearer: Operator,
-        response: Response,
         if_match: IfMatch = None,
         dry_run: DryRun = False,
-    ) -> Replaced:
+    ) -> Tagged[Replaced]:
         """Load a new text in the place of the file that this monitor stands in (or of the file of this name).
 
         For admins; a dry run for operators, too.
         """
         _may_load(bearer, dry_run=dry_run)
-        content_type = request.headers.get("content-type", "")
-        new = read_body(content_type, await request.body(), NewText, "the specification")
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
-            replacing = MonitorReplace(name, new.text, new.definitions, new.note, expected)
-            return await changing.replace(replacing, bearer, response)
-        file = await changing.file_of(name, bearer)
-        order = MonitorLoad({file: new.text}, new.definitions, new.note, expected)
-        return await changing.load(order, bearer, response, dry_run=True)
+            order = MonitorReplace(name, new.text, new.definitions, new.note, expected)
+            return await _replaced(control, order, bearer)
+        file = await _file_of(control, name, bearer)
+        tried = MonitorLoad({file: new.text}, new.definitions, new.note, expected)
+        return await _tried(services, tried, bearer)
 
     @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
     async def reload_monitors(
-        bearer: Operator, response: Response, if_match: IfMatch = None, prune: Prune = False
-    ) -> Replaced:
+        bearer: Operator, if_match: IfMatch = None, prune: Prune = False
+    ) -> Tagged[Replaced]:
         """Take what the folder has now; what was loaded from elsewhere stays, unless an admin says `prune`."""
         if prune and bearer.role < Role.ADMIN:
             raise ProblemError(
                 403, "not-for-this-role", "removing what was loaded from elsewhere is for admins"
             )
-        return await changing.replace(MonitorReload(_expected(if_match), prune), bearer, response)
+        return await _replaced(control, MonitorReload(_expected(if_match), prune), bearer)
 
     @router.delete("/{name}", operation_id="remove_monitor", responses=_CHANGES | UNKNOWN)
-    async def remove_monitor(
-        name: OneName, bearer: Admin, response: Response, if_match: IfMatch = None
-    ) -> Replaced:
+    async def remove_monitor(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[Replaced]:
         """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
-        return await changing.replace(MonitorRemove([name], _expected(if_match)), bearer, response)
+        return await _replaced(control, MonitorRemove([name], _expected(if_match)), bearer)
 
     @router.delete("", operation_id="remove_monitors", responses=_CHANGES | UNKNOWN)
     async def remove_monitors(
-        name: Annotated[list[Name], Query(min_length=1, max_length=1000)],
+        name: Annotated[
+            list[Annotated[str, StringConstraints(min_length=1, max_length=256)]],
+            Query(min_length=1, max_length=1000),
+        ],
         bearer: Admin,
-        response: Response,
         if_match: IfMatch = None,
-    ) -> Replaced:
+    ) -> Tagged[Replaced]:
         """The same for several at once."""
-        return await changing.replace(MonitorRemove(name, _expected(if_match)), bearer, response)
+        return await _replaced(control, MonitorRemove(name, _expected(if_match)), bearer)
 
 
-def _add_switches(router: APIRouter, changing: "_Changing") -> None:
+def _add_switches(router: Routes, control: ControlLink) -> None:
     @router.patch("/{name}", operation_id="switch_monitor", responses=_CHANGES | UNKNOWN)
     async def switch_monitor(
-        name: OneName, to: Switch, bearer: Operator, response: Response, if_match: IfMatch = None
-    ) -> Switched:
+        name: OneName, to: Annotated[Switch, body(Switch)], bearer: Operator, if_match: IfMatch = None
+    ) -> Tagged[Switched]:
         """Enable or disable a monitor, or let the topics that it holds go on (`{"held": false}`)."""
-        return await changing.switch([name], to, _expected(if_match), bearer, response)
+        return await _switched(control, [name], to, _expected(if_match), bearer)
 
     @router.patch("", operation_id="switch_monitors", responses=_CHANGES | UNKNOWN)
     async def switch_monitors(
-        to: SwitchMany, bearer: Operator, response: Response, if_match: IfMatch = None
-    ) -> Switched:
+        to: Annotated[SwitchMany, body(SwitchMany)], bearer: Operator, if_match: IfMatch = None
+    ) -> Tagged[Switched]:
         """The same for several at once."""
-        return await changing.switch(to.names, to, _expected(if_match), bearer, response)
+        return await _switched(control, to.names, to, _expected(if_match), bearer)
 
 
-class _Changing:
-    """What the routes of changes have in common."""
-
-    def __init__(self, services: Services) -> None:
-        self._services = services
-        self._control = services.control
-
-    async def load(
-        self, order: MonitorLoad, bearer: Bearer, response: Response, *, dry_run: bool
-    ) -> Replaced:
-        if not dry_run:
-            return await self.replace(order, bearer, response)
-        body = await ask(self._control, MonitorsWanted(texts=True), bearer)
-        if order.expected not in (None, body["tag"]):
-            text = f"the monitors are at {body['tag']}, not at {order.expected}: look at them first"
-            raise _stale(text, body["tag"])
-        async with self._services.judging:
-            draft = await asyncio.to_thread(judge, body, order.files, order.definitions, body["revision"])
-        response.headers["ETag"] = etag(body["tag"])
-        return _would(draft, body["revision"], body["tag"])
-
-    async def replace(self, order: MonitorChange, bearer: Bearer, response: Response) -> Replaced:
-        body = await _order(self._control, order, bearer)
-        response.headers["ETag"] = etag(body["tag"])
-        rows = (await ask(self._control, MonitorsWanted(), bearer))["monitors"]
-        return Replaced.model_validate(
-            body
-            | {
-                "loaded": True,
-                "warnings": findings_of(body["warnings"]),
-                "monitors": [row["name"] for row in rows],
-            }
-        )
-
-    async def switch(
-        self, names: list[str], to: Switch, expected: str | None, bearer: Bearer, response: Response
-    ) -> Switched:
-        order: MonitorChange = MonitorResume(names, expected)
-        if to.enabled is not None:
-            order = MonitorSwitch(names, to.enabled, expected)
-        body = await _order(self._control, order, bearer)
-        response.headers["ETag"] = etag(body["tag"])
-        return Switched(revision=body["revision"], tag=body["tag"], names=body["names"])
-
-    async def file_of(self, name: str, bearer: Bearer) -> str:
-        """The file that a monitor stands in. Raises `ProblemError` (404)."""
-        body = await ask(self._control, MonitorsWanted(texts=True), bearer)
-        files = {row["name"]: row["file"] for row in body["monitors"]}
-        if name in body["files"]:
-            return name
-        if name not in files:
-            known = ", ".join(files) or "none is loaded"
-            raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
-        return str(files[name])
+async def _tried(services: Services, order: MonitorLoad, bearer: Bearer) -> Tagged[Replaced]:
+    """A dry run."""
+    loaded = await ask(services.control, MonitorsWanted(texts=True), bearer)
+    if order.expected not in (None, loaded.tag):
+        text = f"the monitors are at {loaded.tag}, not at {order.expected}: look at them first"
+        raise _stale(text, loaded.tag)
+    async with services.judging:
+        draft = await asyncio.to_thread(judge, loaded, order.files, order.definitions)
+    would = Replaced(
+        loaded=False,
+        revision=loaded.revision,
+        tag=loaded.tag,
+        added=draft.added,
+        changed=draft.changed,
+        removed=draft.removed,
+        warnings=draft.warnings,
+        monitors=draft.monitors,
+    )
+    return Tagged(would, loaded.tag)
 
 
-async def _order(control: ControlLink, order: MonitorChange, bearer: Bearer) -> dict[str, Any]:
-    answer = await control.ask(order, bearer, _COMPILE_SECONDS)
-    if not answer.ok and answer.trouble == "refused":
-        raise refusal(answer.error, answer.findings)
-    if not answer.ok and answer.trouble == "conflict":
-        raise _stale(answer.error, answer.body["tag"])
-    return answered(answer)
+async def _replaced(
+    control: ControlLink, order: AdminRequest[answers.Replaced], bearer: Bearer
+) -> Tagged[Replaced]:
+    done = await _ordered(control, order, bearer)
+    rows = (await ask(control, MonitorsWanted(), bearer)).monitors
+    fields = asdict(done) | {"warnings": findings_of(done.warnings)}
+    return Tagged(Replaced(**fields, loaded=True, monitors=[row.name for row in rows]), done.tag)
+
+
+async def _switched(
+    control: ControlLink, names: list[str], to: Switch, expected: str | None, bearer: Bearer
+) -> Tagged[Switched]:
+    order: AdminRequest[Switched] = MonitorResume(names, expected)
+    if to.enabled is not None:
+        order = MonitorSwitch(names, to.enabled, expected)
+    done = await _ordered(control, order, bearer)
+    return Tagged(done, done.tag)
+
+
+async def _file_of(control: ControlLink, name: str, bearer: Bearer) -> str:
+    """The file that a monitor stands in. Raises `ProblemError` (404)."""
+    loaded = await ask(control, MonitorsWanted(texts=True), bearer)
+    files = {row.name: row.file for row in loaded.monitors}
+    if name in (loaded.files or {}):
+        return name
+    if name not in files:
+        known = ", ".join(files) or "none is loaded"
+        raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+    return files[name]
+
+
+async def _ordered(control: ControlLink, order: AdminRequest[A], bearer: Bearer) -> A:
+    done = await control.ask(order, bearer, _COMPILE_SECONDS)
+    if not done.ok and done.trouble == "refused":
+        raise refusal(done.error, done.findings)
+    if not done.ok and done.trouble == "conflict":
+        raise _stale(done.error, done.tag)
+    return answered(done)
 
 
 def _stale(text: str, tag: str) -> ProblemError:
@@ -232,17 +217,3 @@ def _expected(if_match: str | None, *, dry_run: bool = False) -> str | None:
     if dry_run and if_match is None:
         return None
     return expected_tag(if_match, "monitors", "/v1/monitors")
-
-
-def _would(draft: Draft, revision: int, tag: str) -> Replaced:
-    return Replaced(
-        loaded=False,
-        revision=revision,
-        tag=tag,
-        replaced=None,
-        added=draft.added,
-        changed=draft.changed,
-        removed=draft.removed,
-        warnings=draft.warnings,
-        monitors=draft.monitors,
-    )

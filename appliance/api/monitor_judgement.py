@@ -7,12 +7,12 @@ api that nobody asks about monitors starts without it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from appliance.api.monitor_models import EventShown, PropertyShown
 from appliance.api.problems import Finding, ProblemError
+from appliance.channel.answers.monitors import Monitors
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
@@ -32,19 +32,17 @@ class Draft:
     monitors: list[str]
 
 
-def judge(
-    before: Mapping[str, dict[str, str]], files: dict[str, str], definitions: dict[str, str], revision: int
-) -> Draft:
+def judge(before: Monitors, files: dict[str, str], definitions: dict[str, str]) -> Draft:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
     from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  as said above
 
-    present = Sources(before["files"], before["definitions"])
+    present = Sources(before.files or {}, before.definitions or {})
     following = present.with_files(files, definitions)
     try:
         checked = check(following)
     except SpecificationsRefusedError as error:
         raise refusal(
-            f"refused; revision {revision} of the specifications stays in force", error.findings
+            f"refused; revision {before.revision} of the specifications stays in force", error.findings
         ) from error
     added, changed, removed = following.difference(present)
     return Draft(added, changed, removed, findings_of(list(checked.warnings)), list(checked.monitors))
@@ -76,12 +74,10 @@ class Compiler:
     def __init__(self) -> None:
         self._last: tuple[int, MonitorSet] | None = None
 
-    def monitor(
-        self, revision: int, files: dict[str, str], definitions: dict[str, str], name: str
-    ) -> Monitor:
-        """A monitor of the specifications with this revision. Raises KeyError."""
-        if self._last is None or self._last[0] != revision:
-            self._last = (revision, _compiled(files, definitions))
+    def monitor(self, loaded: Monitors, name: str) -> Monitor:
+        """A monitor of what is loaded, with texts. Raises KeyError."""
+        if self._last is None or self._last[0] != loaded.revision:
+            self._last = (loaded.revision, _compiled(loaded.files or {}, loaded.definitions or {}))
         return self._last[1].monitor(name)
 
     def warnings(self, file: str) -> list[Finding]:

@@ -3,33 +3,25 @@
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import Path, Query, Response
+from msgspec.structs import asdict
 
 from appliance.api.access import Bearer
 from appliance.api.audit import Desk
 from appliance.api.monitor_judgement import Compiler, events_of, picture_of, properties_of
-from appliance.api.monitor_models import Happened, History, Monitor, Monitors
-from appliance.api.preconditions import etag
+from appliance.api.monitor_models import Happened, History, Monitor
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
+from appliance.api.routing import Responses, Routes, Tagged
 from appliance.api.services import Services
 from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
 from appliance.audit.search import Page, search
 from appliance.channel.admin import MonitorsWanted
+from appliance.channel.answers.monitors import Monitors, MonitorState
 
-TAGGED: dict[int | str, dict[str, Any]] = {
-    200: {
-        "headers": {
-            "ETag": {
-                "description": "of the specifications in force and the switches of their monitors",
-                "schema": {"type": "string"},
-            }
-        }
-    }
-}
-UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"description": "There is no such monitor."}}
-_PICTURE: dict[int | str, dict[str, Any]] = {
+UNKNOWN: Responses = {404: {"description": "There is no such monitor."}}
+_PICTURE: Responses = {
     200: {"description": "OK", "content": {"image/svg+xml": {"schema": {"type": "string"}}}}
 }
 OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor")]
@@ -43,68 +35,62 @@ class _Looking:
         self._compiler = Compiler()
         self.desk = Desk(services)
 
-    async def state(self, bearer: Bearer, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
         """What is in force, with texts, and the row of a monitor. Raises `ProblemError` (404)."""
-        body = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
-        row = next((one for one in body["monitors"] if one["name"] == name), None)
+        loaded = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
+        row = next((one for one in loaded.monitors if one.name == name), None)
         if row is None:
-            known = ", ".join(one["name"] for one in body["monitors"]) or "none is loaded"
+            known = ", ".join(one.name for one in loaded.monitors) or "none is loaded"
             raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
-        return body, row
+        return loaded, row
 
-    async def compiled(self, body: dict[str, Any], name: str) -> Any:
+    async def compiled(self, loaded: Monitors, name: str) -> Any:
         """A monitor, compiled here."""
         async with self._services.judging:
-            return await asyncio.to_thread(
-                self._compiler.monitor, body["revision"], body["files"], body["definitions"], name
-            )
+            return await asyncio.to_thread(self._compiler.monitor, loaded, name)
 
     def warnings(self, file: str) -> Any:
         """The lint of a file of what was compiled last."""
         return self._compiler.warnings(file)
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1/monitors", tags=["monitors"])
+    router = Routes(prefix="/v1/monitors", tags=["monitors"])
     looking = _Looking(services)
 
-    @router.get("", operation_id="monitors", responses=TAGGED)
+    @router.get("", operation_id="monitors")
     async def monitors(
         bearer: Viewer,
-        response: Response,
         texts: Annotated[bool, Query(description="with the texts of the specifications")] = False,
-    ) -> Monitors:
+    ) -> Tagged[Monitors]:
         """All monitors with state and counters, and whether they are what the folder has."""
-        body = await ask(services.control, MonitorsWanted(texts=texts), bearer)
-        response.headers["ETag"] = etag(body["tag"])
-        return Monitors.model_validate(body)
+        loaded = await ask(services.control, MonitorsWanted(texts=texts), bearer)
+        return Tagged(loaded, loaded.tag)
 
-    @router.get("/{name}", operation_id="monitor", responses=TAGGED | UNKNOWN)
-    async def monitor(name: OneName, bearer: Viewer, response: Response) -> Monitor:
+    @router.get("/{name}", operation_id="monitor", responses=UNKNOWN)
+    async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
         """One monitor: state, counters, the text of its file, its events and properties."""
-        body, row = await looking.state(bearer, name)
-        found = await looking.compiled(body, name)
-        response.headers["ETag"] = etag(body["tag"])
-        return Monitor.model_validate(
-            row
-            | {
-                "revision": body["revision"],
-                "tag": body["tag"],
-                "text": body["files"][row["file"]],
-                "alphabet": events_of(found),
-                "properties": properties_of(found),
-                "warnings": looking.warnings(row["file"]),
-                "uses": sorted(found.code.uses),
-                "hold": found.code.hold,
-            }
+        loaded, state = await looking.state(bearer, name)
+        found = await looking.compiled(loaded, name)
+        shown = Monitor(
+            **asdict(state),
+            revision=loaded.revision,
+            tag=loaded.tag,
+            text=(loaded.files or {})[state.file],
+            alphabet=events_of(found),
+            properties=properties_of(found),
+            warnings=looking.warnings(state.file),
+            uses=sorted(found.code.uses),
+            hold=found.code.hold,
         )
+        return Tagged(shown, loaded.tag)
 
     @router.get("/{name}/picture", operation_id="monitor_picture", responses=_PICTURE | UNKNOWN)
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
         """The automata of its properties (SVG); 404 when it has none that is finite."""
-        body, _row = await looking.state(bearer, name)
-        drawn = await asyncio.to_thread(picture_of, await looking.compiled(body, name))
+        loaded, _state = await looking.state(bearer, name)
+        drawn = await asyncio.to_thread(picture_of, await looking.compiled(loaded, name))
         if drawn is None:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")
@@ -122,7 +108,7 @@ def routes(services: Services) -> APIRouter:
         wanted = Filter(category="monitor", text=name)
         page: Page = await looking.desk.read(search, looking.desk.path, wanted, cursor, limit)
         happened = [_happened(one) for one in page.entries if _of(one, name)]
-        return History(name=name, happened=happened, cursor=page.cursor)
+        return History(name, happened, page.cursor)
 
     return router
 

@@ -1,119 +1,67 @@
-"""What `/v1/policy` takes and gives."""
+"""What `/v1/policy` takes and gives besides what RVMaster answers."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import msgspec
 
 from appliance.api.problems import Finding
+from appliance.channel.answers.described import told
 from appliance.policy.model import Category
 
 LONGEST_REVISION = 10**15
+Decided = Literal["allow", "deny", "would deny"]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 
 
-class Model(BaseModel):
-    """What all have in common: nothing that is not named here is taken or given."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-class Revision(Model):
-    """A policy that came into force; `loaded` is seconds since the epoch."""
-
-    revision: int
-    file: str
-    loaded: float
-    who: str
-    note: str
-    in_force: bool
-
-
-class Revisions(Model):
-    """The kept revisions, the newest first."""
-
-    revisions: list[Revision]
-
-
-class RevisionText(Revision):
-    """A kept revision with its text."""
-
-    text: str
-
-
-class PolicyInForce(RevisionText):
-    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
-
-    policy_file: str = Field(description="what `reload` reads")
-    differs_from_file: bool
-    warnings: list[str]
-    confirm_by: float | None
-
-
-class PolicyText(Model):
+class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A new policy."""
 
-    text: str = Field(min_length=1, max_length=1 << 20)
-    note: str = Field(default="", max_length=200, description="kept with the revision: why")
+    text: Text
+    note: Annotated[str, told("kept with the revision: why", max_length=200)] = ""
 
 
-class Change(Model):
+class Change(msgspec.Struct, frozen=True):
     """Something that is registered now and would be decided differently."""
 
     host: str
     caller_id: str
     category: str
     resource: str
-    now: Literal["allow", "deny", "would deny"]
-    then: Literal["allow", "deny", "would deny"]
-    reason: str = Field(description="of the new policy")
+    now: Decided
+    then: Decided
+    reason: Annotated[str, told("of the new policy")]
 
 
-class Ended(Model):
+class Ended(msgspec.Struct, frozen=True):
     """Something live that the policy ends."""
 
     host: str
-    caller_id: str = Field(description="empty: a client that gave no name")
+    caller_id: Annotated[str, told("empty: a client that gave no name")]
     what: Literal["publication", "subscription", "service", "call", "parameter"]
     resource: str
     reason: str
 
 
-class Report(Model):
+class Report(msgspec.Struct, frozen=True, kw_only=True):
     """What a new policy does; `loaded` is false after a dry run, and what only a load can tell is then null."""
 
     loaded: bool
-    revision: int = Field(description="in force now")
-    replaced: int | None
-    revoked: int | None = Field(description="registrations and connections that were taken back")
-    confirm_by: float | None
+    revision: Annotated[int, told("in force now")]
+    replaced: int | None = None
+    revoked: Annotated[int | None, told("registrations and connections that were taken back")] = None
+    confirm_by: float | None = None
     warnings: list[Finding]
     changes: list[Change]
-    ends: list[Ended] = Field(description="what is live and ends by it")
+    ends: Annotated[list[Ended], told("what is live and ends by it")]
 
 
-class Loaded(Model):
-    """A policy came into force."""
-
-    revision: int
-    replaced: int
-    warnings: list[str]
-    revoked: int
-    confirm_by: float | None
-
-
-class Rollback(Model):
+class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where to go back to; null: the revision before the present one."""
 
-    revision: int | None = Field(default=None, ge=1, le=LONGEST_REVISION, strict=True)
+    revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
 
 
-class Confirmed(Model):
-    """Whether there was something to confirm."""
-
-    confirmed: bool
-    revision: int
-
-
-class RuleText(Model):
+class RuleText(msgspec.Struct, frozen=True):
     """Where a rule stands."""
 
     section: str
@@ -122,7 +70,7 @@ class RuleText(Model):
     line: int
 
 
-class LostRule(Model):
+class LostRule(msgspec.Struct, frozen=True):
     """A rule that speaks of the resource and does not decide."""
 
     rule: RuleText
@@ -130,32 +78,32 @@ class LostRule(Model):
     why: str
 
 
-class Explained(Model):
+class Explained(msgspec.Struct, frozen=True, kw_only=True):
     """Why a request is decided as it is; `node` is the right to the node's name, where that is needed too."""
 
     host: str
     caller_id: str
     category: str
     resource: str
-    decision: Literal["allow", "deny", "would deny"]
+    decision: Decided
     rule: RuleText | None
     reason: str
-    told: str | None = Field(description="what the host is told of a denial ([Options] tell); null: allowed")
-    through: list[str] = Field(description="the words of the rule that mean the host")
-    limit: str = Field(
-        description="how much of what is allowed may pass, and by which line of [Limits]; or empty"
-    )
+    told: Annotated[str | None, told("what the host is told of a denial ([Options] tell); null: allowed")]
+    through: Annotated[list[str], told("the words of the rule that mean the host")]
+    limit: Annotated[
+        str, told("how much of what is allowed may pass, and by which line of [Limits]; or empty")
+    ]
     lost: list[LostRule]
-    node: "Explained | None" = Field(description="the name that it gives, where a node is needed")
-    command: "Explained | None" = Field(description="the command `lookupService`, for a call of a service")
-    allowed: bool = Field(description="the answer to the whole call")
+    node: Annotated["Explained | None", told("the name that it gives, where a node is needed")]
+    command: Annotated["Explained | None", told("the command `lookupService`, for a call of a service")]
+    allowed: Annotated[bool, told("the answer to the whole call")]
 
 
-class Question(Model):
+class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A request to explain; `text`: under this policy instead of the one in force."""
 
-    host: str = Field(min_length=1, max_length=100, description="an address, or `robot`")
-    node: str = Field(default="", max_length=256)
+    host: Annotated[str, told("an address, or `robot`", min_length=1, max_length=100)]
+    node: Annotated[str, msgspec.Meta(max_length=256)] = ""
     category: Category
-    resource: str = Field(min_length=1, max_length=256)
-    text: str | None = Field(default=None, max_length=1 << 20)
+    resource: Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
+    text: Annotated[str, msgspec.Meta(max_length=1 << 20)] | None = None

@@ -3,28 +3,28 @@
 import asyncio
 from typing import Annotated, Literal
 
-from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+import msgspec
 
 from appliance.api.judgement import judge_text
+from appliance.api.policy_models import Decided, Text
 from appliance.api.roles import Viewer, ask
+from appliance.api.routing import Routes, body
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.described import told
 
 _MOST_SHOWN = 1000
 
 
-class Draft(BaseModel):
+class Draft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The text to run them on; null: the policy in force."""
 
-    model_config = ConfigDict(extra="forbid")
-    text: Annotated[str, StringConstraints(min_length=1, max_length=1 << 20)] | None = None
+    text: Text | None = None
 
 
-class Case(BaseModel):
+class Case(msgspec.Struct, frozen=True, kw_only=True):
     """One case: what it expects, and what is decided; `line` and `column` are its place in `file`."""
 
-    model_config = ConfigDict(extra="forbid")
     file: str
     line: int
     column: int
@@ -33,28 +33,27 @@ class Case(BaseModel):
     category: str
     resource: str
     expected: Literal["allow", "deny"]
-    decision: Literal["allow", "deny", "would deny"]
+    decision: Decided
     reason: str
     passed: bool
 
 
-class Tested(BaseModel):
+class Tested(msgspec.Struct, frozen=True, kw_only=True):
     """The cases of the policy's tests, at most a thousand of them; none when the file does not exist."""
 
-    model_config = ConfigDict(extra="forbid")
     file: str
     exists: bool
     passed: int
     failed: int
-    cases: list[Case] = Field(description="those that failed first")
+    cases: Annotated[list[Case], told("those that failed first")]
 
 
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The route."""
-    router = APIRouter(prefix="/v1/policy", tags=["policy"])
+    router = Routes(prefix="/v1/policy", tags=["policy"])
 
     @router.post("/test", operation_id="test_policy")
-    async def test_policy(draft: Draft, bearer: Viewer) -> Tested:
+    async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
         """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
         current = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging:
@@ -74,8 +73,8 @@ def routes(services: Services) -> APIRouter:
         ]
         passed = sum(one.passed for one in cases)
         return Tested(
-            file=current["cases_file"],
-            exists=current["cases"] is not None,
+            file=current.cases_file,
+            exists=current.cases is not None,
             passed=passed,
             failed=len(cases) - passed,
             cases=sorted(cases, key=lambda one: one.passed)[:_MOST_SHOWN],

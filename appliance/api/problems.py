@@ -1,22 +1,22 @@
 """What goes wrong, as clients see it: problem details (RFC 9457), one form for every error."""
 
 import http
-import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+import msgspec
 from starlette.responses import Response
+
+from appliance.channel.answers.described import told
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope that has why it was answered as it was
 _MOST_FINDINGS = 200
 
 
-class Finding(BaseModel):
+class Finding(msgspec.Struct, frozen=True):
     """One thing wrong with a text that was sent; `line` and `column` count from 1."""
 
-    model_config = ConfigDict(extra="forbid")
     file: str
     line: int
     column: int
@@ -24,22 +24,20 @@ class Finding(BaseModel):
     text: str
 
 
-class BadInput(BaseModel):
+class BadInput(msgspec.Struct, frozen=True):
     """One part of a request that makes no sense."""
 
-    model_config = ConfigDict(extra="forbid")
-    where: str = Field(description="for example `query.limit` or `body.revision`")
+    where: Annotated[str, told("for example `query.limit` or `body.revision`")]
     text: str
 
 
-class Problem(BaseModel):
+class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
     """Problem details; `line` and `column` are those of the first finding."""
 
-    model_config = ConfigDict(extra="forbid")
-    type: str = Field(description="stable name of the kind of problem: urn:rosrv:problem:…")
+    type: Annotated[str, told("stable name of the kind of problem: urn:rosrv:problem:…")]
     title: str
     status: int
-    detail: str = Field(description="what happened and what to do, for a person")
+    detail: Annotated[str, told("what happened and what to do, for a person")]
     line: int | None = None
     column: int | None = None
     findings: list[Finding] | None = None
@@ -76,19 +74,17 @@ class ProblemError(Exception):
 
     def response(self) -> Response:
         """The problem as an answer."""
-        body: dict[str, Any] = {
-            "type": f"urn:rosrv:problem:{self.kind}",
-            "title": http.HTTPStatus(self.status).phrase,
-            "status": self.status,
-            "detail": self.detail,
-        }
-        if self.line is not None:
-            body |= {"line": self.line, "column": self.column}
-        if self.findings is not None:
-            body["findings"] = [one.model_dump() for one in self.findings[:_MOST_FINDINGS]]
-        if self.errors is not None:
-            body["errors"] = [one.model_dump() for one in self.errors[:_MOST_FINDINGS]]
-        return Response(json.dumps(body), self.status, self.headers, MEDIA_TYPE)
+        problem = Problem(
+            f"urn:rosrv:problem:{self.kind}",
+            http.HTTPStatus(self.status).phrase,
+            self.status,
+            self.detail.encode("utf-8", "backslashreplace").decode(),
+            line=self.line,
+            column=self.column,
+            findings=self.findings[:_MOST_FINDINGS] if self.findings is not None else None,
+            errors=self.errors[:_MOST_FINDINGS] if self.errors is not None else None,
+        )
+        return Response(msgspec.json.encode(problem), self.status, self.headers, MEDIA_TYPE)
 
 
 def defect(error: Exception) -> ProblemError:

@@ -9,7 +9,7 @@ from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 
@@ -50,15 +50,15 @@ _PROBLEMS = {
 }
 
 
-async def ask(control: ControlLink, request: AdminRequest, bearer: Bearer) -> dict[str, Any]:
+async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
     """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
     return answered(await control.ask(request, bearer))
 
 
-def answered(answer: AdminAnswer) -> dict[str, Any]:
+def answered(answer: AdminAnswer[A]) -> A:
     """The body of an answer. Raises `ProblemError` for a refusal."""
     if answer.ok:
-        return answer.body
+        return answer.given()
     status, kind = _PROBLEMS.get(answer.trouble, (503, "not-available"))
     detail = "\n".join([answer.error, *answer.findings])
     raise ProblemError(status, kind, detail)

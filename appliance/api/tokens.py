@@ -4,51 +4,31 @@ Whoever holds an admin's token can end one that was lost from wherever he is. To
 machine (`rosrv token add`): a token that was stolen, or an api that fell to a stranger, does not beget others.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
-from fastapi import APIRouter, Path
-from pydantic import BaseModel, ConfigDict
+from fastapi import Path
 
 from appliance.api.roles import Admin, ask
+from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import TokenList, TokenRevoke
+from appliance.channel.answers.tokens import Token, Tokens
 
-_UNKNOWN: dict[int | str, dict[str, Any]] = {
-    422: {"description": "There is no token of this name that can be used."}
-}
-
-
-class Token(BaseModel):
-    """A token without its secret; times are seconds since the epoch."""
-
-    model_config = ConfigDict(extra="forbid")
-    name: str
-    id: str
-    role: Literal["viewer", "operator", "admin"]
-    created: float
-    expires: float
-    revoked: float | None
+_UNKNOWN: Responses = {422: {"description": "There is no token of this name that can be used."}}
 
 
-class Tokens(BaseModel):
-    """All tokens that were made, the oldest first."""
-
-    model_config = ConfigDict(extra="forbid")
-    tokens: list[Token]
-
-
-def routes(services: Services) -> APIRouter:
+def routes(services: Services) -> Routes:
     """The routes."""
-    router = APIRouter(prefix="/v1/tokens", tags=["tokens"])
+    router = Routes(prefix="/v1/tokens", tags=["tokens"])
 
     @router.get("", operation_id="tokens")
     async def tokens(bearer: Admin) -> Tokens:
         """All access tokens that were made, without their secrets; for admins."""
-        return Tokens.model_validate(await ask(services.control, TokenList(), bearer))
+        return await ask(services.control, TokenList(), bearer)
 
     @router.delete("/{name}", operation_id="revoke_token", responses=_UNKNOWN)
     async def revoke_token(name: Annotated[str, Path(min_length=1, max_length=80)], bearer: Admin) -> Token:
         """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
-        return Token.model_validate(await ask(services.control, TokenRevoke(name), bearer))
+        return await ask(services.control, TokenRevoke(name), bearer)
 
     return router

@@ -1,52 +1,58 @@
-"""What operators' tools ask of the running appliance, and what they are answered.
+"""What operators' tools ask of the running appliance; the base of each request names the struct that answers it.
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make tokens. Of these, control makes a `RestChange` only with the proof that the
-holder of a token asked for just that (`appliance/control/rest_proof.py`).
+passes on `RestRequest`, which cannot make tokens, and gets the same document back. Of these, control makes a
+`RestChange` only with the proof that the holder of a token asked for just that (`appliance/control/rest_proof.py`).
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
 
-from typing import Any, Literal
+import functools
+from typing import Any, Generic, Literal, TypeVar, cast, get_args
 
 import msgspec
 
+from appliance.channel.answers import graph, hosts, measures, monitors, policy, status, tokens
+from appliance.channel.answers.tokens import TokenRole
 
-class AdminRequest(msgspec.Struct, frozen=True, tag_field="verb", forbid_unknown_fields=True):
-    """A question or an order to the running appliance."""
+A = TypeVar("A")
 
 
-def verb_of(request: AdminRequest) -> str:
+class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
+    """A question or an order to the running appliance, which an `A` answers."""
+
+
+def verb_of(request: AdminRequest[Any]) -> str:
     """The name of a request, as it stands in `verb`."""
     return str(type(request).__struct_config__.tag)
 
 
-class StatusWanted(AdminRequest, frozen=True, tag="status"):
+class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
     """Processes, policy, registry, relay, firewall: what `rosrv status` shows."""
 
 
-class PolicyReload(AdminRequest, frozen=True, tag="policy reload"):
+class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"):
     """Read the policy file again; back by itself after `confirm_within` seconds unless confirmed."""
 
     confirm_within: float | None = None
     expected: int | None = None
 
 
-class PolicyRollback(AdminRequest, frozen=True, tag="policy rollback"):
+class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollback"):
     """Back to a kept revision; None: the one before the present."""
 
     revision: int | None = None
     expected: int | None = None
 
 
-class PolicyConfirm(AdminRequest, frozen=True, tag="policy confirm"):
+class PolicyConfirm(AdminRequest[policy.Confirmed], frozen=True, tag="policy confirm"):
     """Keep a change that would go back by itself."""
 
     expected: int | None = None
 
 
-class PolicyLoad(AdminRequest, frozen=True, tag="policy load"):
+class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
     """Bring a text into force that is not the file's: check, test, swap, decide again what is live."""
 
     text: str
@@ -55,35 +61,35 @@ class PolicyLoad(AdminRequest, frozen=True, tag="policy load"):
     expected: int | None = None
 
 
-class PolicyWanted(AdminRequest, frozen=True, tag="policy"):
+class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
     """The text of a revision (None: the one in force), and with what it is judged: its tests, the robot."""
 
     revision: int | None = None
 
 
-class PolicyRevisions(AdminRequest, frozen=True, tag="policy revisions"):
+class PolicyRevisions(AdminRequest[policy.Revisions], frozen=True, tag="policy revisions"):
     """The kept revisions."""
 
 
-class RegistrationsWanted(AdminRequest, frozen=True, tag="registrations"):
-    """What is live now and a change of the policy may end, as rows of `appliance.policy.Live`."""
+class RegistrationsWanted(AdminRequest[graph.Registrations], frozen=True, tag="registrations"):
+    """What is live now and a change of the policy may end."""
 
 
-class GraphWanted(AdminRequest, frozen=True, tag="graph"):
+class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services with who is connected to whom and how much flows."""
 
 
-class MetricsWanted(AdminRequest, frozen=True, tag="metrics"):
+class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics"):
     """The status, and everything that control counts."""
 
 
-class MonitorsWanted(AdminRequest, frozen=True, tag="monitors"):
+class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors"):
     """The monitors with their state and counters; with `texts`, also the specifications themselves."""
 
     texts: bool = False
 
 
-class MonitorLoad(AdminRequest, frozen=True, tag="monitor load"):
+class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
     `expected`, of this and every change below: the tag of the monitors that it is meant for; None for any.
@@ -95,7 +101,7 @@ class MonitorLoad(AdminRequest, frozen=True, tag="monitor load"):
     expected: str | None = None
 
 
-class MonitorReplace(AdminRequest, frozen=True, tag="monitor replace"):
+class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
     """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name."""
 
     name: str
@@ -105,7 +111,7 @@ class MonitorReplace(AdminRequest, frozen=True, tag="monitor replace"):
     expected: str | None = None
 
 
-class MonitorReload(AdminRequest, frozen=True, tag="monitor reload"):
+class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):
     """Take what the folder of specifications has now.
 
     What was loaded from elsewhere stays, unless `prune`: then what the folder does not have is removed.
@@ -115,14 +121,14 @@ class MonitorReload(AdminRequest, frozen=True, tag="monitor reload"):
     prune: bool = False
 
 
-class MonitorRemove(AdminRequest, frozen=True, tag="monitor remove"):
+class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor remove"):
     """Remove specifications, by the names of their files or monitors."""
 
     names: list[str]
     expected: str | None = None
 
 
-class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
+class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor switch"):
     """Let the events of these monitors happen, or not."""
 
     names: list[str]
@@ -130,7 +136,7 @@ class MonitorSwitch(AdminRequest, frozen=True, tag="monitor switch"):
     expected: str | None = None
 
 
-class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
+class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
     names: list[str]
@@ -139,10 +145,8 @@ class MonitorResume(AdminRequest, frozen=True, tag="monitor resume"):
 
 MonitorChange = MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume
 
-TokenRole = Literal["viewer", "operator", "admin"]
 
-
-class TokenAdd(AdminRequest, frozen=True, tag="token add"):
+class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
     """Make a token that ends after `seconds`; the answer is the only place where its text ever stands."""
 
     name: str
@@ -150,17 +154,17 @@ class TokenAdd(AdminRequest, frozen=True, tag="token add"):
     seconds: float
 
 
-class TokenList(AdminRequest, frozen=True, tag="token list"):
+class TokenList(AdminRequest[tokens.Tokens], frozen=True, tag="token list"):
     """All tokens that were made, without their secrets."""
 
 
-class TokenRevoke(AdminRequest, frozen=True, tag="token revoke"):
+class TokenRevoke(AdminRequest[tokens.Token], frozen=True, tag="token revoke"):
     """End a token now."""
 
     name: str
 
 
-class HostAdd(AdminRequest, frozen=True, tag="host add"):
+class HostAdd(AdminRequest[hosts.KitParts], frozen=True, tag="host add"):
     """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
 
     `address`: the virtual address it shall have; None: the next free one.
@@ -173,8 +177,10 @@ class HostAdd(AdminRequest, frozen=True, tag="host add"):
     expected: int | None = None
 
 
-class HostToken(AdminRequest, frozen=True, tag="host token"):
+class HostToken(AdminRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
     """Make a token by which a host enrols itself once within `seconds`; an earlier one of the name ends.
+
+    The `endpoint` of `kit` is found by the appliance where it is empty.
 
     Its text is in the answer and nowhere else. `kit` is kept with it for whoever makes the host's kit. With `new`
     it is refused for a host that is enrolled; else such a host may come with another key.
@@ -189,7 +195,7 @@ class HostToken(AdminRequest, frozen=True, tag="host token"):
     new: bool = False
 
 
-class HostEnrol(AdminRequest, frozen=True, tag="host enrol"):
+class HostEnrol(AdminRequest[hosts.KitParts], frozen=True, tag="host enrol"):
     """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
 
     token: str
@@ -197,7 +203,7 @@ class HostEnrol(AdminRequest, frozen=True, tag="host enrol"):
     peer: str
 
 
-class HostRenew(AdminRequest, frozen=True, tag="host renew"):
+class HostRenew(AdminRequest[hosts.KitParts], frozen=True, tag="host renew"):
     """A new certificate for an enrolled host; the one before is revoked."""
 
     name: str
@@ -206,7 +212,7 @@ class HostRenew(AdminRequest, frozen=True, tag="host renew"):
     expected: int | None = None
 
 
-class HostRenewItself(AdminRequest, frozen=True, tag="host renew itself"):
+class HostRenewItself(AdminRequest[hosts.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
     `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
@@ -219,35 +225,35 @@ class HostRenewItself(AdminRequest, frozen=True, tag="host renew itself"):
     peer: str
 
 
-class HostRenewed(AdminRequest, frozen=True, tag="host renewed"):
+class HostRenewed(AdminRequest[hosts.Renewed], frozen=True, tag="host renewed"):
     """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
 
     name: str
     peer: str
 
 
-class HostList(AdminRequest, frozen=True, tag="host list"):
+class HostList(AdminRequest[hosts.Hosts], frozen=True, tag="host list"):
     """All hosts that were enrolled or declared, with their tunnels."""
 
 
-class HostEndpoint(AdminRequest, frozen=True, tag="host endpoint"):
+class HostEndpoint(AdminRequest[hosts.Endpoint], frozen=True, tag="host endpoint"):
     """At which address hosts reach the appliance, where nobody says it: `endpoint`, and `reason`: why that one."""
 
 
-class HostKit(AdminRequest, frozen=True, tag="host kit"):
+class HostKit(AdminRequest[hosts.KitParts], frozen=True, tag="host kit"):
     """What an enrolled host's kit is made of, without its private key."""
 
     name: str
 
 
-class HostRevoke(AdminRequest, frozen=True, tag="host revoke"):
+class HostRevoke(AdminRequest[hosts.Revoked], frozen=True, tag="host revoke"):
     """Let a host in no more, and cut what it has, now."""
 
     name: str
     expected: int | None = None
 
 
-class HostPorts(AdminRequest, frozen=True, tag="host ports"):
+class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
     """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch; None: now).
 
     `name` is an enrolled or declared host's, or an address of a machine that nodes run on.
@@ -260,21 +266,21 @@ class HostPorts(AdminRequest, frozen=True, tag="host ports"):
     expected: int | None = None
 
 
-class HostsReload(AdminRequest, frozen=True, tag="hosts reload"):
+class HostsReload(AdminRequest[hosts.Reloaded], frozen=True, tag="hosts reload"):
     """Read `ipsec/hosts.yaml` again."""
 
     expected: int | None = None
 
 
-class RevocationsWanted(AdminRequest, frozen=True, tag="host revocations"):
+class RevocationsWanted(AdminRequest[hosts.RevocationList], frozen=True, tag="host revocations"):
     """The authority's signed list of revoked certificates, in PEM."""
 
 
-class AuthorityWanted(AdminRequest, frozen=True, tag="host authority"):
+class AuthorityWanted(AdminRequest[hosts.AuthorityCertificate], frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 
-class ChallengeWanted(AdminRequest, frozen=True, tag="challenge"):
+class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):
     """A challenge, under which the next order over REST is signed."""
 
 
@@ -298,16 +304,42 @@ AnyRequest = _Common | TokenAdd
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]
 
 
-class AdminAnswer(msgspec.Struct, frozen=True):
+class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
     `trouble` says whose fault an error is: `request` (it makes no sense), `refused` (the policy or name given is
-    wrong), `conflict` (another revision is in force than was expected), `unknown` (there is no such thing),
-    `forbidden` (whoever asks may not), `busy` (too much at once), `failed` (the appliance cannot do it now).
+    wrong), `conflict` (another revision is in force than was expected: `tag` is that of the monitors), `unknown` (there
+    is no such thing), `forbidden` (whoever asks may not), `busy` (too much at once), `failed` (the appliance cannot do
+    it now).
     """
 
     ok: bool
-    body: dict[str, Any] = {}
+    body: A | None = None
     error: str = ""
     findings: list[str] = []
     trouble: Trouble = ""
+    tag: str = ""
+
+    def given(self) -> A:
+        """The body of an answer that is `ok`."""
+        assert self.body is not None  # noqa: S101  it has one
+        return self.body
+
+
+encode = msgspec.json.Encoder().encode
+
+
+@functools.cache
+def _decoder(kind: type[AdminRequest[A]]) -> msgspec.json.Decoder[AdminAnswer[A]]:
+    return msgspec.json.Decoder(AdminAnswer[answer_to(kind)])  # type: ignore[misc]  # known when it runs only
+
+
+def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
+    """The struct that answers such a request."""
+    (answer,) = get_args(kind.__orig_bases__[0])  # type: ignore[attr-defined]  # what `typing` keeps of its bases
+    return cast(type[A], answer)
+
+
+def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
+    """The answer to a request. Raises `msgspec.MsgspecError` when it is none."""
+    return _decoder(type(request)).decode(document)

@@ -1,12 +1,13 @@
 """How control's status is read: one answer for health checks, REST, metrics and `rosrv status`. Pure."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+
+from appliance.channel.answers.status import ProcessInfo, Status
 
 
-def probe_failed(status: Mapping[str, Any]) -> bool:
+def probe_failed(status: Status) -> bool:
     """Whether the hidden ROS Master was reached past the appliance; before the probe has run it did not fail."""
-    return status["probe"] not in ("", "passed")
+    return status.probe not in ("", "passed")
 
 
 def no_relay(presence: str) -> str | None:
@@ -18,22 +19,21 @@ def no_relay(presence: str) -> str | None:
     return f"of the relay processes {presence}: their topics and services carry nothing"
 
 
-def unserved(status: Mapping[str, Any]) -> str | None:
+def unserved(status: Status) -> str | None:
     """Why nodes are not served now; None when they are."""
-    audit = status["audit"]
     if probe_failed(status):
-        return f"the ROS Master is not hidden: {status['probe']}"
-    if audit["failed"] and audit["on_failure"] == "deny":
-        return f"the audit log cannot be written: {audit['failed']}"
-    relay = no_relay(status["relay"])
+        return f"the ROS Master is not hidden: {status.probe}"
+    if status.audit.failed and status.audit.on_failure == "deny":
+        return f"the audit log cannot be written: {status.audit.failed}"
+    relay = no_relay(status.relay)
     if relay is not None:
         return relay
-    return None if status["rosmaster"] == "reachable" else "the ROS Master is being rebuilt: calls wait"
+    return None if status.rosmaster == "reachable" else "the ROS Master is being rebuilt: calls wait"
 
 
-def process_names(processes: Sequence[Mapping[str, Any]]) -> list[str]:
+def process_names(processes: Sequence[ProcessInfo]) -> list[str]:
     """What the processes are called, in their order: by their roles; those of one role are numbered from 0."""
-    roles = [str(row["role"]) for row in processes]
+    roles = [row.role for row in processes]
     return [
         f"{role} {roles[:place].count(role)}" if roles.count(role) > 1 else role
         for place, role in enumerate(roles)

@@ -2,11 +2,11 @@
 
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
 
 if TYPE_CHECKING:
     from appliance.cli.audit.source import AuditSource
@@ -32,7 +32,7 @@ class AdminSocket:
 
         return FileLog(self.state)
 
-    def ask(self, request: AdminRequest) -> AdminAnswer:
+    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
@@ -60,10 +60,13 @@ class AdminSocket:
             raise NotRunningError(f"{path}: the appliance did not answer within {SECONDS:g} s") from None
         except OSError as error:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
-        return msgspec.json.decode(answer, type=AdminAnswer)
+        try:
+            return decode(answer, request)
+        except msgspec.MsgspecError as error:
+            raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
 
-def encoded(request: AdminRequest) -> bytes:
+def encoded(request: AdminRequest[Any]) -> bytes:
     """The request as it is sent. Raises `NotRunningError` for words that no appliance can be asked for."""
     try:
         return msgspec.json.encode(request)

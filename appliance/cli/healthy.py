@@ -12,7 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.channel.admin import AdminAnswer, StatusWanted
+from appliance.channel.admin import AdminAnswer, StatusWanted, decode
+from appliance.channel.answers.status import Status
 from appliance.channel.serving import unserved
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`
@@ -24,21 +25,21 @@ def main() -> None:
     state = Path(os.environ.get("ROSRV_STATE", _STATE))
     try:
         answer = ask(state / "admin.sock")
-        reason = unserved(answer.body) if answer.ok else answer.error
+        reason = unserved(answer.given()) if answer.ok else answer.error
     except (OSError, msgspec.MsgspecError) as error:
         reason = f"the appliance does not answer: {error}"
     if reason is not None:
         sys.exit(reason)
 
 
-def ask(path: Path) -> AdminAnswer:
+def ask(path: Path) -> AdminAnswer[Status]:
     """The appliance's status. Raises `OSError` and `msgspec.MsgspecError`."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
         sock.settimeout(_SECONDS)
         sock.connect(str(path))
         sock.sendall(msgspec.json.encode(StatusWanted()) + b"\n")
         with sock.makefile("rb") as answer:
-            return msgspec.json.decode(answer.readline(), type=AdminAnswer)
+            return decode(answer.readline(), StatusWanted())
 
 
 if __name__ == "__main__":

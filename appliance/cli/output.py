@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from typing import Annotated, Any
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.text import Text
@@ -41,6 +42,6 @@ def say(line: str, style: str = "") -> None:
         sys.stdout.write(shown + "\n")
 
 
-def say_json(fields: Mapping[str, Any]) -> None:
+def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
     """Write one object on one line to standard output."""
-    sys.stdout.write(json.dumps(fields) + "\n")
+    sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")

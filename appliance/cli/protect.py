@@ -190,7 +190,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address
         body = running.ask_or_exit(HostPorts(name, state, found, time.time()), as_json=as_json)
-        sys.stderr.write(f"rosrv: the appliance knows it: the ports of {body['name']} are {state}\n")
+        sys.stderr.write(f"rosrv: the appliance knows it: the ports of {body.name} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)
     if unknown:
@@ -208,9 +208,9 @@ def _own(running: Appliance) -> str:
         raise ValueError(f"which appliance may reach this machine? {error}; or {hint}") from None
     if not answer.ok:
         raise ValueError(f"{answer.error}; {hint}")
-    if answer.body["isolation"] == "none":
+    if answer.given().isolation == "none":
         raise ValueError(f"the appliance runs on this machine without isolation, as loopback; {hint}")
-    return str(urlsplit(answer.body["master"]).hostname)
+    return str(urlsplit(answer.given().master).hostname)
 
 
 def _sentence(result: ScanResult, ports: PortRange) -> str:

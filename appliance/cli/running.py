@@ -11,12 +11,12 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, Protocol
+from typing import TYPE_CHECKING, Annotated, Concatenate, ParamSpec, Protocol
 
 import msgspec
 import typer
 
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ _P = ParamSpec("_P")
 class Way(Protocol):
     """A way to ask the running appliance."""
 
-    def ask(self, request: AdminRequest) -> AdminAnswer:
+    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask one thing. Raises `NotRunningError`."""
 
     def audit(self) -> "AuditSource":
@@ -81,7 +81,7 @@ class Appliance:
 
     place: str | None = None
 
-    def ask(self, request: AdminRequest) -> AdminAnswer:
+    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
         return self.way.ask(request)
 
@@ -89,7 +89,7 @@ class Appliance:
         """Its audit log; over the state directory it need not run."""
         return self.way.audit()
 
-    def ask_or_exit(self, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+    def ask_or_exit(self, request: AdminRequest[A], *, as_json: bool) -> A:
         """The answer's body. Ends the program with 1 when it refuses, 2 when none can be asked."""
         try:
             return body_or_exit(self.way.ask(request), as_json=as_json)
@@ -150,10 +150,10 @@ def usage_error(text: str) -> typer.Exit:
     return typer.Exit(2)
 
 
-def body_or_exit(answer: AdminAnswer, *, as_json: bool) -> dict[str, Any]:
+def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
     """The answer's body; a refusal is shown whole and ends the program with status 1."""
     if answer.ok:
-        return answer.body
+        return answer.given()
     if as_json:
         typer.echo(msgspec.json.encode({"error": answer.error, "findings": answer.findings}).decode())
     else:
@@ -163,11 +163,11 @@ def body_or_exit(answer: AdminAnswer, *, as_json: bool) -> dict[str, Any]:
     raise typer.Exit(1)
 
 
-def ask(state: Path, request: AdminRequest) -> AdminAnswer:
+def ask(state: Path, request: AdminRequest[A]) -> AdminAnswer[A]:
     """Ask the appliance of a state directory one thing. Raises `NotRunningError`."""
     return AdminSocket(state).ask(request)
 
 
-def ask_or_exit(state: Path, request: AdminRequest, *, as_json: bool) -> dict[str, Any]:
+def ask_or_exit(state: Path, request: AdminRequest[A], *, as_json: bool) -> A:
     """The same over the socket alone."""
     return Appliance(AdminSocket(state)).ask_or_exit(request, as_json=as_json)

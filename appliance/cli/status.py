@@ -2,14 +2,17 @@
 
 import time
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from appliance.channel.admin import StatusWanted
+from appliance.channel.answers.hosts import PortsSeen
+from appliance.channel.answers.status import FirewallState, IpsecState, Status
 from appliance.channel.serving import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
@@ -35,123 +38,115 @@ def status(
     body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
     troubles = list(troubles_of(body))
     if as_json:
-        say_json({**body, "troubles": troubles})
+        say_json({**msgspec.structs.asdict(body), "troubles": troubles})
     else:
         _show(body, troubles)
     raise typer.Exit(1 if troubles else 0)
 
 
-def troubles_of(body: dict[str, Any]) -> list[str]:
+def troubles_of(body: Status) -> list[str]:
     """What a person should look at, most pressing first."""
     found = []
-    if body["audit"]["failed"]:
-        found.append(f"the audit log cannot be written: {body['audit']['failed']}")
-    if body["audit"]["degraded"]:
-        found.append(f"the audit log is behind: {body['audit']['degraded']}")
-    forwarding = body["audit"]["forwarding"]
-    if forwarding is not None and forwarding["trouble"]:
+    if body.audit.failed:
+        found.append(f"the audit log cannot be written: {body.audit.failed}")
+    if body.audit.degraded:
+        found.append(f"the audit log is behind: {body.audit.degraded}")
+    forwarding = body.audit.forwarding
+    if forwarding is not None and forwarding.trouble:
         found.append(
-            f"the audit log is not forwarded to {forwarding['to']}, {counted(forwarding['behind'], 'record')} wait:"
-            f" {forwarding['trouble']}"
+            f"the audit log is not forwarded to {forwarding.to}, {counted(forwarding.behind, 'record')} wait:"
+            f" {forwarding.trouble}"
         )
     if probe_failed(body):
-        found.append(f"the ROS Master is not hidden: {body['probe']}")
-    monitors = body["monitors"]
-    if monitors["refused"]:
-        found.append(f"the relay does not take the specifications: {monitors['refused'][0]}")
-    if monitors["held"]:
-        found.append(f"topics are held: rosrv monitor resume {' '.join(monitors['held'])}")
-    if monitors["failing"]:
-        found.append(f"monitors fail: {', '.join(monitors['failing'])}; their messages are dropped")
-    relay = no_relay(body["relay"])
+        found.append(f"the ROS Master is not hidden: {body.probe}")
+    monitors = body.monitors
+    if monitors.refused:
+        found.append(f"the relay does not take the specifications: {monitors.refused[0]}")
+    if monitors.held:
+        found.append(f"topics are held: rosrv monitor resume {' '.join(monitors.held)}")
+    if monitors.failing:
+        found.append(f"monitors fail: {', '.join(monitors.failing)}; their messages are dropped")
+    relay = no_relay(body.relay)
     if relay is not None:
         found.append(relay)
-    if body["rosmaster"] != "reachable":
+    if body.rosmaster != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
-    found += body["ipsec"]["troubles"]
-    if body["policy"]["confirm_by"] is not None:
-        left = max(0, round(body["policy"]["confirm_by"] - time.time()))
+    found += body.ipsec.troubles
+    if body.policy.confirm_by is not None:
+        left = max(0, round(body.policy.confirm_by - time.time()))
         found.append(f"the policy goes back in {left} s unless confirmed: rosrv policy confirm")
     return found
 
 
-def _show(body: dict[str, Any], troubles: list[str]) -> None:
+def _show(body: Status, troubles: list[str]) -> None:
     console = Console(highlight=False)
-    policy, audit = body["policy"], body["audit"]
+    policy, audit = body.policy, body.audit
     for trouble in shortened(troubles, _MOST_TROUBLES):
         console.print(Text(f"! {trouble}", style=_RED))
     grid = Table.grid(padding=(0, 2))
-    grid.add_row("appliance", f"{body['version']} at {body['master']}, for {age(body['since'])}")
-    isolation = Text(_isolation(body), style=_YELLOW if body["isolation"] == "none" else _GREEN)
+    grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since)}")
+    isolation = Text(_isolation(body), style=_YELLOW if body.isolation == "none" else _GREEN)
     grid.add_row("isolation", isolation)
-    lacking = lacking_walls(body["processes"])
+    lacking = lacking_walls(body.processes)
     if lacking is not None:
         grid.add_row("walls", Text(lacking, style=_YELLOW))
-    for name, text in _others_rules(body["firewall"]):
+    for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
     differs = ""
-    if policy["differs_from_file"]:
-        theirs = policy["who"] != "disk"
-        differs = (
-            f"; loaded by {policy['who']}, not what the file has" if theirs else "; the file now differs"
-        )
+    if policy.differs_from_file:
+        theirs = policy.who != "disk"
+        differs = f"; loaded by {policy.who}, not what the file has" if theirs else "; the file now differs"
         differs += "" if theirs else ": rosrv policy reload takes the file"
-    warnings = f", {counted(policy['warnings'], 'warning')}" if policy["warnings"] else ""
-    grid.add_row("policy", f"revision {policy['revision']} of {policy['file']}{warnings}{differs}")
-    monitors = body["monitors"]
-    loaded = counted(monitors["loaded"], "monitor")
-    shown = f"revision {monitors['revision']}, {monitors['enabled']} of {loaded} enabled"
-    if monitors["differs_from_folder"]:
-        shown += f"; loaded by {monitors['who']}, not what the folder has"
+    warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
+    grid.add_row("policy", f"revision {policy.revision} of {policy.file}{warnings}{differs}")
+    monitors = body.monitors
+    loaded = counted(monitors.loaded, "monitor")
+    shown = f"revision {monitors.revision}, {monitors.enabled} of {loaded} enabled"
+    if monitors.differs_from_folder:
+        shown += f"; loaded by {monitors.who}, not what the folder has"
     grid.add_row("monitors", shown)
-    shadows = f" ({body['shadows']} lost, awaited)" if body["shadows"] else ""
+    shadows = f" ({body.shadows} lost, awaited)" if body.shadows else ""
     grid.add_row(
         "graph",
-        f"{counted(body['nodes'], 'node')}{shadows}, {counted(body['topics'], 'topic')}, "
-        f"{counted(body['services'], 'service')}",
+        f"{counted(body.nodes, 'node')}{shadows}, {counted(body.topics, 'topic')}, "
+        f"{counted(body.services, 'service')}",
     )
-    dropped = f", {body['dropped']} dropped at slow subscribers" if body["dropped"] else ""
-    relay = Text(
-        f"{counted(body['connections'], 'connection')}, {counted(body['messages'], 'message')}{dropped}"
-    )
-    if body["relaying"] == "monitored":
+    dropped = f", {body.dropped} dropped at slow subscribers" if body.dropped else ""
+    relay = Text(f"{counted(body.connections, 'connection')}, {counted(body.messages, 'message')}{dropped}")
+    if body.relaying == "monitored":
         relay.append("; only what is monitored: NO BOUNDARY, the rest passes it by", style=_YELLOW)
     grid.add_row("relay", relay)
-    grid.add_row("tunnels", _tunnels(body["ipsec"]))
-    grid.add_row("hosts' ports", _ports(body["ipsec"]["ports"]))
-    forwarding = audit["forwarding"]
-    forwarded = (
-        "" if forwarding is None else f", {forwarding['behind']} to be forwarded to {forwarding['to']}"
-    )
-    grid.add_row("audit log", f"{counted(audit['lag_records'], 'record')} waiting to be written{forwarded}")
+    grid.add_row("tunnels", _tunnels(body.ipsec))
+    grid.add_row("hosts' ports", _ports(body.ipsec.ports))
+    forwarding = audit.forwarding
+    forwarded = "" if forwarding is None else f", {forwarding.behind} to be forwarded to {forwarding.to}"
+    grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
     console.print(grid)
-    table = processes_table(body["processes"], console.width)
+    table = processes_table(body.processes, console.width)
     console.print(table)
 
 
-def _tunnels(ipsec: dict[str, Any]) -> str:
-    if ipsec["esp"] is None:
-        return f"{counted(ipsec['enrolled'], 'host')} enrolled"
-    text = f"{ipsec['up']} of {counted(ipsec['enrolled'], 'enrolled host')} up, ESP in {ipsec['esp']}"
-    if ipsec["key_exchange"]:
-        text += f", key exchange {', '.join(ipsec['key_exchange'])}"
+def _tunnels(ipsec: IpsecState) -> str:
+    if ipsec.esp is None:
+        return f"{counted(ipsec.enrolled, 'host')} enrolled"
+    text = f"{ipsec.up} of {counted(ipsec.enrolled, 'enrolled host')} up, ESP in {ipsec.esp}"
+    if ipsec.key_exchange:
+        text += f", key exchange {', '.join(ipsec.key_exchange)}"
     return text
 
 
-def _ports(known: dict[str, dict[str, Any]]) -> str:
+def _ports(known: dict[str, PortsSeen]) -> str:
     """Whether machines on which nodes run are known to be closed to all but the appliance."""
-    by_state = {
-        state: [name for name, one in known.items() if one["state"] == state] for state in _PORT_STATES
-    }
+    by_state = {state: [name for name, one in known.items() if one.state == state] for state in _PORT_STATES}
     if not known:
         return "no other machine has nodes"
     words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]
     return "; ".join(words) + (" (rosrv protect --check)" if by_state["unknown"] else "")
 
 
-def _others_rules(firewall: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
     """What chains of other programs do on the host of isolation netns; their names are in the JSON object."""
-    translating, dropping = firewall.get("translations", []), firewall.get("obstacles", [])
+    translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
         words.append(
@@ -163,9 +158,9 @@ def _others_rules(firewall: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "others' rules", f"{'; '.join(words)}: --json"
 
 
-def _isolation(body: dict[str, Any]) -> str:
-    if body["isolation"] == "none":
+def _isolation(body: Status) -> str:
+    if body.isolation == "none":
         return "none: NO FIREWALL, every user of this machine reaches the ROS Master"
-    back_end = body["firewall"].get("backend", "no back end reported")
-    walled = ", processes walled in" if lacking_walls(body["processes"]) is None else ""
-    return f"{body['isolation']}, firewall {back_end}, probe {body['probe'] or 'not run yet'}{walled}"
+    back_end = body.firewall.backend or "no back end reported"
+    walled = ", processes walled in" if lacking_walls(body.processes) is None else ""
+    return f"{body.isolation}, firewall {back_end}, probe {body.probe or 'not run yet'}{walled}"

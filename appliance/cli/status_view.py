@@ -2,19 +2,19 @@
 
 import datetime
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from rich.table import Table
 from rich.text import Text
 
+from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.serving import process_names
 
 _YELLOW = "yellow"
 _COLUMN = 38  # columns that one process takes
 
 
-def processes_table(rows: Sequence[Mapping[str, Any]], width: int, now: float | None = None) -> Table:
+def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None = None) -> Table:
     """The processes in as many columns as fit, read downwards; processes of one role are numbered from 0."""
     across = max(1, min(3, width // _COLUMN))
     high = -(-len(rows) // across)
@@ -30,15 +30,15 @@ def processes_table(rows: Sequence[Mapping[str, Any]], width: int, now: float | 
     return table
 
 
-def _cells(row: Mapping[str, Any], name: str, now: float | None) -> list[Text]:
-    since = datetime.datetime.fromisoformat(row["since"]).timestamp()
-    restarts = Text(str(row["restarts"]), style=_YELLOW if row["restarts"] else "")
-    return [Text(name), Text(str(row["pid"])), Text(age(since, now)), restarts]
+def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
+    since = datetime.datetime.fromisoformat(row.since).timestamp()
+    restarts = Text(str(row.restarts), style=_YELLOW if row.restarts else "")
+    return [Text(name), Text(str(row.pid)), Text(age(since, now)), restarts]
 
 
-def lacking_walls(rows: Sequence[Mapping[str, Any]]) -> str | None:
+def lacking_walls(rows: Sequence[ProcessInfo]) -> str | None:
     """What this kernel lacks of the walls around the processes, as far as a line holds it; None: they all stand."""
-    lacking = [f"{row['role']}: {what}" for row in rows for what in row["lacks"]]
+    lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
     if not lacking:
         return None
     return lacking[0] + (f" and {len(lacking) - 1} more (rosrv status --json)" if len(lacking) > 1 else "")

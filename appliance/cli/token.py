@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRole
+from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
+from appliance.channel.answers.tokens import TokenRole
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks, usage_error
 from appliance.cli.spans import seconds_of
@@ -35,10 +36,9 @@ def add(
     if as_json:
         say_json(body)
         return
-    say(body["token"])
+    say(body.token)
     typer.echo(
-        f"rosrv: {body['role']} {body['name']}, until {moment(body['expires'])}. "
-        "This is the only time it is shown.",
+        f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. This is the only time it is shown.",
         err=True,
     )
 
@@ -51,15 +51,15 @@ def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
     Example: rosrv token list
     """
     now = datetime.datetime.now(datetime.UTC).timestamp()
-    for row in appliance.ask_or_exit(TokenList(), as_json=as_json)["tokens"]:
+    for row in appliance.ask_or_exit(TokenList(), as_json=as_json).tokens:
         if as_json:
             say_json(row)
             continue
-        if row["revoked"] is not None:
-            end = f"revoked {moment(row['revoked'])}"
+        if row.revoked is not None:
+            end = f"revoked {moment(row.revoked)}"
         else:
-            end = f"{'expired' if row['expires'] <= now else 'until'} {moment(row['expires'])}"
-        say(f"{row['name']:<24} {row['role']:<9} {row['id']}  made {moment(row['created'])}  {end}")
+            end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
+        say(f"{row.name:<24} {row.role:<9} {row.id}  made {moment(row.created)}  {end}")
 
 
 @app.command()
@@ -77,7 +77,7 @@ def revoke(
     if as_json:
         say_json(body)
     else:
-        say(f"token {body['name']} ({body['role']}) is revoked")
+        say(f"token {body.name} ({body.role}) is revoked")
 
 
 def _seconds(text: str) -> float:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import socket
+from typing import Any
 
 import msgspec
 import structlog
@@ -30,7 +31,7 @@ class AdminServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             while line := await reader.readline():
-                writer.write(msgspec.json.encode(await self._answer(line)) + b"\n")
+                writer.write(admin.encode(await self._answer(line)) + b"\n")
                 await writer.drain()
         except (ValueError, ConnectionError) as error:
             _log.warning("a tool spoke nonsense on the admin socket", error=str(error))
@@ -39,7 +40,7 @@ class AdminServer:
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
 
-    async def _answer(self, line: bytes) -> admin.AdminAnswer:
+    async def _answer(self, line: bytes) -> admin.AdminAnswer[Any]:
         try:
             request = self._decoder.decode(line)
         except msgspec.MsgspecError as error:

@@ -1,12 +1,13 @@
 """Control's end of the link to the forwarder of the audit log: for status, metrics, and the log itself."""
 
 import asyncio
-from typing import Any
 
+import msgspec
 import structlog
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
+from appliance.channel.answers.status import ForwardingState
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
 from appliance.recorder import Recorder
@@ -42,7 +43,7 @@ class Forwarded:
 
         channel.attach(asyncio.get_running_loop(), received, lost, lost)
 
-    def status(self) -> dict[str, Any] | None:
+    def status(self) -> ForwardingState | None:
         """For `rosrv status` and the metrics; None when nothing is to be forwarded."""
         if self._wanted.to is None:
             return None
@@ -50,8 +51,8 @@ class Forwarded:
         trouble = report.trouble
         if self._channel is None or self._report is None:
             trouble = trouble or "the forwarder does not run yet"
-        fields = {name: getattr(report, name) for name in report.__struct_fields__}
-        return {**fields, "to": self._wanted.to, "send": self._wanted.send, "trouble": trouble}
+        fields = msgspec.structs.asdict(report) | {"trouble": trouble}
+        return ForwardingState(**fields, to=self._wanted.to, send=self._wanted.send)
 
     def _reported(self, report: messages.ForwardingReported) -> None:
         before = self._report

@@ -1,9 +1,12 @@
-"""What control measures, in plain values: for the api, which makes Prometheus's format of it."""
+"""What control measures, for the api, which makes Prometheus's format of it."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TypeVar
 
+from appliance.channel.answers.hosts import Host
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.status import Status
 from appliance.control.assembly import Parts
 from appliance.master.graph.registry import Life
 from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried, Traffic
@@ -13,13 +16,14 @@ from appliance.specifications.observed import KINDS
 MOST_DELAYED = 200  # topics with a histogram of their own
 
 _Labels = tuple[str, str]
+_Number = TypeVar("_Number", int, float)
 _DECISIONS = tuple(
     (category.value, outcome) for category in Category for outcome in ("allow", "deny", "would deny")
 )
 
 
-def measures_of(parts: Parts) -> dict[str, Any]:
-    """Counters of requests, and the state of registry and relay at this moment.
+def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveries: int) -> Measures:
+    """Counters of requests, and the state of registry and relay at this moment, beside the status.
 
     Topics and services are named as far as `MOST_RESOURCES` goes (histograms: `MOST_DELAYED`): who registers names
     without end fills `OTHERS`.
@@ -27,45 +31,45 @@ def measures_of(parts: Parts) -> dict[str, Any]:
     lives = Counter(one.life for one in parts.registry.all() if not one.own)
     kinds = Counter(one.kind.value for node, one in parts.registry.in_order() if not node.own)
     records = parts.monitors.records
-    values = parts.recorder.meter.values()
-    decided = {(category, outcome): count for category, outcome, count in values["decisions"]}
-    return {
-        **values,
-        "decisions": [[*labels, count] for labels, count in from_zero(decided, _DECISIONS).items()],
-        "nodes": {"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
-        "registrations": dict(kinds),
-        **carried_of(parts.relay.carried),
-        "monitors": [
-            [kind, name, count]
-            for (kind, name), count in from_zero(
-                records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS)
-            ).items()
-        ],
-        **{
-            f"{kind}_at": by_resource(
-                (resource, (count,)) for (what, resource), count in records.at.items() if what == kind
-            )
-            for kind in ("drop", "change")
-        },
-        "limited": [[*labels, count] for labels, count in parts.relay.carried.limited_messages.items()],
-        "memory": {
-            what: sum(held.get(what, 0) for held in parts.relay.carried.memory.values())
+    meter, carried = parts.recorder.meter, parts.relay.carried
+    relayed, delayed = carried_of(carried)
+    done = from_zero(records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS))
+    return Measures(
+        status=status,
+        hosts=hosts,
+        queued_deliveries=queued_deliveries,
+        decisions=[(*labels, count) for labels, count in from_zero(meter.decisions, _DECISIONS).items()],
+        decision_seconds=meter.decision_seconds.values(),
+        calls=[(call, one.values()) for call, one in meter.calls.items()],
+        nodes={"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
+        registrations=dict(kinds),
+        relayed=relayed,
+        delayed=delayed,
+        monitors=[(*labels, count) for labels, count in done.items()],
+        drop_at=_at(records.at, "drop"),
+        change_at=_at(records.at, "change"),
+        limited=[(*labels, count) for labels, count in carried.limited_messages.items()],
+        memory={
+            what: sum(held.get(what, 0) for held in carried.memory.values())
             for what in ("frames", "queues", "latched", "headers")
         },
-        "connections": dict(Counter(one.kind for one in parts.relay.connections.values())),
-    }
+        connections=dict(Counter(one.kind for one in parts.relay.connections.values())),
+    )
 
 
-def carried_of(carried: Carried) -> dict[str, dict[str, list[float]]]:
+def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
+    """How often that happened, by resource."""
+    sums = by_resource((resource, (count,)) for (what, resource), count in counts.items() if what == kind)
+    return {resource: count for resource, (count,) in sums.items()}
+
+
+def carried_of(carried: Carried) -> tuple[dict[str, list[int]], dict[str, list[float]]]:
     """What went through each topic and service since control started, and how late; all incarnations together."""
     rows: list[tuple[str, Traffic]] = [*carried.past.items()]
     rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
-    return {
-        "relayed": by_resource((name, (one.messages, one.bytes, one.dropped)) for name, one in rows),
-        "delayed": by_resource(
-            ((name, (*one.delays, one.delay_seconds)) for name, one in rows if one.delays), MOST_DELAYED
-        ),
-    }
+    return by_resource((name, (one.messages, one.bytes, one.dropped)) for name, one in rows), by_resource(
+        ((name, (*one.delays, one.delay_seconds)) for name, one in rows if one.delays), MOST_DELAYED
+    )
 
 
 def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dict[_Labels, int]:
@@ -74,10 +78,10 @@ def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dic
 
 
 def by_resource(
-    rows: Iterable[tuple[str, tuple[float, ...]]], most: int = MOST_RESOURCES
-) -> dict[str, list[float]]:
+    rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MOST_RESOURCES
+) -> dict[str, list[_Number]]:
     """The sums of each resource's rows; of the first `most` by name, of all others together."""
-    sums: dict[str, list[float]] = {}
+    sums: dict[str, list[_Number]] = {}
     for resource, values in rows:
         name = resource if resource in sums or len(sums) < most else OTHERS
         row = sums.setdefault(name, [0] * len(values))

@@ -1,101 +1,120 @@
-"""What operators ask of the monitors, over the admin socket and REST alike."""
+"""What operators ask of the monitors."""
 
-from typing import Any
+from dataclasses import asdict
+
+import msgspec
 
 from appliance.channel import admin
+from appliance.channel.answers import monitors as answers
+from appliance.channel.answers.status import MonitorsState
 from appliance.control.assembly import Parts
-from appliance.specifications.monitors import Monitors, Replaced
+from appliance.specifications.monitors import Monitors
+from appliance.specifications.monitors import Replaced as Done
 
 
-async def change_monitors(monitors: Monitors, request: admin.MonitorChange, who: str) -> dict[str, Any]:
-    """Carry out a change; what it did."""
-    match request:
-        case admin.MonitorLoad(files, definitions, note, expected):
-            loaded = await monitors.load(files, definitions, who=who, note=note, expected=expected)
-            return _replaced(loaded, monitors.tag)
-        case admin.MonitorReplace(name, text, definitions, note, expected):
-            file = monitors.file_of(name)
-            loaded = await monitors.load({file: text}, definitions, who=who, note=note, expected=expected)
-            return _replaced(loaded, monitors.tag)
-        case admin.MonitorReload(expected, prune):
-            return _replaced(await monitors.reload(who=who, expected=expected, prune=prune), monitors.tag)
-        case admin.MonitorRemove(names, expected):
-            return _replaced(await monitors.remove(names, who=who, expected=expected), monitors.tag)
-        case admin.MonitorSwitch(names, enabled, expected):
-            changed = await monitors.switch(names, enabled, who=who, expected=expected)
-            return {"names": changed, "enabled": enabled, "revision": monitors.revision, "tag": monitors.tag}
-        case admin.MonitorResume(names, expected):
-            held = await monitors.resume(names, who=who, expected=expected)
-            return {"names": held, "revision": monitors.revision, "tag": monitors.tag}
+class MonitorOrders:
+    """Each method answers the request that it takes.
+
+    They raise `SpecificationsRefusedError`, `MonitorsChangedError`, `UnknownMonitorError`.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._monitors = parts.monitors
+
+    async def listed(self, request: admin.MonitorsWanted) -> answers.Monitors:
+        """All monitors with state and counters; with `texts`, the specifications too."""
+        monitors = self._monitors
+        return answers.Monitors(
+            revision=monitors.revision,
+            tag=monitors.tag,
+            who=monitors.who,
+            note=monitors.note,
+            loaded=monitors.loaded,
+            folder=str(monitors.folder) if monitors.folder is not None else None,
+            differs_from_folder=monitors.differs_from_folder,
+            warnings=list(monitors.checked.warnings),
+            refused=monitors.refused,
+            rv_state=msgspec.convert(self._parts.monitor_calls.rv_state(), answers.RvState),
+            monitors=states_of(monitors),
+            files=monitors.sources.files if request.texts else None,
+            definitions=monitors.sources.definitions if request.texts else None,
+        )
+
+    async def load(self, request: admin.MonitorLoad, who: str) -> answers.Replaced:
+        """Add or replace files of specifications."""
+        done = await self._monitors.load(
+            request.files, request.definitions, who=who, note=request.note, expected=request.expected
+        )
+        return self._replaced(done)
+
+    async def replace(self, request: admin.MonitorReplace, who: str) -> answers.Replaced:
+        """Put a text in the place of a monitor's file."""
+        files = {self._monitors.file_of(request.name): request.text}
+        done = await self._monitors.load(
+            files, request.definitions, who=who, note=request.note, expected=request.expected
+        )
+        return self._replaced(done)
+
+    async def reload(self, request: admin.MonitorReload, who: str) -> answers.Replaced:
+        """Take what the folder has."""
+        done = await self._monitors.reload(who=who, expected=request.expected, prune=request.prune)
+        return self._replaced(done)
+
+    async def remove(self, request: admin.MonitorRemove, who: str) -> answers.Replaced:
+        """Remove specifications."""
+        return self._replaced(await self._monitors.remove(request.names, who=who, expected=request.expected))
+
+    async def switch(self, request: admin.MonitorSwitch, who: str) -> answers.Switched:
+        """Enable or disable monitors."""
+        names = await self._monitors.switch(
+            request.names, request.enabled, who=who, expected=request.expected
+        )
+        return answers.Switched(names, self._monitors.revision, self._monitors.tag)
+
+    async def resume(self, request: admin.MonitorResume, who: str) -> answers.Switched:
+        """Let topics go on that monitors hold."""
+        names = await self._monitors.resume(request.names, who=who, expected=request.expected)
+        return answers.Switched(names, self._monitors.revision, self._monitors.tag)
+
+    def _replaced(self, done: Done) -> answers.Replaced:
+        return answers.Replaced(**asdict(done), tag=self._monitors.tag)
 
 
-def monitors_body(parts: Parts, *, texts: bool) -> dict[str, Any]:
-    """All monitors with state and counters; with `texts`, the specifications too."""
-    monitors = parts.monitors
-    body: dict[str, Any] = {
-        "revision": monitors.revision,
-        "tag": monitors.tag,
-        "who": monitors.who,
-        "note": monitors.note,
-        "loaded": monitors.loaded,
-        "folder": str(monitors.folder) if monitors.folder is not None else None,
-        "differs_from_folder": monitors.differs_from_folder,
-        "warnings": list(monitors.checked.warnings),
-        "refused": monitors.refused,
-        "rv_state": parts.monitor_calls.rv_state(),
-        "monitors": [_row(monitors, name) for name in monitors.names()],
-    }
-    if texts:
-        body["files"] = monitors.sources.files
-        body["definitions"] = monitors.sources.definitions
-    return body
-
-
-def monitors_status(monitors: Monitors) -> dict[str, Any]:
+def monitors_status(monitors: Monitors) -> MonitorsState:
     """The few words of `rosrv status`."""
-    rows = [_row(monitors, name) for name in monitors.names()]
-    return {
-        "revision": monitors.revision,
-        "tag": monitors.tag,
-        "loaded": len(rows),
-        "enabled": sum(row["enabled"] for row in rows),
-        "held": [row["name"] for row in rows if row["held"]],
-        "failing": [row["name"] for row in rows if row["failing"]],
-        "refused": monitors.refused,
-        "who": monitors.who,
-        "differs_from_folder": monitors.differs_from_folder,
-    }
+    rows = states_of(monitors)
+    return MonitorsState(
+        revision=monitors.revision,
+        tag=monitors.tag,
+        loaded=len(rows),
+        enabled=sum(row.enabled for row in rows),
+        held=[row.name for row in rows if row.held],
+        failing=[row.name for row in rows if row.failing],
+        refused=monitors.refused,
+        who=monitors.who,
+        differs_from_folder=monitors.differs_from_folder,
+    )
 
 
-def _row(monitors: Monitors, name: str) -> dict[str, Any]:
-    row = monitors.rows.get(name)
-    checked = monitors.checked
-    return {
-        "name": name,
-        "file": checked.monitors[name],
-        "enabled": monitors.enabled(name),
-        "held": name in monitors.held,
-        "failing": row is not None and row.failing,
-        "topics": sorted(checked.topics[name]),
-        "services": sorted(checked.services[name]),
-        "events": row.events if row is not None else 0,
-        "verdicts": row.verdicts if row is not None else 0,
-        "drops": row.drops if row is not None else 0,
-        "changes": row.changes if row is not None else 0,
-        "faults": row.faults if row is not None else 0,
-    }
+def states_of(monitors: Monitors) -> list[answers.MonitorState]:
+    """Every monitor, in the order in which they see messages."""
+    return [_state(monitors, name) for name in monitors.names()]
 
 
-def _replaced(replaced: Replaced, tag: str) -> dict[str, Any]:
-    return {
-        "revision": replaced.revision,
-        "tag": tag,
-        "replaced": replaced.replaced,
-        "added": replaced.added,
-        "changed": replaced.changed,
-        "removed": replaced.removed,
-        "warnings": replaced.warnings,
-        "moved": replaced.moved,
-        "began": replaced.began,
-        "kept": replaced.kept,
-    }
+def _state(monitors: Monitors, name: str) -> answers.MonitorState:
+    row, checked = monitors.rows.get(name), monitors.checked
+    return answers.MonitorState(
+        name=name,
+        file=checked.monitors[name],
+        enabled=monitors.enabled(name),
+        held=name in monitors.held,
+        failing=row is not None and row.failing,
+        topics=sorted(checked.topics[name]),
+        services=sorted(checked.services[name]),
+        events=row.events if row is not None else 0,
+        verdicts=row.verdicts if row is not None else 0,
+        drops=row.drops if row is not None else 0,
+        changes=row.changes if row is not None else 0,
+        faults=row.faults if row is not None else 0,
+    )

@@ -20,6 +20,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
 from appliance.channel import messages
+from appliance.channel.answers.status import AuditState
 from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
 from appliance.control.admin import AdminServer
@@ -27,10 +28,15 @@ from appliance.control.administration import Administration
 from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts, assemble
 from appliance.control.doors import Doors
 from appliance.control.forwarded import Forwarded
+from appliance.control.host_orders import HostOrders
 from appliance.control.lifeline import ControlLifeline
+from appliance.control.looks import Looks
+from appliance.control.monitor_orders import MonitorOrders
+from appliance.control.policy_orders import PolicyOrders
 from appliance.control.rest import RestLink
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
+from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
 from appliance.hosts.certification import Certification
@@ -216,20 +222,21 @@ class _Control:
             self._tokens.told()
         self._lifeline.was_announced = self._tokens.told
         self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
-        administration = Administration(
+        looks = Looks(
             parts,
             base.policies,
-            self._tokens,
-            base.store,
+            base.hosts,
             self._lifeline.surroundings,
-            hosts=base.hosts,
-            lag=lambda: self._audit.lag,
-            on_audit_failure=self._settings.audit.on_audit_failure,
-            audit_failed=lambda: self._audit.failed,
-            audit_degraded=lambda: self._audit.degraded,
+            audit=self._audit_state,
             queued_deliveries=lambda: parts.delivery.waiting,
-            forwarded=self._forwarded.status,
             live=parts.revocation.live,
+        )
+        administration = Administration(
+            looks,
+            PolicyOrders(base.policies, base.store),
+            MonitorOrders(parts),
+            HostOrders(base.hosts),
+            TokenOrders(self._tokens),
         )
         self._rest = RestLink(
             administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof
@@ -238,6 +245,16 @@ class _Control:
         if _ADMIN in sockets:
             self._admin = AdminServer(administration)
             await self._admin.start(sockets[_ADMIN].dup())
+
+    def _audit_state(self) -> AuditState:
+        assert self._forwarded is not None  # noqa: S101  it is asked when all is there
+        return AuditState(
+            *self._audit.lag,
+            failed=self._audit.failed,
+            on_failure=self._settings.audit.on_audit_failure,
+            degraded=self._audit.degraded,
+            forwarding=self._forwarded.status(),
+        )
 
     def _connect(self) -> None:
         """From now on the supervisor's messages and links to other processes are taken."""

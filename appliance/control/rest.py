@@ -13,6 +13,7 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
 import asyncio
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import structlog
 
@@ -28,6 +29,7 @@ from appliance.channel.admin import (
     HostRenewItself,
     HostToken,
     RestChange,
+    encode,
     verb_of,
 )
 from appliance.channel.channel import Channel, ChannelFullError
@@ -86,9 +88,7 @@ class RestLink:
             case messages.RequestMade(number):
                 if len(self._waiting) >= _MOST_WAITING:
                     text = "too many requests wait for the appliance: try again"
-                    self._send(
-                        messages.RequestAnswered(number, AdminAnswer(False, error=text, trouble="busy"))
-                    )
+                    self._send_answer(number, AdminAnswer(False, error=text, trouble="busy"))
                     return
                 self._waiting.append(message)
                 if self._worker is None or self._worker.done():
@@ -116,7 +116,7 @@ class RestLink:
         """Serve beside the others what waits for charon or the signer."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many hosts are being enrolled: try again"
-            self._send(messages.RequestAnswered(made.number, AdminAnswer(False, error=text, trouble="busy")))
+            self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
             return
         task = asyncio.get_running_loop().create_task(self._serve(channel, made))
         self._slow.add(task)
@@ -125,9 +125,9 @@ class RestLink:
     async def _serve(self, channel: Channel, made: messages.RequestMade) -> None:
         answer = await self._answer(made)
         if channel is self._channel:
-            self._send(messages.RequestAnswered(made.number, answer))
+            self._send_answer(made.number, answer)
 
-    async def _answer(self, made: messages.RequestMade) -> AdminAnswer:
+    async def _answer(self, made: messages.RequestMade) -> AdminAnswer[Any]:
         if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
             return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
         try:
@@ -176,6 +176,9 @@ class RestLink:
 
     def _state_tokens(self) -> None:
         self._send(messages.TokensStated(self._tokens.usable()))
+
+    def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+        self._send(messages.RequestAnswered(number, encode(answer)))
 
     def _send(self, message: messages.Message) -> None:
         if self._channel is None:

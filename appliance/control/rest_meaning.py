@@ -4,8 +4,7 @@ The api makes an order out of each request for a change. Control derives it agai
 carries it out only when both are the same: an api that fell cannot put another order under a proof.
 
 What a request leaves to the appliance is taken from the api's order, and is nothing but this: the signing request of a
-kit whose key the api makes, and the address at which a host reaches the appliance where nobody named one. Everything
-that a request does not say otherwise has the default that `docs/rest.md` gives.
+kit whose key the api makes. Everything that a request does not say otherwise has the default that `docs/rest.md` gives.
 """
 
 import json
@@ -110,23 +109,20 @@ def _hosts(  # noqa: PLR0911  one for each route
         case "POST", []:
             body = _body(asked)
             if body.get("how", "token") == "token":
-                return _host_token(body["name"], body, given, expected, new=True)
+                return _host_token(body["name"], body, expected, new=True)
             days, address = body.get("days", _DAYS), body.get("address")
             return admin.HostAdd(body["name"], _signing_request(body, given), days, address, expected)
         case "POST", [name, "token"]:
-            return _host_token(name, _body(asked), given, expected, new=False)
+            return _host_token(name, _body(asked), expected, new=False)
         case "POST", [name, "kit"]:
             body = _body(asked)
             return admin.HostRenew(name, _signing_request(body, given), body.get("days", _DAYS), expected)
     raise NoOrderError("no order about hosts is given there")
 
 
-def _host_token(
-    name: str, body: Mapping[str, Any], given: admin.RestRequest, expected: int | None, *, new: bool
-) -> admin.HostToken:
-    found = given.kit.get("endpoint", "") if isinstance(given, admin.HostToken) else ""
+def _host_token(name: str, body: Mapping[str, Any], expected: int | None, *, new: bool) -> admin.HostToken:
     kit = {
-        "endpoint": body.get("endpoint") or found,
+        "endpoint": body.get("endpoint") or "",
         "ports": body.get("ports", _LOCAL_PORTS),
         "open": ",".join(body.get("open", [])),
     }

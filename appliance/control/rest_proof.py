@@ -18,6 +18,7 @@ import time
 
 from appliance.audit.record import Severity
 from appliance.channel import admin
+from appliance.channel.answers.tokens import Challenge
 from appliance.channel.messages import Asked, RequestMade
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant
@@ -58,9 +59,9 @@ class Askers:
         self._checked: dict[str, bytes] = {}
         self._checking = asyncio.Lock()
 
-    def challenge(self) -> dict[str, object]:
+    def challenge(self) -> Challenge:
         """What the next order is signed under, and how long it is good."""
-        return {"challenge": self._challenges.give(time.monotonic()), "seconds": SECONDS}
+        return Challenge(self._challenges.give(time.monotonic()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:
         """The name of the token in whose name this is asked. Raises `UnprovenError`."""

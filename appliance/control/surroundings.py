@@ -1,6 +1,7 @@
 """What control knows of the rest of the appliance: told by the supervisor, shown by `rosrv status` and REST."""
 
-from appliance.channel.messages import FirewallReported, ProcessInfo
+from appliance.channel.answers.status import FirewallState, ProcessInfo
+from appliance.channel.messages import FirewallReported
 
 
 class Surroundings:
@@ -11,6 +12,6 @@ class Surroundings:
 
     def __init__(self) -> None:
         self.processes: list[ProcessInfo] = []
-        self.firewall = FirewallReported("unknown", {})
+        self.firewall = FirewallReported("unknown", FirewallState())
         self.probe = ""
         self.master = ""

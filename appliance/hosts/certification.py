@@ -9,14 +9,13 @@ Invariants:
 
 import asyncio
 import contextlib
-import hashlib
-import ssl
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from appliance.audit.record import Severity
+from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.awaited import Awaited
@@ -59,13 +58,13 @@ class Certification:
         self._master_port = master_port
         self._revocations: Counter[str] = Counter()  # of each name, in this life
         self._warned: set[str] = set()  # serials
-        self._pin = ""
+        self.pin = ""
         self._served = asyncio.Event()
         tunnels.each_hour = self._each_hour
 
     def served_by(self, pin: str) -> None:
         """The api says by what hosts recognise it."""
-        self._pin = pin
+        self.pin = pin
         self._served.set()
 
     def revoked(self, name: str) -> None:
@@ -125,46 +124,50 @@ class Certification:
         self.tunnels.state_anew()
         self.changed()
 
-    async def finish(self, name: str) -> dict[str, Any]:
-        """The answer to an enrolment, when all of it is on the disk and charon knows it."""
+    async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
+        """The answer to an enrolment, when all of it is on the disk and charon knows it; `kept`: with its token."""
         await self.store.settled()
         taken = await self.tunnels.until_taken()
-        return await self.kit(
-            name, None if taken else "charon does not know it yet; `rosrv status` and the log say why"
-        )
+        warning = None if taken else "charon does not know it yet; `rosrv status` and the log say why"
+        return await self.kit(name, warning, kept)
 
-    async def kit(self, name: str, warning: str | None) -> dict[str, Any]:
+    async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
         """What a host's kit is made of. Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
         authority = await self.authority_certificate()
+        own, rest = self.table.own_address, self.rest
         row, certificate = self.table.rows[name], self.table.certificates.get(name)
         if certificate is None or not certificate.certificate:
             raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
-        return {
-            **self.places(),
-            "revision": self.table.revision,
-            "name": name,
-            "address": row.address,
-            "warning": warning,
-            "serial": row.serial,
-            "expires": row.expires,
-            "certificate": certificate.certificate,
-            "authority": authority.decode(),
-            "authority_fingerprint": fingerprint(authority),
-        }
+        return KitParts(
+            revision=self.table.revision,
+            name=name,
+            address=row.address,
+            appliance=own,
+            master=f"http://{own}:{self._master_port}",
+            rest_url=f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
+            rest_trouble=rest.trouble,
+            pin=self.pin,
+            warning=warning,
+            serial=row.serial,
+            expires=row.expires,
+            certificate=certificate.certificate,
+            authority=authority.decode(),
+            kept=kept or {},
+        )
 
-    async def revocations(self) -> dict[str, Any]:
+    async def revocations(self) -> RevocationList:
         """The authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
-        return {"revocations": listed.decode()}
+        return RevocationList(listed.decode())
 
-    async def authority(self) -> dict[str, Any]:
+    async def authority(self) -> AuthorityCertificate:
         """The authority's certificate, in PEM. Raises `HostRefusedError`."""
-        return {"authority": (await self.authority_certificate()).decode()}
+        return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
         """The authority's own, in PEM. Raises `HostRefusedError`."""
@@ -180,18 +183,6 @@ class Certification:
         except TimeoutError:
             return False
         return True
-
-    def places(self) -> dict[str, Any]:
-        """Where hosts reach the appliance."""
-        own, rest = self.table.own_address, self.rest
-        return {
-            "appliance": own,
-            "master": f"http://{own}:{self._master_port}",
-            "rest_port": rest.port,
-            "rest_trouble": rest.trouble,
-            "rest_url": f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
-            "pin": self._pin,
-        }
 
     def _each_hour(self) -> None:
         """Certificates that follow ended ones count; those that end soon are recorded, once each."""
@@ -211,8 +202,3 @@ class Certification:
                     serial=row.serial,
                     expires=row.expires,
                 )
-
-
-def fingerprint(certificate: bytes) -> str:
-    """SHA-256 of a certificate (PEM), in hexadecimal."""
-    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()

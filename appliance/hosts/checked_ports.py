@@ -3,9 +3,9 @@
 import ipaddress
 import time
 from collections.abc import Callable
-from typing import Any
 
 from appliance.audit.record import Severity
+from appliance.channel.answers.hosts import PortsTold
 from appliance.hosts.certification import Certification
 from appliance.hosts.table import HostRefusedError
 from appliance.hosts.view import HostView
@@ -35,7 +35,7 @@ class CheckedPorts:
         checked: float,
         who: str,
         expected: int | None = None,
-    ) -> dict[str, Any]:
+    ) -> PortsTold:
         """What somebody saw of a machine's ports from outside. Raises as `add`."""
         self._table.require(expected)
         key = self._known_machine(name)
@@ -55,7 +55,7 @@ class CheckedPorts:
             who=who,
         )
         await self._certification.store.settled()
-        return {"revision": self._table.revision, "name": key, "ports": self._view.ports(key)}
+        return PortsTold(self._table.revision, key, self._view.ports(key))
 
     def in_clear_text(self) -> dict[str, int]:
         """Machines on which nodes run without a tunnel."""

@@ -2,23 +2,21 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any
 
+from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.messages import EndpointFound
 from appliance.hosts.table import HostRefusedError
 
 _PATIENCE_SECONDS = 20.0
 
 
-async def find_endpoint(
-    configured: str | None, look: Callable[[], Awaitable[EndpointFound]]
-) -> dict[str, Any]:
-    """`endpoint` and why it is that (`reason`): what is configured, else what the supervisor sees.
+async def find_endpoint(configured: str | None, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
+    """What is configured, else what the supervisor sees.
 
     Raises `HostRefusedError`, which says what to give instead.
     """
     if configured is not None:
-        return {"endpoint": configured, "reason": "ipsec.endpoint of the configuration"}
+        return Endpoint(configured, "ipsec.endpoint of the configuration")
     try:
         found = await asyncio.wait_for(look(), _PATIENCE_SECONDS)
     except TimeoutError:
@@ -29,4 +27,4 @@ async def find_endpoint(
             " --appliance ADDRESS (REST: `endpoint`), or for all hosts `ipsec: {endpoint: ADDRESS}` in appliance.yaml"
             " (compose: ROSRV_ENDPOINT=ADDRESS in .env)"
         )
-    return {"endpoint": found.address, "reason": found.reason}
+    return Endpoint(found.address, found.reason)

@@ -8,20 +8,24 @@ Invariants:
 3. No answer but the one to `token` has a token in it, and no answer has a private key.
 """
 
+import hashlib
 import ipaddress
+import ssl
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.channel.answers import hosts as answers
+from appliance.channel.answers.status import IpsecState
 from appliance.hosts.awaited import LONGEST_SECONDS, MOST
-from appliance.hosts.certification import Certification, fingerprint
+from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
 from appliance.hosts.declared import DeclaredHostsError
 from appliance.hosts.self_service import SelfService
 from appliance.hosts.table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.view import HostView
+from appliance.ipsec.enrolment import Enrolment
 from appliance.policy.model import Address
 from appliance.store.hosts import AwaitedRow
 
@@ -36,7 +40,7 @@ class Hosts:
     """
 
     def __init__(
-        self, certification: Certification, endpoint: Callable[[], Awaitable[dict[str, Any]]]
+        self, certification: Certification, endpoint: Callable[[], Awaitable[answers.Endpoint]]
     ) -> None:
         self._certification = certification
         self._store = certification.store
@@ -63,22 +67,22 @@ class Hosts:
             return {}
         return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
 
-    def overview(self) -> dict[str, Any]:
+    def overview(self) -> answers.Hosts:
         """Every host and machine, and how the tunnels stand."""
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
-        return {
-            "revision": self._table.revision,
-            "hosts": self._view.rows(),
-            "machines": self._view.machines(machines),
-            **{name: status[name] for name in _OVERVIEW},
-        }
+        return answers.Hosts(
+            self._table.revision,
+            self._view.rows(),
+            self._view.machines(machines),
+            **{name: getattr(status, name) for name in _OVERVIEW},
+        )
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> IpsecState:
         """For `rosrv status`."""
         return self._view.status(self.ports.in_clear_text())
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[answers.Host]:
         """Every host, enrolled, awaited or declared."""
         return self._view.rows()
 
@@ -102,7 +106,7 @@ class Hosts:
         who: str,
         address: str | None = None,
         expected: int | None = None,
-    ) -> dict[str, Any]:
+    ) -> answers.KitParts:
         """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
         async with self._certification.changing:
             self._table.require(expected)
@@ -117,7 +121,7 @@ class Hosts:
 
     async def renew(
         self, name: str, request: str, *, days: float, who: str, expected: int | None = None
-    ) -> dict[str, Any]:
+    ) -> answers.KitParts:
         """A new certificate for a host, the one before revoked. Raises as `add`."""
         async with self._certification.changing:
             self._table.require(expected)
@@ -140,8 +144,9 @@ class Hosts:
         new: bool,
         who: str,
         expected: int | None = None,
-    ) -> dict[str, Any]:
-        """A one-time token for a host. Raises as `add`."""
+    ) -> answers.EnrolmentToken:
+        """A one-time token for a host; an empty `endpoint` of `kit` is found. Raises as `add`."""
+        found = answers.Endpoint(kit["endpoint"], "") if kit["endpoint"] else await self.endpoint()
         async with self._certification.changing:
             self._table.require(expected)
             self._table.require_name(name)
@@ -163,7 +168,12 @@ class Hosts:
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
             row, text = self._awaited.add(
-                name, seconds=seconds, address=promised, days=days, kit=kit, who=who
+                name,
+                seconds=seconds,
+                address=promised,
+                days=days,
+                kit=kit | {"endpoint": found.endpoint},
+                who=who,
             )
             self._table.changed()
             self._recorder.happened(
@@ -177,17 +187,24 @@ class Hosts:
                 who=who,
             )
             await self._store.settled()
-            return {
-                **self._certification.places(),
-                "revision": self._table.revision,
-                "name": name,
-                "address": promised,
-                "token": text,
-                "token_expires": row.expires,
-                "authority_fingerprint": fingerprint(authority),
-            }
+            place = f"[{found.endpoint}]" if ":" in found.endpoint else found.endpoint
+            url = f"https://{place}:{self._certification.rest.port}"
+            joining = Enrolment(name, url, self._certification.pin, _fingerprint(authority))
+            return answers.EnrolmentToken(
+                revision=self._table.revision,
+                name=name,
+                address=promised,
+                token=text,
+                expires=row.expires,
+                endpoint=found.endpoint,
+                endpoint_reason=found.reason,
+                url=url,
+                pin=joining.pin,
+                authority=joining.authority,
+                script=joining.script(),
+            )
 
-    async def revoke(self, name: str, who: str, expected: int | None = None) -> dict[str, Any]:
+    async def revoke(self, name: str, who: str, expected: int | None = None) -> answers.Revoked:
         """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
         self._table.require(expected)
         self._certification.revoked(name)
@@ -212,15 +229,9 @@ class Hosts:
             who=who,
         )
         await self._store.settled()
-        return {
-            "revision": self._table.revision,
-            "name": name,
-            "address": row.address,
-            "serial": row.serial,
-            "taken_back": taken,
-        }
+        return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
-    async def reload(self, who: str, expected: int | None = None) -> dict[str, Any]:
+    async def reload(self, who: str, expected: int | None = None) -> answers.Reloaded:
         """Read hosts.yaml again: which tunnels are wanted. Raises as `add`; a bad file changes nothing."""
         self._table.require(expected)
         before = {row.name for row in self._table.admitted()}
@@ -241,7 +252,7 @@ class Hosts:
         await self.start()
         if self.addresses != meant:  # the first tunnel of all: only now is clear text kept out
             taken += self.changed()
-        divergence = [f"{row['name']}: {row['divergence']}" for row in self._view.rows() if row["divergence"]]
+        divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._recorder.happened(
             "hosts reloaded",
             f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
@@ -252,15 +263,15 @@ class Hosts:
             divergence=divergence,
             who=who,
         )
-        return {
-            "revision": self._table.revision,
-            "declared": sorted(self._table.declared.hosts),
-            "opened": sorted(after - before),
-            "closed": sorted(before - after),
-            "divergence": divergence,
-        }
+        return answers.Reloaded(
+            self._table.revision,
+            sorted(self._table.declared.hosts),
+            sorted(after - before),
+            sorted(before - after),
+            divergence,
+        )
 
-    async def kit(self, name: str) -> dict[str, Any]:
+    async def kit(self, name: str) -> answers.KitParts:
         """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
         self._table.enrolled_row(name)
         return await self._certification.kit(name, None)
@@ -272,7 +283,7 @@ class Hosts:
                 f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
             )
 
-    async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> dict[str, Any]:
+    async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> answers.Revoked:
         self._table.changed()
         self._recorder.happened(
             "host awaited no longer",
@@ -283,13 +294,12 @@ class Hosts:
             who=who,
         )
         await self._store.settled()
-        return {
-            "revision": self._table.revision,
-            "name": awaited.name,
-            "address": awaited.address,
-            "serial": "",
-            "taken_back": 0,
-        }
+        return answers.Revoked(self._table.revision, awaited.name, awaited.address, "", 0)
+
+
+def _fingerprint(certificate: bytes) -> str:
+    """SHA-256 of a certificate (PEM), in hexadecimal."""
+    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()
 
 
 _OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")

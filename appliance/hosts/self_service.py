@@ -15,9 +15,9 @@ Invariants:
 import asyncio
 import ipaddress
 import time
-from typing import Any
 
 from appliance.audit.record import Severity
+from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
 from appliance.hosts.awaited import BadEnrolmentTokenError
 from appliance.hosts.certification import Certification
 from appliance.hosts.table import HostForbiddenError, HostRefusedError
@@ -44,7 +44,7 @@ class SelfService:
             if name.startswith(_RENEWED)
         }
 
-    async def enrol(self, token: str, request: str, peer: str) -> dict[str, Any]:
+    async def enrol(self, token: str, request: str, peer: str) -> KitParts:
         """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
@@ -67,9 +67,9 @@ class SelfService:
             self._certification.enrolled(
                 name, awaited.address, made, awaited.who, token=awaited.id, peer=peer
             )
-            return {**await self._certification.finish(name), "kit": awaited.kit}
+            return await self._certification.finish(name, awaited.kit)
 
-    async def renew(self, name: str, request: str, proof: bytes, peer: str) -> dict[str, Any]:
+    async def renew(self, name: str, request: str, proof: bytes, peer: str) -> NewCertificate:
         """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
         async with self._certification.changing:
             row = self._in_its_tunnel(name, peer)
@@ -86,15 +86,11 @@ class SelfService:
             self._note_renewal(name)
             await self._certification.store.settled()
             authority = await self._certification.authority_certificate()
-            return {
-                "name": name,
-                "serial": made.serial,
-                "expires": made.expires,
-                "certificate": made.certificate.decode(),
-                "authority": authority.decode(),
-            }
+            return NewCertificate(
+                name, made.serial, made.expires, made.certificate.decode(), authority.decode()
+            )
 
-    async def renewed(self, name: str, peer: str) -> dict[str, Any]:
+    async def renewed(self, name: str, peer: str) -> Renewed:
         """A host has put its next certificate in place. Raises `HostRefusedError`."""
         before = self._in_its_tunnel(name, peer).serial
         row = self._table.take_next(name)
@@ -103,7 +99,7 @@ class SelfService:
         self._certification.renewed(name, before, row.serial, row.expires, name)
         await self._certification.store.settled()
         asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
-        return {"name": name}
+        return Renewed(name)
 
     def _in_its_tunnel(self, name: str, peer: str) -> HostRow:
         address = ipaddress.ip_address(peer)

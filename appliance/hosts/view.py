@@ -3,15 +3,17 @@
 import math
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import cast
 
+from appliance.channel.answers.hosts import Host, Machine, PortsSeen, PortsState, State
+from appliance.channel.answers.status import IpsecState
 from appliance.hosts.awaited import Awaited
 from appliance.hosts.table import HostTable
 from appliance.hosts.tunnels import Tunnels
 from appliance.store.hosts import AwaitedRow, HostRow
 
 SOON_SECONDS = 14 * 86_400.0
-_NEVER: dict[str, Any] = {"state": "unknown", "checked": None, "open": [], "who": ""}
+_NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
@@ -29,40 +31,40 @@ class HostView:
         self._awaited = awaited
         self._tunnels = tunnels
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[Host]:
         """Every host, enrolled, awaited or declared, by name."""
         awaited = self._awaited.rows()
         names = {*self._table.rows, *self._table.declared.hosts, *awaited}
         return [self._row(name, awaited.get(name)) for name in sorted(names)]
 
-    def _row(self, name: str, awaited: AwaitedRow | None) -> dict[str, Any]:
+    def _row(self, name: str, awaited: AwaitedRow | None) -> Host:
         declared = self._table.declared.hosts.get(name)
         row, seen = self._table.rows.get(name), self._tunnels.seen.get(name)
         promised = awaited.address if awaited else declared.address if declared else None
         certificate = self._table.certificates.get(name)
         now = time.time()
-        return {
-            "name": name,
-            "address": row.address if row else promised,
-            "state": self._state(name, row, now, awaited=awaited is not None),
-            "groups": list(declared.groups) if declared else [],
-            "declared": declared is not None,
-            "wanted": self._table.declared.wants(name),
-            "divergence": self.divergence(name),
-            "serial": row.serial if row else None,
-            "enrolled": row.enrolled if row else None,
-            "expires": row.expires if row else None,
-            "expires_soon": row is not None and row.revoked is None and soon(self._table, row, now),
-            "renewing": certificate is not None and certificate.next is not None,
-            "revoked": row.revoked if row else None,
-            "remote": seen.remote if seen else None,
-            "seconds": seen.seconds if seen else None,
-            "bytes_in": seen.bytes_in if seen else None,
-            "bytes_out": seen.bytes_out if seen else None,
-            "last_seen": self._tunnels.last.get(name),
-            "token_expires": awaited.expires if awaited else None,
-            "ports": self.ports(name),
-        }
+        return Host(
+            name=name,
+            address=row.address if row else promised,
+            state=self._state(name, row, now, awaited=awaited is not None),
+            groups=list(declared.groups) if declared else [],
+            declared=declared is not None,
+            wanted=self._table.declared.wants(name),
+            divergence=self.divergence(name),
+            serial=row.serial if row else None,
+            enrolled=row.enrolled if row else None,
+            expires=row.expires if row else None,
+            expires_soon=row is not None and row.revoked is None and soon(self._table, row, now),
+            renewing=certificate is not None and certificate.next is not None,
+            revoked=row.revoked if row else None,
+            remote=seen.remote if seen else None,
+            seconds=seen.seconds if seen else None,
+            bytes_in=seen.bytes_in if seen else None,
+            bytes_out=seen.bytes_out if seen else None,
+            last_seen=self._tunnels.last.get(name),
+            token_expires=awaited.expires if awaited else None,
+            ports=self.ports(name),
+        )
 
     def divergence(self, name: str) -> str | None:
         """What is different from hosts.yaml; None also where nothing is declared at all."""
@@ -79,40 +81,40 @@ class HostView:
             return f"hosts.yaml keeps {declared.address} for it; it has {row.address} for good"
         return None
 
-    def ports(self, name: str) -> dict[str, Any]:
+    def ports(self, name: str) -> PortsSeen:
         """What was last seen of its ROS ports from outside."""
         row = self._table.ports.get(name)
         if row is None:
-            return dict(_NEVER)
-        return {"state": row.state, "checked": row.checked, "open": row.open, "who": row.who}
+            return _NEVER
+        return PortsSeen(cast(PortsState, row.state), row.checked, row.open, row.who)
 
-    def status(self, machines: Mapping[str, int]) -> dict[str, Any]:
+    def status(self, machines: Mapping[str, int]) -> IpsecState:
         """How the tunnels stand, and what a person should look at."""
         charon = self._tunnels.charon
-        return {
-            "esp": self._tunnels.esp,
-            "key_exchange": charon.key_exchange if charon else [],
-            "post_quantum": any("mlkem" in one for one in charon.key_exchange) if charon else None,
-            "charon": charon.version if charon else None,
-            "pool": str(self._table.pool),
-            "address": self._table.own_address,
-            "hosts_file": str(self._table.declared.path),
-            "enrolled": len(self._table.enrolled()),
-            "awaited": len(self._awaited.rows()),
-            "up": len(self._tunnels.seen),
-            "troubles": [*self._troubles(), *self._open_ports()],
-            "ports": self._known_ports(machines),
-        }
+        return IpsecState(
+            esp=self._tunnels.esp,
+            key_exchange=charon.key_exchange if charon else [],
+            post_quantum=any("mlkem" in one for one in charon.key_exchange) if charon else None,
+            charon=charon.version if charon else None,
+            pool=str(self._table.pool),
+            address=self._table.own_address,
+            hosts_file=str(self._table.declared.path),
+            enrolled=len(self._table.enrolled()),
+            awaited=len(self._awaited.rows()),
+            up=len(self._tunnels.seen),
+            troubles=[*self._troubles(), *self._open_ports()],
+            ports=self._known_ports(machines),
+        )
 
-    def machines(self, machines: Mapping[str, int]) -> list[dict[str, Any]]:
+    def machines(self, machines: Mapping[str, int]) -> list[Machine]:
         """Machines in clear text on which nodes run, and those of which somebody told."""
         told = self._table.ports.keys() - self._table.rows.keys() - self._table.declared.hosts.keys()
         return [
-            {"address": address, "nodes": machines.get(address, 0), "ports": self.ports(address)}
+            Machine(address, machines.get(address, 0), self.ports(address))
             for address in sorted({*machines, *told})
         ]
 
-    def _known_ports(self, machines: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+    def _known_ports(self, machines: Mapping[str, int]) -> dict[str, PortsSeen]:
         """Of every host that may have nodes, by name or address."""
         return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
 
@@ -123,7 +125,7 @@ class HostView:
             if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
         ]
 
-    def _state(self, name: str, row: HostRow | None, now: float, *, awaited: bool) -> str:
+    def _state(self, name: str, row: HostRow | None, now: float, *, awaited: bool) -> State:
         if row is None:
             return "awaited" if awaited else "not enrolled"
         if row.revoked is not None:

@@ -15,19 +15,21 @@ Invariants:
 import contextlib
 import ipaddress
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
+import msgspec
 import structlog
 
+from appliance.channel.answers.status import FirewallRule, FirewallState
 from appliance.channel.own_node import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
-from appliance.network.firewall.firewall import Firewall
+from appliance.network.firewall.firewall import Firewall, RuleStatus
 from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNode, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
@@ -98,9 +100,9 @@ class Enclosure:
         """Where hosts of other networks reach the appliance. Raises `NetworkError` when that cannot be told."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> FirewallState:
         """How it stands, for `rosrv status`."""
-        return {}
+        return FirewallState()
 
     def probe(self) -> str | None:
         """None when no other user can reach what must be hidden, else what was seen."""
@@ -224,11 +226,11 @@ class Contained(Enclosure):
             return replace(found, reason=reason)
         return found
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> FirewallState:
         """Back end, rules with counters; rules that are gone are put back first."""
         with self._standing():
             if self._firewall is None:
-                return {}
+                return FirewallState()
             report = self._firewall.report()
             if self._owed or not report.intact:
                 gone = [rule.purpose for rule in report.rules if not rule.in_force]
@@ -237,8 +239,7 @@ class Contained(Enclosure):
                 self._firewall.install(self._settings())
                 self._owed = False
                 report = self._firewall.report()
-        rules = [asdict(rule) for rule in report.rules]
-        return {"backend": report.backend, "not_used": list(report.not_used), "rules": rules}
+        return FirewallState(report.backend, list(report.not_used), _shown(report.rules))
 
     def probe(self) -> str | None:
         """Try to reach ROSMaster and the inner face as another local user."""
@@ -369,7 +370,7 @@ class InNamespace(Contained):
         """The machine's address towards its default route, else its only one."""
         return self._isolation.endpoint()
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> FirewallState:
         """As in a container, and the rules on the host; those that are gone are put back, too."""
         with self._standing():
             rules = self._isolation.rules()
@@ -379,8 +380,9 @@ class InNamespace(Contained):
                 log.critical("rules on the host were taken away and are put back", rules=gone)
                 self._isolation.put_rules_back()
                 rules = self._isolation.rules()
-            forwarding = {"forwarding": [asdict(rule) for rule in rules]}
-            return super().report() | forwarding | self._look_at_others()
+            return msgspec.structs.replace(
+                super().report(), forwarding=_shown(rules), **self._look_at_others()
+            )
 
     def _look_at_others(self) -> dict[str, list[str]]:
         """What programs such as Docker do to forwarded packets on the host; it is said when it changes."""
@@ -401,6 +403,10 @@ class InNamespace(Contained):
             for obstacle in found["obstacles"]:
                 log.warning("connections from the network may not reach the appliance", reason=obstacle)
         return found
+
+
+def _shown(rules: Iterable[RuleStatus]) -> list[FirewallRule]:
+    return [FirewallRule(**asdict(rule)) for rule in rules]
 
 
 def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:

@@ -17,6 +17,7 @@ from typing import TypeVar
 import structlog
 
 from appliance.channel import messages
+from appliance.channel.answers.status import FirewallState
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure
@@ -41,7 +42,7 @@ class Guard:
         self._one_at_a_time = asyncio.Lock()
         self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # routes are only looked up
         self._probe: messages.Message | None = None
-        self._report = messages.FirewallReported(isolation=enclosure.kind, report={})
+        self._report = messages.FirewallReported(isolation=enclosure.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
         """What a new control has to know."""

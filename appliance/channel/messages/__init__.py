@@ -7,6 +7,7 @@ process cannot be told anything that is not written here. A struct that travels 
 Strings from strangers (names, header values) are carried as values and never interpreted on the way.
 """
 
+from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.messages.api import (
     ApiLink,
     Asked,
@@ -34,7 +35,6 @@ from appliance.channel.messages.lifeline import (
     ProbeFailed,
     ProbePassed,
     ProcessesChanged,
-    ProcessInfo,
     Ready,
     RouteFound,
     RouteWanted,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.admin import AdminAnswer, RestRequest
+from appliance.channel.admin import RestRequest
 from appliance.channel.messages.message import Message
 
 
@@ -36,10 +36,10 @@ class RequestMade(Message):
 
 
 class RequestAnswered(Message):
-    """Control's answer to `RequestMade` with the same number."""
+    """Control's answer to `RequestMade` with the same number: the document that the admin socket would carry."""
 
     number: int
-    answer: AdminAnswer
+    answer: bytes
 
 
 class TokenKept(msgspec.Struct, frozen=True):

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.messages.message import Message
 from appliance.channel.messages.signer import SignatureMade, SignatureWanted
 from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
@@ -97,17 +98,6 @@ class Announced(Message):
     """Whoever started the appliance has been told what control said with `Ready`, the first token included."""
 
 
-class ProcessInfo(msgspec.Struct, frozen=True):
-    """One process of the appliance as `rosrv status` shows it; `since` is RFC 3339 UTC."""
-
-    role: str
-    pid: int
-    since: str
-    restarts: int
-    walls: str = ""  # in words; empty for the supervisor, and for a process that has not told yet
-    lacks: list[str] = []  # what this kernel lacks of them
-
-
 class ProcessesChanged(Message):
     """Supervisor tells control which processes run; sent at start and after every start or death."""
 
@@ -118,7 +108,7 @@ class FirewallReported(Message):
     """Supervisor tells control the state of isolation and firewall for `rosrv status`."""
 
     isolation: str
-    report: dict[str, Any]
+    report: FirewallState
 
 
 class ProbeFailed(Message):

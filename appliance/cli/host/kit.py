@@ -1,14 +1,14 @@
 """What `rosrv host` writes for a host: its kit, or the script by which it enrols itself."""
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import typer
 
-from appliance.api.kits import Wishes, enrolment_of, kit_of
+from appliance.api.kits import Wishes, kit_of
 from appliance.channel.admin import HostEndpoint
+from appliance.channel.answers.hosts import EnrolmentToken, KitParts
 from appliance.cli.host.output import Output, usage_error
 from appliance.cli.output import moment, say_json
 from appliance.cli.running import Appliance
@@ -33,24 +33,15 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Wi
         raise usage_error(str(error)) from None
 
 
-@dataclass(frozen=True)
-class Placed:
-    """What a host is given; `reason`: why the appliance took its own address for that, empty where it was said."""
+def placed(running: Appliance, wishes: Wishes, *, as_json: bool) -> tuple[Wishes, str]:
+    """The wishes with the address of the appliance, and why it is that where nobody said it.
 
-    wishes: Wishes
-    reason: str = ""
-
-
-def place(running: Appliance, wishes: Wishes, *, as_json: bool) -> Placed:
-    """The wishes with the address of the appliance, which it finds where nobody said it.
-
-    Over REST it is found when the order is carried out, and the answer has it. Ends the program with 1 when it
-    cannot be told.
+    Ends the program with 1 when it cannot be told.
     """
-    if wishes.endpoint or running.remote:
-        return Placed(wishes)
-    body = running.ask_or_exit(HostEndpoint(), as_json=as_json)
-    return Placed(replace(wishes, endpoint=body["endpoint"]), body["reason"])
+    if wishes.endpoint:
+        return wishes, ""
+    found = running.ask_or_exit(HostEndpoint(), as_json=as_json)
+    return replace(wishes, endpoint=found.endpoint), found.reason
 
 
 class KitWriter:
@@ -66,32 +57,32 @@ class KitWriter:
         else:
             self.request = _read_request(csr)
 
-    def write(self, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
-        """Write the archive."""
-        wishes, output = placed.wishes, self._output
+    def write(self, body: KitParts, wishes: Wishes, reason: str, *, as_json: bool) -> None:
+        """Write the archive; `reason`: why the appliance's address is that, empty where it was said."""
+        output = self._output
         again = (
-            f"{body['name']} is enrolled, its kit is not written:"
-            f" rosrv host kit {body['name']} --appliance {wishes.endpoint} --out FILE"
+            f"{body.name} is enrolled, its kit is not written:"
+            f" rosrv host kit {body.name} --appliance {wishes.endpoint} --out FILE"
         )
         output.write(archive(kit_of(body, wishes, self._key)), again)
-        if body["warning"]:
-            typer.echo(f"rosrv: {body['warning']}", err=True)
-        if not body["rest_url"]:
+        if body.warning:
+            typer.echo(f"rosrv: {body.warning}", err=True)
+        if not body.rest_url:
             typer.echo(
-                f"rosrv: {body['name']} cannot renew its certificate by itself: {body['rest_trouble']}",
+                f"rosrv: {body.name} cannot renew its certificate by itself: {body.rest_trouble}",
                 err=True,
             )
         if as_json:
-            where = {"endpoint": wishes.endpoint, "endpoint_reason": placed.reason}
-            say_json({key: body[key] for key in _SHOWN} | where | {"kit": str(output.path)})
+            where = {"endpoint": wishes.endpoint, "endpoint_reason": reason}
+            say_json({key: getattr(body, key) for key in _SHOWN} | where | {"kit": str(output.path)})
             return
-        output.say(f"{body['name']} is enrolled as {body['address']}, until {moment(body['expires'])}")
+        output.say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
         kit = "standard output" if output.is_standard else str(output.path)
         output.say(
             f"its kit: {kit}" + ("" if self._key else " (without the private key, which the host has)")
         )
-        if placed.reason:
-            output.say(_taken(wishes.endpoint, placed.reason))
+        if reason:
+            output.say(_taken(wishes.endpoint, reason))
         output.say("on the host: unpack it, then sudo ./join.sh")
 
 
@@ -99,26 +90,20 @@ def _taken(endpoint: str, reason: str) -> str:
     return f"the appliance is at {endpoint} ({reason}); another: --appliance"
 
 
-def write_script(output: Output, body: dict[str, Any], placed: Placed, *, as_json: bool) -> None:
+def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None:
     """Write the script of a host that was given a one-time token, and print the token."""
-    try:
-        script = body.get("script") or enrolment_of(body, placed.wishes).script()
-    except ValueError as error:
-        typer.echo(f"rosrv: {error}", err=True)
-        raise typer.Exit(1) from None
-    endpoint = body.get("endpoint", placed.wishes.endpoint)
-    reason = body.get("endpoint_reason", placed.reason)
-    output.write(script.encode(), "the token is lost: ask for another one")
+    output.write(made.script.encode(), "the token is lost: ask for another one")
     if as_json:
-        shown = {key: body[key] for key in ("name", "address", "token", "token_expires")}
-        where = {"endpoint": endpoint, "endpoint_reason": reason}
-        say_json(shown | where | {"script": str(output.path)})
+        shown = {
+            key: getattr(made, key) for key in ("name", "address", "token", "endpoint", "endpoint_reason")
+        }
+        say_json(shown | {"token_expires": made.expires, "script": str(output.path)})
         return
-    output.say(body["token"])
-    if reason:
-        typer.echo(f"rosrv: {_taken(endpoint, reason)}", err=True)
+    output.say(made.token)
+    if made.endpoint_reason:
+        typer.echo(f"rosrv: {_taken(made.endpoint, made.endpoint_reason)}", err=True)
     typer.echo(
-        f"rosrv: {body['name']} is awaited as {body['address']} until {moment(body['token_expires'])}; the token is"
+        f"rosrv: {made.name} is awaited as {made.address} until {moment(made.expires)}; the token is"
         f" good once and shown only here.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
         err=True,
     )

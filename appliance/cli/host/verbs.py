@@ -1,12 +1,13 @@
 """`rosrv host add|list|kit|reload|revoke`: who may come through a tunnel."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
-from appliance.cli.host.kit import KitWriter, place, wishes_of, write_script
+from appliance.channel.answers.hosts import Host, PortsSeen
+from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
@@ -74,15 +75,14 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             )
         seconds = _seconds(within)
         with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
-            placed = place(running, wishes, as_json=as_json)
-            order = HostToken(name, placed.wishes.kept(), seconds, days, address, new=True)
-            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+            order = HostToken(name, wishes.kept(), seconds, days, address, new=True)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
         writer = KitWriter(output, csr=csr)
-        placed = place(running, wishes, as_json=as_json)
+        wishes, reason = placed(running, wishes, as_json=as_json)
         order_kit = HostAdd(name, writer.request, days, address)
-        writer.write(running.ask_or_exit(order_kit, as_json=as_json), placed, as_json=as_json)
+        writer.write(running.ask_or_exit(order_kit, as_json=as_json), wishes, reason, as_json=as_json)
 
 
 @app.command()
@@ -110,15 +110,14 @@ def kit(  # noqa: PLR0917  as above
     if token:
         seconds = _seconds(within)
         with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
-            placed = place(running, wishes, as_json=as_json)
-            order = HostToken(name, placed.wishes.kept(), seconds, days)
-            write_script(output, running.ask_or_exit(order, as_json=as_json), placed, as_json=as_json)
+            order = HostToken(name, wishes.kept(), seconds, days)
+            write_script(output, running.ask_or_exit(order, as_json=as_json), as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
         writer = KitWriter(output, csr=csr)
-        placed = place(running, wishes, as_json=as_json)
+        wishes, reason = placed(running, wishes, as_json=as_json)
         body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
-        writer.write(body, placed, as_json=as_json)
+        writer.write(body, wishes, reason, as_json=as_json)
 
 
 @app.command("list")
@@ -133,8 +132,8 @@ def list_hosts(
     Example: rosrv host list
     """
     body = running.ask_or_exit(HostList(), as_json=as_json)
-    for row in body["hosts"]:
-        if group is not None and group not in row["groups"]:
+    for row in body.hosts:
+        if group is not None and group not in row.groups:
             continue
         if as_json:
             say_json(row)
@@ -142,10 +141,10 @@ def list_hosts(
             say("  ".join(_words(row)))
     if as_json or group is not None:
         return
-    for one in body["machines"]:
-        nodes = f"{one['nodes']} nodes in clear text"
-        say("  ".join([f"{one['address']:<37} {nodes:<13}", _ports_words(one["ports"])]))
-    for trouble in body["troubles"]:
+    for one in body.machines:
+        nodes = f"{one.nodes} nodes in clear text"
+        say("  ".join([f"{one.address:<37} {nodes:<13}", _ports_words(one.ports)]))
+    for trouble in body.troubles:
         say(f"! {trouble}")
 
 
@@ -160,11 +159,11 @@ def reload(running: Appliance, as_json: Json = False) -> None:
     if as_json:
         say_json(body)
         return
-    say(f"{len(body['declared'])} hosts are declared")
-    for word, names in (("may come again", body["opened"]), ("tunnel closed", body["closed"])):
+    say(f"{len(body.declared)} hosts are declared")
+    for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
         if names:
             say(f"{word}: {', '.join(names)}")
-    for one in body["divergence"]:
+    for one in body.divergence:
         say(f"! {one}")
 
 
@@ -178,41 +177,35 @@ def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
     body = running.ask_or_exit(HostRevoke(name), as_json=as_json)
     if as_json:
         say_json(body)
-    elif not body["serial"]:
-        say(f"{body['name']} is awaited no longer: its one-time token opens nothing")
+    elif not body.serial:
+        say(f"{body.name} is awaited no longer: its one-time token opens nothing")
     else:
-        say(
-            f"{body['name']} ({body['address']}) is revoked; {body['taken_back']} registrations and grants taken back"
-        )
+        say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
 
 
-def _words(row: dict[str, Any]) -> list[str]:
-    parts = [f"{row['name']:<20} {row['address'] or '-':<16} {row['state']:<13}"]
-    if row["state"] == "up":
-        parts.append(
-            f"from {row['remote']} for {row['seconds']} s, {row['bytes_in']} B in, {row['bytes_out']} B out"
-        )
-    if row["last_seen"] is not None:
-        parts.append(f"last seen {moment(row['last_seen'])}")
-    if row["expires"] is not None and row["state"] != "revoked":
-        parts.append(
-            f"certificate until {moment(row['expires'])}" + (" (soon!)" if row["expires_soon"] else "")
-        )
-    if row["token_expires"] is not None:
-        parts.append(f"token until {moment(row['token_expires'])}")
-    if row["state"] not in ("not enrolled", "revoked", "awaited"):
-        parts.append(_ports_words(row["ports"]))
-    if row["groups"]:
-        parts.append(f"in {', '.join(row['groups'])}")
-    if row["divergence"]:
-        parts.append(f"({row['divergence']})")
+def _words(row: Host) -> list[str]:
+    parts = [f"{row.name:<20} {row.address or '-':<16} {row.state:<13}"]
+    if row.state == "up":
+        parts.append(f"from {row.remote} for {row.seconds} s, {row.bytes_in} B in, {row.bytes_out} B out")
+    if row.last_seen is not None:
+        parts.append(f"last seen {moment(row.last_seen)}")
+    if row.expires is not None and row.state != "revoked":
+        parts.append(f"certificate until {moment(row.expires)}" + (" (soon!)" if row.expires_soon else ""))
+    if row.token_expires is not None:
+        parts.append(f"token until {moment(row.token_expires)}")
+    if row.state not in ("not enrolled", "revoked", "awaited"):
+        parts.append(_ports_words(row.ports))
+    if row.groups:
+        parts.append(f"in {', '.join(row.groups)}")
+    if row.divergence:
+        parts.append(f"({row.divergence})")
     return parts
 
 
-def _ports_words(ports: dict[str, Any]) -> str:
-    if ports["checked"] is None:
+def _ports_words(ports: PortsSeen) -> str:
+    if ports.checked is None:
         return "ports never checked"
-    return f"ports {ports['state']} ({moment(ports['checked'])})"
+    return f"ports {ports.state} ({moment(ports.checked)})"
 
 
 def _seconds(text: str) -> float:

@@ -3,9 +3,10 @@
 import sys
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from msgspec.structs import asdict
 from rich.console import Console
 from rich.table import Column, Table
 
@@ -18,6 +19,7 @@ from appliance.channel.admin import (
     MonitorsWanted,
     MonitorSwitch,
 )
+from appliance.channel.answers.monitors import MonitorState, Replaced
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
 
@@ -34,26 +36,26 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
     """
     body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
     if as_json:
-        for row in body["monitors"]:
+        for row in body.monitors:
             say_json(row)
         return
-    if body["refused"]:
-        say(f"the relay does not take them: {body['refused'][0]}", "red")
+    if body.refused:
+        say(f"the relay does not take them: {body.refused[0]}", "red")
     table = Table(
         "monitor", "state", Column("listens to", overflow="fold"), "events", "verdicts", "drops", "changes", "faults",
         box=None, padding=(0, 2, 0, 0), header_style="dim",
     )  # fmt: skip
-    for row in body["monitors"]:
-        counts = [str(row[name]) for name in ("events", "verdicts", "drops", "changes", "faults")]
-        table.add_row(row["name"], _state(row), "\n".join(row["topics"] + row["services"]), *counts)
+    for row in body.monitors:
+        counts = [str(getattr(row, name)) for name in ("events", "verdicts", "drops", "changes", "faults")]
+        table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts)
     Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
-    source = f" ({body['folder']})" if body["folder"] else ""
+    source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; not what the folder has (rosrv monitor reload takes that, and removes nothing that was loaded here)"
-        if body["folder"] and body["differs_from_folder"]
+        if body.folder and body.differs_from_folder
         else ""
     )
-    say(f"revision {body['revision']} of the specifications{source}, by {body['who']}{differs}")
+    say(f"revision {body.revision} of the specifications{source}, by {body.who}{differs}")
 
 
 @speaks
@@ -133,13 +135,13 @@ def reload(
     """
     body = appliance.ask_or_exit(MonitorReload(prune=prune), as_json=as_json)
     _say_replaced(body, as_json=as_json)
-    if body["kept"] and not as_json:
+    if body.kept and not as_json:
         say(
-            f"not of the folder, and still in force: {', '.join(body['kept'])} (--prune removes them)",
+            f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)",
             "yellow",
         )
     if not as_json:
-        _say_disabled(appliance, [*body["added"], *body["changed"]])
+        _say_disabled(appliance, [*body.added, *body.changed])
 
 
 @speaks
@@ -152,16 +154,16 @@ def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
     if as_json:
         say_json(body)
     else:
-        say(f"resumed: {', '.join(body['names']) or 'none was held'}")
+        say(f"resumed: {', '.join(body.names) or 'none was held'}")
 
 
 @speaks
 def rv_state(appliance: Appliance, as_json: Json = False) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
     body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
-    real, port, rows = body["rv_state"]
+    real, port, rows = body.rv_state
     if as_json:
-        say_json(body["rv_state"])
+        say_json(body.rv_state)
         return
     say(f"ROSMaster port {real}, RVMaster port {port}")
     for name, topic, xmlrpc, tcp in rows:
@@ -171,39 +173,43 @@ def rv_state(appliance: Appliance, as_json: Json = False) -> None:
 def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
     body = appliance.ask_or_exit(MonitorSwitch(names, enabled), as_json=as_json)
     if as_json:
-        say_json(body)
+        say_json({**asdict(body), "enabled": enabled})
         return
     word = "enabled" if enabled else "disabled"
-    say(f"{word}: {', '.join(body['names']) or 'nothing, it was so already'}")
+    say(f"{word}: {', '.join(body.names) or 'nothing, it was so already'}")
 
 
-def _state(row: dict[str, Any]) -> str:
-    if row["held"]:
+def _state(row: MonitorState) -> str:
+    if row.held:
         return "holds its topics"
-    if row["failing"]:
+    if row.failing:
         return "failing"
-    return "enabled" if row["enabled"] else "disabled"
+    return "enabled" if row.enabled else "disabled"
 
 
-def _say_replaced(body: dict[str, Any], *, as_json: bool) -> None:
+def _say_replaced(body: Replaced, *, as_json: bool) -> None:
     if as_json:
         say_json(body)
         return
-    for warning in body["warnings"]:
+    for warning in body.warnings:
         say(warning, "yellow")
-    parts = [f"{word} {', '.join(body[word])}" for word in ("added", "changed", "removed") if body[word]]
+    parts = [
+        f"{word} {', '.join(files)}"
+        for word, files in (("added", body.added), ("changed", body.changed), ("removed", body.removed))
+        if files
+    ]
     what = "; ".join(parts) or "nothing is different"
-    say(f"revision {body['revision']} of the specifications is in force (was {body['replaced']}): {what}")
-    if body["moved"]:
-        names = ", ".join(body["moved"])
+    say(f"revision {body.revision} of the specifications is in force (was {body.replaced}): {what}")
+    if body.moved:
+        names = ", ".join(body.moved)
         say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
-    if body["warnings"]:
-        say(counted(len(body["warnings"]), "warning"), "yellow")
+    if body.warnings:
+        say(counted(len(body.warnings), "warning"), "yellow")
 
 
 def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
     """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
-    rows = appliance.ask_or_exit(MonitorsWanted(), as_json=False)["monitors"]
-    names = [row["name"] for row in rows if row["file"] in files and not row["enabled"]]
+    rows = appliance.ask_or_exit(MonitorsWanted(), as_json=False).monitors
+    names = [row.name for row in rows if row.file in files and not row.enabled]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")

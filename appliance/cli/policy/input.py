@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec.structs import asdict
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
@@ -100,7 +101,8 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
 
 def live_now(appliance: Appliance) -> list[Live]:
     """What is live at the running appliance. Raises `NotRunningError`."""
-    return [Live.of(row) for row in appliance.ask(RegistrationsWanted()).body.get("registrations", ())]
+    answer = appliance.ask(RegistrationsWanted())
+    return [Live.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:

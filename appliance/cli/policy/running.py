@@ -1,11 +1,12 @@
 """`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
 
 import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
+from appliance.channel.answers.policy import Loaded
 from appliance.cli.output import Json, counted, say, say_json
 from appliance.cli.policy.input import usage_error
 from appliance.cli.running import Appliance, speaks
@@ -59,9 +60,9 @@ def confirm(appliance: Appliance, as_json: Json = False) -> None:
     if as_json:
         say_json(body)
     else:
-        kept = f"revision {body['revision']} stays in force"
-        say(kept if body["confirmed"] else f"nothing waits to be confirmed: {kept}")
-    raise typer.Exit(0 if body["confirmed"] else 1)
+        kept = f"revision {body.revision} stays in force"
+        say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
+    raise typer.Exit(0 if body.confirmed else 1)
 
 
 @speaks
@@ -70,28 +71,26 @@ def revisions(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv policy revisions
     """
-    for row in appliance.ask_or_exit(PolicyRevisions(), as_json=as_json)["revisions"]:
+    for row in appliance.ask_or_exit(PolicyRevisions(), as_json=as_json).revisions:
         if as_json:
             say_json(row)
             continue
-        loaded = datetime.datetime.fromtimestamp(row["loaded"], datetime.UTC).isoformat(timespec="seconds")
-        mark = "in force" if row["in_force"] else ""
-        say(f"{row['revision']:>5}  {loaded}  {row['who']}: {row['note']}  {row['file']}  {mark}".rstrip())
+        loaded = datetime.datetime.fromtimestamp(row.loaded, datetime.UTC).isoformat(timespec="seconds")
+        mark = "in force" if row.in_force else ""
+        say(f"{row.revision:>5}  {loaded}  {row.who}: {row.note}  {row.file}  {mark}".rstrip())
 
 
-def _say_loaded(body: dict[str, Any], *, as_json: bool) -> None:
+def _say_loaded(body: Loaded, *, as_json: bool) -> None:
     if as_json:
         say_json(body)
         return
-    for warning in body["warnings"]:
+    for warning in body.warnings:
         say(warning, "yellow")
     say(
-        f"revision {body['revision']} is in force (was {body['replaced']}); {counted(body['revoked'], 'right')} revoked"
+        f"revision {body.revision} is in force (was {body.replaced}); {counted(body.revoked, 'right')} revoked"
     )
-    if body["confirm_by"] is not None:
-        until = datetime.datetime.fromtimestamp(body["confirm_by"], datetime.UTC).isoformat(
-            timespec="seconds"
-        )
+    if body.confirm_by is not None:
+        until = datetime.datetime.fromtimestamp(body.confirm_by, datetime.UTC).isoformat(timespec="seconds")
         say(f"it goes back by itself at {until} unless you say: rosrv policy confirm", "yellow")
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
+
 from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.policy.input import known_of, live_now, read_text
 from appliance.cli.running import Appliance, body_or_exit
@@ -28,7 +30,7 @@ def try_policy(
     """Try a file; `robot` and `enrolled` go before what the appliance knows. Raises `NotRunningError`."""
     if appliance.remote:
         return _by_dry_run(appliance, file)
-    known = known_of(robot, enrolled, Known.of(appliance.ask(PolicyWanted()).body))
+    known = known_of(robot, enrolled, Known.of(asdict(appliance.ask(PolicyWanted()).given())))
     try:
         policy = judge(read_text(file), str(file), known).accepted()
     except PolicyError as error:

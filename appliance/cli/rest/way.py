@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import encoded
 from appliance.cli.rest.orders import carry_out
 from appliance.cli.rest.session import ProblemError, RestClient
@@ -19,7 +19,7 @@ class RestWay:
         """Raises ValueError when it is no place to send a token to."""
         self.client = RestClient(url, token, authority)
 
-    def ask(self, request: AdminRequest) -> AdminAnswer:
+    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask one thing. Raises `NotRunningError`."""
         encoded(request)  # what cannot be written over the socket is not asked here either
         try:

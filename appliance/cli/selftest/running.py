@@ -3,12 +3,12 @@
 import secrets
 import time
 from collections.abc import Iterator
-from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import StatusWanted
+from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
@@ -36,33 +36,31 @@ def running(appliance: Appliance) -> Iterator[Found]:
     if not answer.ok:
         yield fail("appliance", answer.error, "the log of rosrv up says why")
         return
-    status = answer.body
+    status = answer.given()
     yield ok(
         "appliance",
-        f"{status['version']}, {len(status['processes'])} processes, nodes find it at {status['master']}",
+        f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}",
     )
     yield from told("status", lambda: _status(status))
-    yield from told("processes", lambda: _processes(status["processes"]))
+    yield from told("processes", lambda: _processes(status.processes))
     yield from told("audit log", lambda: _audit(appliance))
-    master = _reachable(appliance, str(status["master"]))
+    master = _reachable(appliance, status.master)
     yield from told("RVMaster", lambda: _call(appliance, master))
     yield from told("relay", lambda: _message(master))
 
 
-def _status(status: dict[str, Any]) -> Iterator[Found]:
+def _status(status: Status) -> Iterator[Found]:
     troubles = list(troubles_of(status))
     for trouble in troubles:
         yield fail("status", trouble, "rosrv status")
     if not troubles:
-        probe = status["probe"] or "not run yet"
-        hidden = "no firewall" if status["isolation"] == "none" else f"probe of the ROS Master {probe}"
-        yield ok("status", f"isolation {status['isolation']}, {hidden}")
+        probe = status.probe or "not run yet"
+        hidden = "no firewall" if status.isolation == "none" else f"probe of the ROS Master {probe}"
+        yield ok("status", f"isolation {status.isolation}, {hidden}")
 
 
-def _processes(rows: list[dict[str, Any]]) -> Iterator[Found]:
-    restarted = [
-        f"{row['role']} {row['restarts']} times" for row in rows if row["restarts"] >= _MANY_RESTARTS
-    ]
+def _processes(rows: list[ProcessInfo]) -> Iterator[Found]:
+    restarted = [f"{row.role} {row.restarts} times" for row in rows if row.restarts >= _MANY_RESTARTS]
     if restarted:
         yield warn("processes", f"started again: {', '.join(restarted)}", "the log of rosrv up says why")
     else:

@@ -8,6 +8,7 @@ from itertools import zip_longest
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
+from appliance.channel.answers.graph import Flow
 from appliance.channel.messages import TopicTraffic
 from appliance.policy.limits import LimitRule
 from appliance.recorder import Recorder
@@ -107,18 +108,18 @@ class Carried:
             total.include(one)
         return total
 
-    def flow(self, key: str, resource: str) -> dict[str, float]:
-        """What went and goes through a topic or service of an incarnation, in plain values."""
+    def flow(self, key: str, resource: str) -> Flow:
+        """What went and goes through a topic or service of an incarnation."""
         traffic = self.traffic.get((key, resource), Traffic())
         flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
-        return {
-            "messages": traffic.messages,
-            "bytes": traffic.bytes,
-            "dropped": traffic.dropped,
-            "messages_per_second": round(traffic.messages_per_second, 2) if flows else 0.0,
-            "bytes_per_second": round(traffic.bytes_per_second, 1) if flows else 0.0,
-            "delay_seconds": round(traffic.delay, 6) if flows else 0.0,
-        }
+        return Flow(
+            messages=traffic.messages,
+            bytes=traffic.bytes,
+            dropped=traffic.dropped,
+            messages_per_second=round(traffic.messages_per_second, 2) if flows else 0.0,
+            bytes_per_second=round(traffic.bytes_per_second, 1) if flows else 0.0,
+            delay_seconds=round(traffic.delay, 6) if flows else 0.0,
+        )
 
     def lost(self, relay: int) -> None:
         """A relay is gone, and its connections and memory with it."""

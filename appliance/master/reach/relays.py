@@ -11,6 +11,7 @@ import ipaddress
 from collections.abc import Callable, Iterable
 
 from appliance.channel import messages
+from appliance.channel.answers.graph import Flow
 from appliance.channel.channel import Channel
 from appliance.master.graph.delivery import Delivery
 from appliance.master.graph.registry import Incarnation, Kind, Registry
@@ -91,8 +92,8 @@ class RelayControl:
         """What went through each topic and service of each incarnation."""
         return self.carried.traffic
 
-    def flow(self, key: str, resource: str) -> dict[str, float]:
-        """What went and goes through a topic or service of an incarnation, in plain values."""
+    def flow(self, key: str, resource: str) -> Flow:
+        """What went and goes through a topic or service of an incarnation."""
         return self.carried.flow(key, resource)
 
     # --- the links ---

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.admin import (
+    A,
     AdminRequest,
     MonitorLoad,
     MonitorRemove,
@@ -17,6 +18,7 @@ from appliance.channel.admin import (
     MonitorSwitch,
     StatusWanted,
 )
+from appliance.channel.answers.monitors import Replaced
 from appliance.cli.admin_socket import AdminSocket
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
@@ -58,20 +60,20 @@ def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
         yield session
 
 
-def ask(appliance: Appliance, request: AdminRequest) -> dict[str, Any]:
+def ask(appliance: Appliance, request: AdminRequest[A]) -> A:
     """What a verb of `rosrv` asks, without starting a process for each."""
     answer = AdminSocket(appliance.state).ask(request)
     assert answer.ok, answer.error
-    return dict(answer.body)
+    return answer.given()
 
 
 def relays(appliance: Appliance) -> list[int]:
     """The process ids of the relays; `rosrv status` fails while one is away."""
-    processes = ask(appliance, StatusWanted())["processes"]
-    return [row["pid"] for row in processes if row["role"] == "relay"]
+    processes = ask(appliance, StatusWanted()).processes
+    return [row.pid for row in processes if row.role == "relay"]
 
 
-def load(appliance: Appliance, **files: str) -> dict[str, Any]:
+def load(appliance: Appliance, **files: str) -> Replaced:
     """Load or replace files of these names."""
     return ask(appliance, MonitorLoad({f"{name}.rv": text for name, text in files.items()}, {}))
 
@@ -124,7 +126,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
         listener.wait_for(event="first")
     stopped.popen.send_signal(signal.SIGSTOP)
     eventually(
-        lambda: ask(appliance, StatusWanted())["dropped"] > 0, "the stopped one's queue is full", seconds=90
+        lambda: ask(appliance, StatusWanted()).dropped > 0, "the stopped one's queue is full", seconds=90
     )
     slow = ros.node("rospy", "counting_listener", "/flood", "--slow", "0.002", name="slow")
     slow.wait_for(event="first")
@@ -148,7 +150,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     assert seen[-1] == ROUNDS
     lost = missing(counts[slow]) + missing(counts[stopped])
     eventually(
-        lambda: ask(appliance, StatusWanted())["dropped"] == lost, f"{lost} messages are counted as dropped"
+        lambda: ask(appliance, StatusWanted()).dropped == lost, f"{lost} messages are counted as dropped"
     )
     assert missing(counts[stopped]) > 0
     heard = ros.listener("rospy", "/map").wait_for(event="received")
@@ -192,5 +194,5 @@ def test_a_relay_that_is_killed_while_specifications_are_loaded(
         eventually(settled, f"messages go on, through version {in_force}")
     load(appliance, tag=tag(9))
     eventually(lambda: versions(counted(listener))[-1] == 9, "the next load is in force")
-    assert ask(appliance, MonitorsWanted())["refused"] == []
+    assert ask(appliance, MonitorsWanted()).refused == []
     talker.send("")

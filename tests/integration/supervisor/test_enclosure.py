@@ -101,19 +101,19 @@ def test_rules_that_were_refused_are_owed(
             patch.setattr(firewall, "update", refused)
             enclosure.control_ready(port, port + 1)
         assert reachable(host, port)
-        assert all(rule["in_force"] for rule in enclosure.report()["rules"])
+        assert all(rule.in_force for rule in enclosure.report().rules or ())
         assert not reachable(host, port)
 
 
 def test_rules_that_are_taken_away_come_back(host: Host, enclosure: Contained, hidden: int) -> None:
     """Somebody flushes the rules: the next look puts them back, and they are reported in force."""
     enclosure.build()
-    backend = enclosure.report()["backend"]
+    backend = enclosure.report().backend
     flush = ["nft", "flush", "ruleset"] if backend == "nft" else ["iptables", "-F"]
     assert host.popen(flush).wait() == 0
     assert reachable(host, hidden)
     report = enclosure.report()
-    assert all(rule["in_force"] for rule in report["rules"])
+    assert all(rule.in_force for rule in report.rules or ())
     assert not reachable(host, hidden)
 
 
@@ -190,8 +190,8 @@ def test_rules_on_the_host_come_back(host: Host, tmp_path: Path) -> None:
     try:
         assert host.popen(["nft", "flush", "ruleset"]).wait() == 0
         report = enclosure.report()
-        assert report["forwarding"]
-        assert all(rule["in_force"] for rule in report["forwarding"] + report["rules"])
+        assert report.forwarding
+        assert all(rule.in_force for rule in [*report.forwarding, *(report.rules or ())])
     finally:
         enclosure.remove()
 
@@ -209,11 +209,11 @@ def test_what_others_do_to_forwarded_packets_is_said(host: Host, tmp_path: Path)
     enclosure.build()
     try:
         report = enclosure.report()
-        assert report["translations"] == [TRANSLATORS[0].chain]
-        (obstacle,) = report["obstacles"]
+        assert report.translations == [TRANSLATORS[0].chain]
+        (obstacle,) = report.obstacles or [""]
         assert "iptables-legacy chain filter FORWARD" in obstacle
         own = f"{isolation.ends[4].host}: the machine's own packets only"
-        assert [rule["in_force"] for rule in report["rules"] if rule["purpose"] == own] == [True]
+        assert [rule.in_force for rule in report.rules or () if rule.purpose == own] == [True]
     finally:
         enclosure.remove()
 

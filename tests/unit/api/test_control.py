@@ -10,9 +10,11 @@ import pytest
 from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, StatusWanted
+from appliance.channel.admin import AdminAnswer, StatusWanted, encode
+from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel
 from appliance.channel.messages import RestCalled, TokenKept
+from tests.support.answers import example
 from tests.support.heard import Heard
 
 
@@ -65,8 +67,12 @@ def test_each_question_gets_its_own_answer() -> None:
         there = control()
         asked = [asyncio.create_task(link.ask(StatusWanted(), bearer(f"who{one}"))) for one in range(3)]
         for made in reversed(await there.until(3)):
-            there.channel.send(messages.RequestAnswered(made.number, AdminAnswer(True, {"who": made.shown})))
-        assert [(await one).body["who"] for one in asked] == ["who0", "who1", "who2"]
+            there.channel.send(
+                messages.RequestAnswered(
+                    made.number, encode(AdminAnswer(True, example(Status, probe=made.shown)))
+                )
+            )
+        assert [(await one).given().probe for one in asked] == ["who0", "who1", "who2"]
 
     run(play)
 

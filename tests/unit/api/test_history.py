@@ -7,17 +7,20 @@ from typing import Any
 from appliance.api import history
 from appliance.api.control import ControlAwayError
 from appliance.api.history import History, sample_of
+from appliance.channel.answers.measures import Measures
+from tests.support.answers import example
 
 
-def body(allowed: int = 0) -> dict[str, Any]:
-    """Control's answer to `MetricsWanted`, as far as it is read."""
-    return {
-        "status": {"version": "1"},
-        "decisions": [["publish", "allow", allowed], ["publish", "deny", 2], ["command", "would deny", 3]],
-        "relayed": {"/a": [5, 50, 1], "/b": [7, 70, 0]},
-        "monitors": [["verdict", "watch", 4], ["drop", "watch", 1], ["log", "watch", 9]],
-        "nodes": {"live": 3, "lost": 1},
-    }
+def body(allowed: int = 0) -> Measures:
+    """Control's measures, as far as they are read."""
+    return example(
+        Measures,
+        status={"version": "1"},
+        decisions=[("publish", "allow", allowed), ("publish", "deny", 2), ("command", "would deny", 3)],
+        relayed={"/a": [5, 50, 1], "/b": [7, 70, 0]},
+        monitors=[("verdict", "watch", 4), ("drop", "watch", 1), ("log", "watch", 9)],
+        nodes={"live": 3, "lost": 1},
+    )
 
 
 def test_a_sample_adds_up() -> None:
@@ -44,7 +47,7 @@ def test_followers_are_told_and_the_hour_is_kept(monkeypatch: Any) -> None:
     monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
     count = 0
 
-    async def measures() -> dict[str, Any]:
+    async def measures() -> Measures:
         nonlocal count
         count += 1
         return body(count)
@@ -64,13 +67,12 @@ def test_followers_are_told_and_the_hour_is_kept(monkeypatch: Any) -> None:
 def test_without_control_followers_are_told_why(monkeypatch: Any) -> None:
     """While RVMaster is away there is no sample and no status, but the reason; then it goes on."""
     monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
-    answers = [ControlAwayError("being restarted"), body(1)]
+    answers: list[ControlAwayError | Measures] = [ControlAwayError("being restarted"), body(1)]
 
-    async def measures() -> dict[str, Any]:
+    async def measures() -> Measures:
         answer = answers.pop(0) if len(answers) > 1 else answers[0]
         if isinstance(answer, ControlAwayError):
             raise answer
-        assert isinstance(answer, dict)
         return answer
 
     async def scenario() -> None:
@@ -82,7 +84,8 @@ def test_without_control_followers_are_told_why(monkeypatch: Any) -> None:
                 assert (first.status, first.sample, first.away) == (None, None, "being restarted")
                 second = await history.after(first.number)
                 assert second.away is None
-                assert second.status == {"version": "1"}
+                assert second.status is not None
+                assert second.status.version == "1"
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
@@ -94,7 +97,7 @@ def test_who_begins_to_follow_does_not_wait(monkeypatch: Any) -> None:
     """A sleep that was begun while nobody followed ends when somebody does."""
     monkeypatch.setattr(history, "IDLE_SECONDS", 3600.0)
 
-    async def measures() -> dict[str, Any]:
+    async def measures() -> Measures:
         return body()
 
     async def scenario() -> None:

@@ -2,64 +2,72 @@
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from appliance.api.metrics import rendered
+from appliance.channel.answers.measures import Measures
 from appliance.metrics import BOUNDS, METRICS, Meter, markdown
+from tests.support.answers import example
 
 PAGE = Path(__file__).parents[3] / "docs" / "metrics.md"
 
 
-def body() -> dict[str, Any]:
+CALLS = {("GET", "200"): 8}
+FORWARDING: dict[str, Any] = {"sent": 9, "behind": 4, "seconds": 1.5, "trouble": "nobody there"}
+
+
+def body(
+    processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
+    forwarding: dict[str, Any] | None = FORWARDING,
+) -> Measures:
     """Control's answer, small."""
     meter = Meter()
     meter.decided("publish", "deny", 0.0003)
     meter.decided("publish", "deny", 99.0)
     meter.called("getPid", 0.002)
-    return {
-        **meter.values(),
-        "status": {
+    return example(
+        Measures,
+        decisions=[(*labels, count) for labels, count in meter.decisions.items()],
+        decision_seconds=meter.decision_seconds.values(),
+        calls=[(call, one.values()) for call, one in meter.calls.items()],
+        status={
             "version": "1", "since": 5.0, "relay": "1 of 2 are away", "rosmaster": "reachable", "probe": "it answers",
             "ipsec": {"troubles": ["a", "b"]},
             "policy": {"revision": 3, "differs_from_file": True},
             "monitors": {"loaded": 3, "enabled": 2, "held": ["b"], "failing": []},
-            "audit": {"lag_records": 2, "lag_seconds": 0.5, "failed": None, "degraded": "fsync", "forwarding": {
-                "sent": 9, "behind": 4, "seconds": 1.5, "missed": 0, "trouble": "nobody there",
-            }},
-            "processes": [{"role": "control", "pid": 1, "restarts": 4}],
+            "audit": {"lag_records": 2, "lag_seconds": 0.5, "degraded": "fsync", "forwarding": forwarding},
+            "processes": list(processes),
         },
-        "queued_deliveries": 6,
-        "nodes": {"live": 2, "lost": 1},
-        "registrations": {"publication": 3},
-        "monitors": [["drop", "safeTrigger", 4]],
-        "relayed": {"/a\"\\\n": [1, 2, 3]},
-        "delayed": {"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
-        "drop_at": {"/b": [5]}, "change_at": {"/b": [6], "(others)": [1]},
-        "connections": {"topic": 7},
-        "memory": {"latched": 12},
-        "limited": [["/scan", "publisher", 3]],
-        "rest": [(("GET", "200"), 8)],
-        "hosts": [
+        queued_deliveries=6,
+        nodes={"live": 2, "lost": 1},
+        registrations={"publication": 3},
+        monitors=[("drop", "safeTrigger", 4)],
+        relayed={"/a\"\\\n": [1, 2, 3]},
+        delayed={"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
+        drop_at={"/b": 5}, change_at={"/b": 6, "(others)": 1},
+        connections={"topic": 7},
+        memory={"latched": 12},
+        limited=[("/scan", "publisher", 3)],
+        hosts=[
             host("a", "up", remote="10.0.0.9", seconds=7, bytes_in=100, bytes_out=50, expires=time.time() + 1000),
             host("b", "revoked", revoked=5.0),
             host("c", "not enrolled", serial=None),
         ],
-    }  # fmt: skip
+    )  # fmt: skip
 
 
 def host(name: str, state: str, **more: Any) -> dict[str, Any]:
     """A row of the hosts."""
-    row: dict[str, Any] = {"name": name, "state": state, "serial": "1f", "revoked": None, "expires": 9.0}
-    row |= dict.fromkeys(("remote", "seconds", "bytes_in", "bytes_out"))
-    return row | {"ports": {"state": "closed"}} | more
+    return {"name": name, "state": state, "serial": "1f", "expires": 9.0, "ports": {"state": "closed"}} | more
 
 
 def test_every_metric_is_given_as_it_is_listed() -> None:
     """Names, kinds, labels and helps are those of the list, and a Prometheus parser reads all of it."""
-    families = {one.name: one for one in text_string_to_metric_families(rendered(body()).decode())}
+    families = {one.name: one for one in text_string_to_metric_families(rendered(body(), CALLS).decode())}
     for metric in METRICS:
         family = families[metric.name.removesuffix("_total")]
         assert family.type == metric.kind
@@ -72,7 +80,7 @@ def test_values_are_what_was_counted() -> None:
     """Counters, gauges, histogram buckets (cumulative); a topic's name is escaped and comes back whole."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
-        for family in text_string_to_metric_families(rendered(body()).decode())
+        for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
         for one in family.samples
     }
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
@@ -105,7 +113,7 @@ def test_tunnels_are_measured() -> None:
     """Of an enrolled host: up, age, bytes, when its certificate ends, ports; of a revoked one nothing but its count."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
-        for family in text_string_to_metric_families(rendered(body()).decode())
+        for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
         for one in family.samples
         if "tunnel" in one.name or "host" in one.name
     }
@@ -121,9 +129,8 @@ def test_tunnels_are_measured() -> None:
 
 def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:
     """Without a syslog receiver there are no samples of it, so that no alert takes absence for a fault."""
-    answer = body()
-    answer["status"]["audit"]["forwarding"] = None
-    families = {one.name: one for one in text_string_to_metric_families(rendered(answer).decode())}
+    answer = body(forwarding=None)
+    families = {one.name: one for one in text_string_to_metric_families(rendered(answer, CALLS).decode())}
     assert not any(family.samples for name, family in families.items() if name.startswith("rosrv_syslog_"))
 
 
@@ -135,11 +142,12 @@ def test_the_page_is_what_the_code_says() -> None:
 
 def test_processes_of_one_role_are_series_of_their_own() -> None:
     """Of several relay processes each has its restarts and its memory: no series is given twice."""
-    answer = body()
-    answer["status"]["processes"] = [
-        {"role": "relay", "pid": os.getpid(), "restarts": 1},
-        {"role": "relay", "pid": os.getpid(), "restarts": 2},
-    ]
-    lines = [one for one in rendered(answer).decode().splitlines() if one.startswith("rosrv_process")]
+    answer = body(
+        [
+            {"role": "relay", "pid": os.getpid(), "restarts": 1},
+            {"role": "relay", "pid": os.getpid(), "restarts": 2},
+        ]
+    )
+    lines = [one for one in rendered(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines

@@ -12,23 +12,25 @@ from appliance.api.monitor_judgement import (
     refusal,
 )
 from appliance.api.problems import ProblemError
+from appliance.channel.answers.monitors import Monitors
+from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
 TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
-IN_FORCE = {"files": {"a.rv": A}, "definitions": {}}
+IN_FORCE = example(Monitors, revision=7, files={"a.rv": A}, definitions={})
 
 
 def test_a_draft_says_what_it_would_change() -> None:
     """Files that are added and changed, the monitors there would be; what is the same is not named."""
-    draft = judge(IN_FORCE, {"a.rv": A + " ", "b.rv": TICK}, {}, 7)
+    draft = judge(IN_FORCE, {"a.rv": A + " ", "b.rv": TICK}, {})
     assert (draft.added, draft.changed, draft.removed, draft.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
-    assert judge(IN_FORCE, {"a.rv": A}, {}, 7).changed == []
+    assert judge(IN_FORCE, {"a.rv": A}, {}).changed == []
 
 
 def test_a_draft_that_is_wrong_is_refused_with_its_place() -> None:
     """The problem has every finding as a structure, and as lines of its detail."""
     with pytest.raises(ProblemError) as refused:
-        judge(IN_FORCE, {"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}, {}, 7)
+        judge(IN_FORCE, {"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}, {})
     problem = refused.value
     assert (problem.status, problem.kind, problem.line) == (422, "specifications-refused", 2)
     assert problem.detail.splitlines()[0] == "refused; revision 7 of the specifications stays in force"
@@ -47,8 +49,10 @@ def test_findings_without_a_place_stay_words() -> None:
 def test_a_monitor_is_told_apart() -> None:
     """Events of topics, services and clocks; properties with what they handle; a picture of what is finite."""
     compiler = Compiler()
-    a = compiler.monitor(1, {"a.rv": A, "b.rv": TICK}, {}, "a")
-    b = compiler.monitor(1, {}, {}, "b")  # compiled before: the same revision is not compiled again
+    a = compiler.monitor(example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a")
+    b = compiler.monitor(
+        example(Monitors, revision=1), "b"
+    )  # compiled before: the same revision is not compiled again
     (said,) = events_of(a)
     assert (said.name, said.topic, said.type, said.part, said.every) == (
         "said",
@@ -65,5 +69,5 @@ def test_a_monitor_is_told_apart() -> None:
     assert str(picture_of(a)).startswith("<svg ")
     assert picture_of(b) is None
     with pytest.raises(KeyError):
-        compiler.monitor(1, {}, {}, "nobody")
+        compiler.monitor(example(Monitors, revision=1), "nobody")
     assert {one.file for one in compiler.warnings("a.rv")} <= {"a.rv"}

@@ -4,11 +4,12 @@ from typing import Any
 
 import pytest
 
+from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.channel.serving import no_relay, process_names, unserved
+from tests.support.answers import example
 
 SERVING: dict[str, Any] = {
     "probe": "passed",
-    "audit": {"failed": None, "on_failure": "deny"},
     "relay": "connected",
     "rosmaster": "reachable",
 }
@@ -16,9 +17,10 @@ SERVING: dict[str, Any] = {
 
 def test_an_appliance_that_serves() -> None:
     """What status says of a running appliance is no reason, with and without a probe."""
-    assert unserved(SERVING) is None
-    assert unserved(SERVING | {"probe": ""}) is None
-    assert unserved(SERVING | {"audit": {"failed": "disk full", "on_failure": "allow"}}) is None
+    assert unserved(example(Status, **SERVING)) is None
+    assert unserved(example(Status, **SERVING | {"probe": ""})) is None
+    audit = {"failed": "disk full", "on_failure": "allow"}
+    assert unserved(example(Status, **SERVING, audit=audit)) is None
 
 
 @pytest.mark.parametrize(
@@ -36,7 +38,7 @@ def test_an_appliance_that_serves() -> None:
 )
 def test_what_keeps_nodes_from_being_served_is_named(wrong: dict[str, Any], reason: str) -> None:
     """Each reason why nodes are not served, in words."""
-    assert reason in str(unserved(SERVING | wrong))
+    assert reason in str(unserved(example(Status, **SERVING | wrong)))
 
 
 def test_one_relay_away_is_not_all_away() -> None:
@@ -47,5 +49,5 @@ def test_one_relay_away_is_not_all_away() -> None:
 
 def test_processes_of_one_role_are_numbered() -> None:
     """Who is alone has the name of its role."""
-    rows = [{"role": role} for role in ("control", "relay", "api", "relay")]
+    rows = [example(ProcessInfo, role=role) for role in ("control", "relay", "api", "relay")]
     assert process_names(rows) == ["control", "relay 0", "api", "relay 1"]

@@ -5,18 +5,14 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from appliance.channel.admin import AdminAnswer
+from appliance.channel.answers.status import Status
+from tests.support.answers import example
 
-SERVING: dict[str, Any] = {
-    "probe": "passed",
-    "audit": {"failed": None},
-    "relay": "connected",
-    "rosmaster": "reachable",
-}
+SERVING = example(Status, probe="passed", relay="connected", rosmaster="reachable")
 
 
 def check(state: Path) -> "subprocess.CompletedProcess[str]":

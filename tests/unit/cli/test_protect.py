@@ -3,13 +3,17 @@
 import json
 from typing import Any
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
 from appliance.channel.admin import AdminAnswer, AdminRequest, HostPorts
+from appliance.channel.answers.hosts import PortsTold
+from appliance.channel.answers.status import Status
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.main import app
 from appliance.network.scan import ScanResult
+from tests.support.answers import example
 
 
 def test_the_file_is_printed() -> None:
@@ -27,11 +31,11 @@ def test_the_help_has_examples_and_says_how_to_keep_it() -> None:
         assert words in text
 
 
-def answering(monkeypatch: pytest.MonkeyPatch, body: dict[str, Any] | None) -> list[AdminRequest]:
+def answering(monkeypatch: pytest.MonkeyPatch, body: msgspec.Struct | None) -> list[AdminRequest[Any]]:
     """An appliance that answers with this, or (None) none at all; what it was asked."""
-    asked: list[AdminRequest] = []
+    asked: list[AdminRequest[Any]] = []
 
-    def ask(_self: AdminSocket, request: AdminRequest) -> AdminAnswer:
+    def ask(_self: AdminSocket, request: AdminRequest[Any]) -> AdminAnswer[Any]:
         asked.append(request)
         if body is None:
             raise NotRunningError("/var/lib/rosrv: no appliance runs with this state directory")
@@ -43,7 +47,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, body: dict[str, Any] | None) -> l
 
 def test_the_appliance_is_the_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without --appliance it is asked how the robot sees it; with it nothing is asked."""
-    asked = answering(monkeypatch, {"isolation": "netns", "master": "http://10.200.0.2:11311"})
+    asked = answering(monkeypatch, example(Status, isolation="netns", master="http://10.200.0.2:11311"))
     result = CliRunner().invoke(app, ["protect", "--ports", "40000-40099", "--state", "/var/lib/rosrv"])
     assert result.exit_code == 0, result.output
     assert "ip saddr { 10.200.0.2 } accept" in result.stdout
@@ -56,11 +60,11 @@ def test_the_appliance_is_the_running_one(monkeypatch: pytest.MonkeyPatch) -> No
     ("body", "said"),
     [
         (None, "no appliance runs"),
-        ({"isolation": "none", "master": "http://127.0.0.1:11311"}, "without isolation"),
+        (example(Status, isolation="none", master="http://127.0.0.1:11311"), "without isolation"),
     ],
 )
 def test_an_appliance_that_cannot_be_known_is_to_be_named(
-    monkeypatch: pytest.MonkeyPatch, body: dict[str, Any] | None, said: str
+    monkeypatch: pytest.MonkeyPatch, body: Status | None, said: str
 ) -> None:
     """The error says why, and how to name it."""
     answering(monkeypatch, body)
@@ -72,7 +76,7 @@ def test_an_appliance_that_cannot_be_known_is_to_be_named(
 
 def test_what_a_check_saw_is_told_where_an_appliance_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Under the name of the host, with the ports that were open; nobody is told when no appliance was named."""
-    asked = answering(monkeypatch, {"name": "ocu", "ports": {}})
+    asked = answering(monkeypatch, example(PortsTold, name="ocu"))
     monkeypatch.setattr(
         "appliance.cli.protect.scan", lambda address, _ports, _s: ScanResult(address, (40001,), 99, 0)
     )

@@ -8,49 +8,43 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli import status
 from appliance.cli.status_view import age, processes_table, shortened
+from tests.support.answers import example
 
 ROLES = ("supervisor", "rosmaster", "signer", *["relay"] * 4, "control", "rosout", "api", "charon", "syslog")
 
 
-def rows(count: int = len(ROLES), restarts: int = 0) -> list[dict[str, Any]]:
+def rows(count: int = len(ROLES), restarts: int = 0) -> list[ProcessInfo]:
     """Processes as the status has them."""
     since = (datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=30)).isoformat()
     return [
-        {
-            "role": role,
-            "pid": 4_194_300 - number,
-            "since": since,
-            "restarts": restarts,
-            "walls": "listed calls, Landlock 7" if number else "",
-            "lacks": [],
-        }
+        ProcessInfo(role, 4_194_300 - number, since, restarts, "listed calls, Landlock 7" if number else "")
         for number, role in enumerate(ROLES[:count])
     ]
 
 
-def body() -> dict[str, Any]:
+def body(**more: Any) -> Status:
     """A large appliance: everything there is, names as long as they get."""
-    return {
+    fields: dict[str, Any] = {
         "version": "0.1.0", "since": time.time() - 100_000, "master": "http://10.113.11.1:11311", "processes": rows(),
         "isolation": "netns", "relaying": "all", "mediation": "full", "probe": "passed",
         "firewall": {"backend": "nft", "translations": ["one", "another"], "obstacles": ["a third"]},
         "policy": {"revision": 12, "file": "/etc/rosrv/policies/robot.ini", "source": "x", "who": "alice",
-                   "differs_from_file": True, "warnings": 3, "confirm_by": None},
-        "ipsec": {"esp": "kernel", "up": 3, "enrolled": 4, "troubles": [], "key_exchange": ["x25519"],
+                   "differs_from_file": True, "warnings": 3},
+        "ipsec": {"esp": "kernel", "up": 3, "enrolled": 4, "key_exchange": ["x25519"],
                   "ports": {"10.0.0.9": {"state": "open"}}},
-        "monitors": {"revision": 7, "loaded": 12, "enabled": 11, "held": [], "failing": [], "refused": [], "who": "bob",
-                     "differs_from_folder": True},
+        "monitors": {"revision": 7, "loaded": 12, "enabled": 11, "who": "bob", "differs_from_folder": True},
         "rosmaster": "reachable", "relay": "connected", "nodes": 61, "shadows": 2, "topics": 240, "services": 400,
         "connections": 512, "messages": 123_456_789, "dropped": 17,
-        "audit": {"lag_records": 3, "lag_seconds": 0.1, "failed": None, "degraded": None,
-                  "forwarding": {"to": "tls:10.0.0.7:6514", "behind": 12, "trouble": ""}},
+        "audit": {"lag_records": 3, "lag_seconds": 0.1, "forwarding": {"to": "tls:10.0.0.7:6514", "behind": 12}},
     }  # fmt: skip
+    return example(Status, **fields | more)
 
 
 def screen(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], width: int, shown: dict[str, Any]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], width: int, shown: Status
 ) -> list[str]:
     """The lines on a terminal of this width."""
     monkeypatch.setenv("COLUMNS", str(width))
@@ -82,9 +76,8 @@ def test_many_troubles_leave_room_for_the_rest(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The most pressing come first; of more than five it is said how many there are and where to see them."""
-    shown = body()
-    shown["audit"]["failed"] = "disk full"
-    shown["ipsec"]["troubles"] = [f"the certificate of host-{number} ends soon" for number in range(9)]
+    ends = [f"the certificate of host-{number} ends soon" for number in range(9)]
+    shown = body(audit={"failed": "disk full"}, ipsec={"troubles": ends})
     lines = screen(monkeypatch, capsys, 80, shown)
     assert lines[0] == "! the audit log cannot be written: disk full"
     assert "and 6 more: rosrv status --json" in lines[4]
@@ -99,7 +92,7 @@ def test_every_process_is_shown_once(width: int, across: int) -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO
     assert len(text.splitlines()) == 1 + -(-len(ROLES) // across)
     for row in rows():
-        assert text.count(str(row["pid"])) == 1
+        assert text.count(str(row.pid)) == 1
     assert [name in text for name in ("relay 0", "relay 3", "relay 4", "control 0")] == [
         True,
         True,
@@ -125,7 +118,7 @@ def test_that_not_everything_is_carried_is_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`--relay monitored` is no boundary, and the status says so; of the default it says nothing."""
-    monitored = " ".join(screen(monkeypatch, capsys, 160, body() | {"relaying": "monitored"}))
+    monitored = " ".join(screen(monkeypatch, capsys, 160, body(relaying="monitored")))
     assert "only what is monitored: NO BOUNDARY" in monitored
     assert "NO BOUNDARY" not in " ".join(screen(monkeypatch, capsys, 160, body()))
 
@@ -136,8 +129,8 @@ def test_what_a_kernel_lacks_of_the_walls_is_shown(
     """Where all stand that is said in two words; else the first that is lacking is named, and how many more."""
     shown = body()
     assert any("processes walled in" in line for line in screen(monkeypatch, capsys, 80, shown))
-    for row in shown["processes"][2:4]:
-        row["lacks"] = ["no Landlock"]
+    for row in shown.processes[2:4]:
+        row.lacks.append("no Landlock")
     lines = "\n".join(screen(monkeypatch, capsys, 100, shown))
     assert "walled in" not in lines
     assert "signer: no Landlock and 1 more (rosrv status --json)" in lines

@@ -9,11 +9,13 @@ from typing import Any
 import msgspec
 
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted
+from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
+from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import Asked, TokenKept
 from appliance.control.rest import RestLink
 from appliance.store.tokens import TokenRow, make_token
+from tests.support.answers import example
 from tests.support.heard import Heard
 
 VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=600)
@@ -45,14 +47,14 @@ class Everything:
         self.go = asyncio.Event()
         self.go.set()
 
-    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer:
+    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
         """Answer when told to."""
         if not isinstance(request, StatusWanted) or not self.only_slow:
             await self.go.wait()
         self.asked.append((request, who))
         if isinstance(request, PolicyLoad) and request.text == "defect":
             raise RuntimeError("secret detail")
-        return AdminAnswer(True, {"number": len(self.asked)})
+        return AdminAnswer(True, example(Status, nodes=len(self.asked)))
 
     def usable(self) -> list[TokenKept]:
         """Two tokens."""
@@ -102,6 +104,11 @@ def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:
     asyncio.run(whole())
 
 
+def answer_of(message: messages.RequestAnswered) -> AdminAnswer[Status]:
+    """What was answered; a status, if anything."""
+    return decode(message.answer, StatusWanted())
+
+
 def test_tokens_are_told_at_once_and_after_every_change() -> None:
     """A new api knows them first of all; a change is told without being asked."""
 
@@ -125,10 +132,10 @@ def test_enrolments_hold_nobody_up() -> None:
             api.channel.send(messages.RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
         api.channel.send(messages.RequestMade(99, StatusWanted(), TOKEN))
         heard = (await api.until(6))[1:]
-        assert [one.answer.trouble for one in heard if one.number != 99] == ["busy"] * 4
-        assert [one.answer.ok for one in heard if one.number == 99] == [True]
+        assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4
+        assert [answer_of(one).ok for one in heard if one.number == 99] == [True]
         world.go.set()
-        assert sum(one.answer.ok for one in (await api.until(22))[1:]) == 17
+        assert sum(answer_of(one).ok for one in (await api.until(22))[1:]) == 17
 
     run(play)
 
@@ -164,7 +171,7 @@ def test_answers_bear_their_numbers_in_order() -> None:
             )
         heard = await api.until(4)
         assert [one.number for one in heard[1:]] == [7, 3, 9]
-        assert [one.answer.body["number"] for one in heard[1:]] == [1, 2, 3]
+        assert [answer_of(one).given().nodes for one in heard[1:]] == [1, 2, 3]
         assert [who for _request, who in world.asked] == ["w", "alice", "w"]
 
     run(play)
@@ -179,10 +186,10 @@ def test_more_than_may_wait_are_told_so_at_once() -> None:
         for number in range(200):
             api.channel.send(messages.RequestMade(number, StatusWanted(), TOKEN))
         heard = await api.until(1 + 200 - 65)
-        assert {one.answer.trouble for one in heard[1:]} == {"busy"}
+        assert {answer_of(one).trouble for one in heard[1:]} == {"busy"}
         world.go.set()
         heard = await api.until(201)
-        assert sum(one.answer.ok for one in heard[1:]) == len(world.asked) <= 65
+        assert sum(answer_of(one).ok for one in heard[1:]) == len(world.asked) <= 65
 
     run(play)
 
@@ -195,9 +202,9 @@ def test_a_defect_is_one_answer() -> None:
         api.channel.send(loading(1, "defect"))
         api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
         _tokens, failed, served = await api.until(3)
-        assert (failed.answer.ok, failed.answer.trouble) == (False, "failed")
-        assert "secret" not in failed.answer.error
-        assert served.answer.ok
+        assert (answer_of(failed).ok, answer_of(failed).trouble) == (False, "failed")
+        assert "secret" not in answer_of(failed).error
+        assert answer_of(served).ok
 
     run(play)
 
@@ -211,8 +218,8 @@ def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
         api.channel.send(loading(1, "[Nodes]"))
         api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
         _tokens, refused, served = await api.until(3)
-        assert (refused.answer.trouble, refused.answer.error) == ("failed", world.obstacle)
-        assert served.answer.ok
+        assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.obstacle)
+        assert answer_of(served).ok
         assert [request for request, _who in world.asked] == [StatusWanted()]
 
     run(play)
@@ -228,7 +235,7 @@ def test_a_change_in_a_name_that_may_not_is_refused() -> None:
         api.channel.send(messages.RequestMade(8, StatusWanted(), VIEWER_TOKEN))
         api.channel.send(loading(9, "[Nodes]"))
         answers = (await api.until(7))[1:]
-        assert [one.answer.trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
+        assert [answer_of(one).trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
         assert [who for _request, who in world.asked] == ["alice", "w"]
 
     run(play)
@@ -253,7 +260,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
         assert world.asked == []
         api = Api(world, link)
         api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
-        assert (await api.until(2))[1].answer.ok
+        assert answer_of((await api.until(2))[1]).ok
 
     run(play)
 

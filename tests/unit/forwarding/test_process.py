@@ -80,7 +80,7 @@ def test_what_was_missed_before_the_first_link(controls: list[Control], reports:
         assert control.gaps == [7, 2]
         status = control.forwarded.status()
         assert status is not None
-        assert status["missed"] == 9
+        assert status.missed == 9
 
     asyncio.run(play())
 

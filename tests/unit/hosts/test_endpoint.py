@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.messages import EndpointFound
 from appliance.hosts.endpoint import find_endpoint
 from appliance.hosts.table import HostRefusedError
@@ -19,18 +20,14 @@ async def _several() -> EndpointFound:
 
 def test_what_is_configured_comes_first() -> None:
     """Nobody looks then, so that it also helps where nothing can be found."""
-    assert asyncio.run(find_endpoint("robot.example.org", _several)) == {
-        "endpoint": "robot.example.org",
-        "reason": "ipsec.endpoint of the configuration",
-    }
+    assert asyncio.run(find_endpoint("robot.example.org", _several)) == Endpoint(
+        "robot.example.org", "ipsec.endpoint of the configuration"
+    )
 
 
 def test_what_the_supervisor_sees_is_taken_with_its_reason() -> None:
     """So that a person can judge it."""
-    assert asyncio.run(find_endpoint(None, _found)) == {
-        "endpoint": "10.0.0.5",
-        "reason": "the only address here",
-    }
+    assert asyncio.run(find_endpoint(None, _found)) == Endpoint("10.0.0.5", "the only address here")
 
 
 def test_what_cannot_be_told_is_refused_with_what_to_give() -> None:

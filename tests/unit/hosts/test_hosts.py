@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
+from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.certification import Certification
@@ -113,8 +114,8 @@ class Bench:
         self.asked.append(message)
         self.tunnels.answered(self.answer)
 
-    async def _endpoint(self) -> dict[str, Any]:
-        return {"endpoint": "10.0.0.1", "reason": "it is"}
+    async def _endpoint(self) -> Endpoint:
+        return Endpoint("10.0.0.1", "it is")
 
     def _changed(self) -> int:
         self.order.append(f"policy {sorted(self.hosts.addresses)}")
@@ -132,7 +133,7 @@ def sign(key: bytes, request: str) -> bytes:
     return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
 
 
-def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, dict[str, Any]]:
+def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, KitParts]:
     """Enrol a host with a key of its own."""
     return bench.hosts.add(
         name, signing_request(make_key(), name).decode(), days=90, address=address, who="tester"
@@ -164,13 +165,13 @@ def test_addresses_are_given_in_order_and_kept(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
         await bench.hosts.reload("tester")
-        assert (await add(bench, "a"))["address"] == "10.113.11.2"
-        assert (await add(bench, "b"))["address"] == "10.113.11.4"
-        assert (await add(bench, "laptop"))["address"] == "10.113.11.3"
+        assert (await add(bench, "a")).address == "10.113.11.2"
+        assert (await add(bench, "b")).address == "10.113.11.4"
+        assert (await add(bench, "laptop")).address == "10.113.11.3"
         await bench.hosts.revoke("a", "tester")
-        assert (await add(bench, "c"))["address"] == "10.113.11.5"
-        assert (await add(bench, "a"))["address"] == "10.113.11.2"
-        assert (await add(bench, "d"))["address"] == "10.113.11.6"
+        assert (await add(bench, "c")).address == "10.113.11.5"
+        assert (await add(bench, "a")).address == "10.113.11.2"
+        assert (await add(bench, "d")).address == "10.113.11.6"
         with pytest.raises(HostRefusedError, match=r"take a larger ipsec\.pool"):
             await add(bench, "e")
 
@@ -212,7 +213,7 @@ def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> Non
         await bench.hosts.start()
         assert isinstance(bench.asked[0], TunnelsWanted)
         assert bench.hosts.addresses == {}
-        assert "no firewall here" in bench.hosts.status()["troubles"][0]
+        assert "no firewall here" in bench.hosts.status().troubles[0]
         with pytest.raises(HostRefusedError, match="no firewall here"):
             await add(bench, "b")
 
@@ -238,8 +239,8 @@ def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path)
         bench.order.clear()
         body = await bench.hosts.revoke("a", "tester")
         assert bench.order == ["policy []", "expel 10.113.11.2"]
-        assert body["taken_back"] == 3
-        assert [row.serial for row in bench.store.hosts.revoked()] == [body["serial"]]
+        assert body.taken_back == 3
+        assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
         with pytest.raises(HostRefusedError, match="enrolled are: none"):
             await bench.hosts.revoke("a", "tester")
 
@@ -256,8 +257,8 @@ def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
         second = await bench.hosts.renew(
             "a", signing_request(make_key(), "a").decode(), days=90, who="tester"
         )
-        assert second["address"] == first["address"]
-        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
+        assert second.address == first.address
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
 
     run(tmp_path, work)
 
@@ -280,13 +281,13 @@ def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n")
         await bench.hosts.reload("tester")
         await add(bench, "a")
-        rows = {row["name"]: (row["state"], row["declared"]) for row in bench.hosts.rows()}
+        rows = {row.name: (row.state, row.declared) for row in bench.hosts.rows()}
         assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
         bench.declared.write_text("hosts: [")
         with pytest.raises(HostRefusedError, match="what was declared before holds"):
             await bench.hosts.reload("tester")
-        assert [row["name"] for row in bench.hosts.rows()] == ["a", "laptop"]
-        assert any("hosts.yaml" in trouble for trouble in bench.hosts.status()["troubles"])
+        assert [row.name for row in bench.hosts.rows()] == ["a", "laptop"]
+        assert any("hosts.yaml" in trouble for trouble in bench.hosts.status().troubles)
 
     run(tmp_path, work)
 
@@ -298,7 +299,7 @@ def request_of(name: str) -> str:
 
 def token(
     bench: Bench, name: str, *, seconds: float = 60, new: bool = True
-) -> Coroutine[Any, Any, dict[str, Any]]:
+) -> Coroutine[Any, Any, EnrolmentToken]:
     """A one-time token."""
     kit = {"endpoint": "10.0.0.1", "ports": "32768-60999", "open": ""}
     return bench.hosts.token(name, kit=kit, seconds=seconds, days=90, address=None, new=new, who="tester")
@@ -315,16 +316,16 @@ def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         first = await token(bench, "a")
         second = await token(bench, "a")
-        for text in (first["token"], "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
+        for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
             with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
                 await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
-        assert bench.hosts.rows()[0]["state"] == "awaited"
-        body = await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
-        assert body["address"] == second["address"]
-        assert body["kit"]["endpoint"] == "10.0.0.1"
+        assert bench.hosts.rows()[0].state == "awaited"
+        body = await bench.hosts.itself.enrol(second.token, request_of("a"), "10.9.9.9")
+        assert body.address == second.address
+        assert body.kept["endpoint"] == "10.0.0.1"
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(second["token"], request_of("a"), "10.9.9.9")
-        secret = second["token"].rpartition("_")[2].encode()
+            await bench.hosts.itself.enrol(second.token, request_of("a"), "10.9.9.9")
+        secret = second.token.rpartition("_")[2].encode()
         for file in tmp_path.rglob("*"):
             if file.is_file():
                 assert secret not in file.read_bytes(), file
@@ -336,7 +337,7 @@ def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> No
     """It is used up before the authority is asked."""
 
     async def work(bench: Bench) -> None:
-        text = (await token(bench, "a"))["token"]
+        text = (await token(bench, "a")).token
         both = await asyncio.gather(
             bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.8"),
             bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9"),
@@ -351,16 +352,16 @@ def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
     """The host may come again with a right one; an ended or revoked token is good for nothing."""
 
     async def work(bench: Bench) -> None:
-        text = (await token(bench, "a"))["token"]
+        text = (await token(bench, "a")).token
         with pytest.raises(HostRefusedError, match="not a signing request"):
             await bench.hosts.itself.enrol(text, "rubbish", "10.9.9.9")
         await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
-        short = (await token(bench, "b", seconds=0.05))["token"]
+        short = (await token(bench, "b", seconds=0.05)).token
         await asyncio.sleep(0.06)
         with pytest.raises(HostForbiddenError):
             await bench.hosts.itself.enrol(short, request_of("b"), "10.9.9.9")
-        taken_back = (await token(bench, "c"))["token"]
-        assert (await bench.hosts.revoke("c", "tester"))["serial"] == ""
+        taken_back = (await token(bench, "c")).token
+        assert (await bench.hosts.revoke("c", "tester")).serial == ""
         with pytest.raises(HostForbiddenError):
             await bench.hosts.itself.enrol(taken_back, request_of("c"), "10.9.9.9")
 
@@ -372,10 +373,10 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
     texts: list[str] = []
 
     async def before(bench: Bench) -> None:
-        texts.append((await token(bench, "a"))["token"])
+        texts.append((await token(bench, "a")).token)
 
     async def after(bench: Bench) -> None:
-        assert (await bench.hosts.itself.enrol(texts[0], request_of("a"), "10.9.9.9"))["name"] == "a"
+        assert (await bench.hosts.itself.enrol(texts[0], request_of("a"), "10.9.9.9")).name == "a"
 
     run(tmp_path, before)
     run(tmp_path, after)
@@ -388,7 +389,7 @@ def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
     async def work(bench: Bench) -> None:
         key = make_key()
         await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
-        text = (await token(bench, "a", new=False))["token"]
+        text = (await token(bench, "a", new=False)).token
         tasks: list[asyncio.Task[Any]] = []
 
         def revoke() -> None:
@@ -405,7 +406,7 @@ def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
             else:
                 await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
         await asyncio.gather(*tasks)
-        assert bench.hosts.rows()[0]["state"] == "revoked"
+        assert bench.hosts.rows()[0].state == "revoked"
         assert bench.hosts.addresses == {}
 
     run(tmp_path, work)
@@ -419,12 +420,12 @@ def test_a_host_renews_itself(tmp_path: Path) -> None:
         first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
         request = request_of("a")
         made = await bench.hosts.itself.renew("a", request, sign(key, request), "::ffff:10.113.11.2")
-        assert made["serial"] != first["serial"]
-        assert bench.hosts.rows()[0]["renewing"]
+        assert made.serial != first.serial
+        assert bench.hosts.rows()[0].renewing
         assert bench.store.hosts.revoked() == []
         await bench.hosts.itself.renewed("a", "10.113.11.2")
-        assert [row.serial for row in bench.store.hosts.revoked()] == [first["serial"]]
-        assert bench.hosts.rows()[0]["serial"] == made["serial"]
+        assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
+        assert bench.hosts.rows()[0].serial == made.serial
         with pytest.raises(HostRefusedError, match="renew first"):
             await bench.hosts.itself.renewed("a", "10.113.11.2")
         with pytest.raises(HostRefusedError, match="again in"):
@@ -509,14 +510,14 @@ def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> No
         made = await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
         await bench.hosts.revoke("a", "tester")
         assert {row.serial for row in bench.store.hosts.revoked()} == {
-            first["serial"],
-            made["serial"],
+            first.serial,
+            made.serial,
         }
         with pytest.raises(HostForbiddenError):
             await bench.hosts.itself.renewed("a", "10.113.11.2")
         again = await add(bench, "a")
-        assert again["address"] == first["address"]
-        assert again["serial"] not in {first["serial"], made["serial"]}
+        assert again.address == first.address
+        assert again.serial not in {first.serial, made.serial}
 
     run(tmp_path, work)
 
@@ -526,14 +527,14 @@ def test_the_list_is_signed_once_however_often_it_is_asked_for(tmp_path: Path) -
 
     async def work(bench: Bench) -> None:
         first = await add(bench, "a")
-        assert "BEGIN CERTIFICATE" in (await bench.hosts.authority())["authority"]
+        assert "BEGIN CERTIFICATE" in (await bench.hosts.authority()).authority
         assert bench.authority.lists == 0
         answers = await asyncio.gather(*(bench.hosts.revocations() for _ in range(20)))
         assert bench.authority.lists == 1
-        assert len({one["revocations"] for one in answers}) == 1
+        assert len({one.revocations for one in answers}) == 1
         await bench.hosts.revoke("a", "tester")
-        after = x509.load_pem_x509_crl((await bench.hosts.revocations())["revocations"].encode())
-        assert [f"{one.serial_number:x}" for one in after] == [first["serial"]]
+        after = x509.load_pem_x509_crl((await bench.hosts.revocations()).revocations.encode())
+        assert [f"{one.serial_number:x}" for one in after] == [first.serial]
         assert bench.authority.lists == 2
 
     run(tmp_path, work)
@@ -548,14 +549,14 @@ def test_a_full_list_replaces_no_certificate(tmp_path: Path, monkeypatch: pytest
             await add(bench, name)
         for _ in range(2):
             await bench.hosts.renew("a", request_of("a"), days=90, who="tester")
-        key_before = bench.hosts.rows()[1]["serial"]
+        key_before = bench.hosts.rows()[1].serial
         with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
             await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
-        assert bench.hosts.rows()[1]["serial"] == key_before
+        assert bench.hosts.rows()[1].serial == key_before
         await add(bench, "c")
         await bench.hosts.revoke("a", "tester")
         await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
-        assert bench.hosts.status()["troubles"] == []
+        assert bench.hosts.status().troubles == []
 
     run(tmp_path, work)
 
@@ -564,7 +565,7 @@ def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
     """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
 
     async def work(bench: Bench) -> None:
-        seen = bench.hosts.overview()["revision"]
+        seen = bench.hosts.overview().revision
         await add(bench, "a")
         for late in (
             bench.hosts.revoke("a", "tester", seen),
@@ -574,7 +575,7 @@ def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
         ):
             with pytest.raises(HostsChangedError):
                 await late
-        await bench.hosts.revoke("a", "tester", bench.hosts.overview()["revision"])
+        await bench.hosts.revoke("a", "tester", bench.hosts.overview().revision)
 
     run(tmp_path, work)
 
@@ -597,7 +598,7 @@ def test_odd_names_that_are_names(tmp_path: Path, name: str) -> None:
 
     async def work(bench: Bench) -> None:
         await add(bench, name)
-        assert bench.hosts.rows()[0]["name"] == name
+        assert bench.hosts.rows()[0].name == name
         await bench.hosts.revoke(name, "tester")
 
     run(tmp_path, work)
@@ -610,7 +611,7 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
         request = request_of("x")
         for number in range(200):
             await bench.hosts.add(f"h{number}", request, days=1, who="tester")
-        assert len({row["address"] for row in bench.hosts.rows()}) == 200
+        assert len({row.address for row in bench.hosts.rows()}) == 200
 
     async def again(bench: Bench) -> None:
         assert len(bench.hosts.rows()) == 200
@@ -630,16 +631,16 @@ def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
         bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
         body = await bench.hosts.reload("tester")
         assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
-        assert (body["closed"], body["opened"]) == (["a"], [])
-        assert body["divergence"] == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
-        rows = {row["name"]: row for row in bench.hosts.rows()}
-        assert (rows["a"]["state"], rows["a"]["groups"], rows["b"]["state"]) == (
+        assert (body.closed, body.opened) == (["a"], [])
+        assert body.divergence == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
+        rows = {row.name: row for row in bench.hosts.rows()}
+        assert (rows["a"].state, rows["a"].groups, rows["b"].state) == (
             "not wanted",
             ["ocu"],
             "down",
         )
         bench.declared.unlink()
-        assert (await bench.hosts.reload("tester"))["opened"] == ["a"]
+        assert (await bench.hosts.reload("tester")).opened == ["a"]
         assert sorted(bench.hosts.addresses) == ["a", "b"]
 
     run(tmp_path, work)
@@ -656,7 +657,7 @@ def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) ->
         assert not bench.asked
         bench.declared.unlink()
         body = await bench.hosts.reload("tester")
-        assert body["opened"] == ["a"]
+        assert body.opened == ["a"]
         assert list(bench.hosts.addresses) == ["a"]
         assert bench.order[-1] == "policy ['a']"
         bench.order.clear()
@@ -673,14 +674,14 @@ def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         await bench.hosts.add("short", request_of("a"), days=10, who="tester")
-        assert bench.hosts.status()["troubles"] == []
+        assert bench.hosts.status().troubles == []
         await bench.hosts.renew("short", request_of("a"), days=1e-5, who="tester")
         await asyncio.sleep(0.7)
         bench.tunnels.each_hour()
         bench.tunnels.each_hour()
         ended = recorded(bench, "certificate ends soon") + recorded(bench, "certificate ended")
         assert len(ended) == 1
-        assert "short" in bench.hosts.status()["troubles"][0]
+        assert "short" in bench.hosts.status().troubles[0]
 
     run(tmp_path, work)
 
@@ -691,22 +692,17 @@ def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         await add(bench, "a")
         bench.hosts.ports.machines = lambda: {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
-        assert (await bench.hosts.ports.tell("10.113.11.2", "open", [40001], checked=5.0, who="eve"))[
-            "name"
-        ] == "a"
+        assert (
+            await bench.hosts.ports.tell("10.113.11.2", "open", [40001], checked=5.0, who="eve")
+        ).name == "a"
         await bench.hosts.ports.tell("10.0.0.7", "closed", [], checked=6.0, who="eve")
         with pytest.raises(HostRefusedError, match="enrolled are: a"):
             await bench.hosts.ports.tell("nobody", "open", [], checked=5.0, who="eve")
         with pytest.raises(HostRefusedError, match="a day ahead"):
             await bench.hosts.ports.tell("a", "closed", [], checked=4e9, who="eve")
         overview = bench.hosts.overview()
-        assert overview["hosts"][0]["ports"] == {
-            "state": "open",
-            "checked": 5.0,
-            "open": [40001],
-            "who": "eve",
-        }
-        assert [(one["address"], one["nodes"], one["ports"]["state"]) for one in overview["machines"]] == [
+        assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
+        assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
             ("10.0.0.7", 3, "closed")
         ]
 

@@ -14,7 +14,7 @@ import pytest
 
 from appliance.audit.record import Severity
 from appliance.channel import admin, messages
-from appliance.channel.admin import AdminAnswer, AdminRequest, AnyRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, decode
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Asked
 from appliance.control.rest import RestLink
@@ -43,7 +43,7 @@ class World:
         self.tokens = Tokens(self.store, self)  # type: ignore[arg-type]  # as above
         self.link = RestLink(self, self.tokens, self, require_proof=require_proof)  # type: ignore[arg-type]  # as above
 
-    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer:
+    async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
         """Note what would be done."""
         self.done.append((request, who))
         return AdminAnswer(True)
@@ -69,20 +69,22 @@ class Api:
         self._ear = Heard(self.channel)
         self._answers = 0
 
-    async def ask(self, request: AdminRequest, shown: str = "", asked: Asked | None = None) -> AdminAnswer:
+    async def ask(
+        self, request: AdminRequest[A], shown: str = "", asked: Asked | None = None
+    ) -> AdminAnswer[A]:
         """Control's answer."""
         self._answers += 1
         self.channel.send(messages.RequestMade(self._answers, request, shown, asked))  # type: ignore[arg-type]  # one of the union
         while True:
             for one in await self._ear.until(len(self._ear.messages)):
                 if isinstance(one, messages.RequestAnswered) and one.number == self._answers:
-                    return one.answer
+                    return decode(one.answer, request)
             await self._ear.until(len(self._ear.messages) + 1)
 
     async def signed(self, token: str, asked: Asked) -> Asked:
         """What the holder of a token, who is honest, sends of an order."""
         answer = await self.ask(admin.ChallengeWanted(), reading_key(token))
-        challenge = str(answer.body["challenge"])
+        challenge = answer.given().challenge
         stated = statement(
             challenge,
             method=asked.method,
@@ -122,12 +124,13 @@ def test_nothing_is_done_for_a_name(tmp_path: Path) -> None:
         guesses = ["", "alice", row.id, f"rosrv_{row.id}_{'A' * 43}", f"rosrv-read_{row.id}_{'A' * 43}"]
         guesses += [kept.hash.hex(), kept.reading.hex(), f"rosrv-read_{row.id}_{kept.reading.hex()[:43]}"]
         for shown in guesses:
-            for request, asked in (
+            requests: tuple[tuple[AdminRequest[Any], Asked | None], ...] = (
                 (admin.HostRevoke("laptop", 3), REVOKE),
                 (admin.PolicyWanted(), None),
                 (admin.ChallengeWanted(), None),
                 (admin.TokenList(), None),
-            ):
+            )
+            for request, asked in requests:
                 answer = await api.ask(request, shown, asked)
                 assert (answer.ok, answer.trouble) == (False, "forbidden")
         assert world.done == []
@@ -218,7 +221,7 @@ def test_no_byte_of_an_order_can_be_another(tmp_path: Path, change: dict[str, An
         admin.PolicyLoad("[Topics]\n* = *\n"), admin.PolicyRollback(1), admin.MonitorRemove(["safeZone"]),
     ],
 )  # fmt: skip
-def test_another_order_under_a_good_proof_is_an_alarm(tmp_path: Path, order: admin.RestRequest) -> None:
+def test_another_order_under_a_good_proof_is_an_alarm(tmp_path: Path, order: AdminRequest[Any]) -> None:
     """The proof holds for the request, not for what the api makes of it; only an api that fell does this."""
 
     async def story(world: World) -> None:

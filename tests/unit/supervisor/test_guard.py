@@ -3,10 +3,10 @@
 import asyncio
 import errno
 import threading
-from typing import Any
 
 import pytest
 
+from appliance.channel.answers.status import FirewallState
 from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
 from appliance.network.esp import Esp
 from appliance.network.namespaces import NetworkError
@@ -25,9 +25,9 @@ class Surroundings(Enclosure):
         self.closed: list[int] = []
         self.looked = threading.Event()
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> FirewallState:
         """A report that can be recognised."""
-        return {"backend": "nft"}
+        return FirewallState(backend="nft")
 
     def probe(self) -> str | None:
         """The next finding."""
@@ -67,7 +67,7 @@ def test_control_is_told_when_something_opens_and_closes(surroundings: Surroundi
         assert await guard.look() is None
 
     asyncio.run(scene())
-    report = FirewallReported("container", {"backend": "nft"})
+    report = FirewallReported("container", FirewallState(backend="nft"))
     assert told == [report, ProbeFailed("reached"), report, ProbePassed()]
 
 
@@ -89,7 +89,7 @@ def test_a_new_control_learns_how_things_stand(surroundings: Surroundings) -> No
 
     async def scene() -> list[Message]:
         guard = Guard(surroundings, lambda _message: None)
-        assert guard.news() == [FirewallReported("container", {})]
+        assert guard.news() == [FirewallReported("container", FirewallState())]
         await guard.look()
         return guard.news()
 
@@ -182,7 +182,7 @@ def test_without_isolation_nothing_is_probed() -> None:
         assert await Guard(Enclosure(), told.append).look() is None
 
     asyncio.run(scene())
-    assert told == [FirewallReported("none", {})]
+    assert told == [FirewallReported("none", FirewallState())]
 
 
 def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:

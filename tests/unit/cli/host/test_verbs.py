@@ -10,8 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.channel.admin import AdminAnswer, AdminRequest, HostEndpoint, HostList, HostRevoke, HostToken
+from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, Hosts, KitParts, Revoked
 from appliance.cli.admin_socket import AdminSocket
 from appliance.cli.main import app
+from tests.support.answers import example
 
 PORTS: dict[str, Any] = {"state": "unknown", "checked": None, "open": [], "who": ""}
 HOST: dict[str, Any] = {
@@ -21,38 +23,45 @@ HOST: dict[str, Any] = {
     "bytes_out": 20, "last_seen": 1795160000.0, "token_expires": None,
     "ports": PORTS | {"state": "closed", "checked": 1.0},
 }  # fmt: skip
-OVERVIEW = {
-    "hosts": [
+OVERVIEW = example(
+    Hosts,
+    hosts=[
         HOST,
         HOST | {"name": "other", "state": "awaited", "groups": [], "token_expires": 1795164925.0},
     ],
-    "machines": [{"address": "10.0.0.7", "nodes": 3, "ports": PORTS}],
-    "troubles": ["look at this"],
-}
-TOKEN = {
-    "name": "laptop", "address": "10.113.11.2", "token": "rosrv-enrol_x", "token_expires": 1795164925.0,
-    "rest_port": 8443, "rest_trouble": "", "pin": "sha256//p=", "authority_fingerprint": "ab" * 32,
-}  # fmt: skip
+    machines=[{"address": "10.0.0.7", "nodes": 3, "ports": PORTS}],
+    troubles=["look at this"],
+)
+
+
+def token(request: HostToken) -> EnrolmentToken:
+    """What the appliance makes of it; it finds its own address where none is given."""
+    endpoint, reason = (request.kit["endpoint"], "") if request.kit["endpoint"] else FOUND
+    return example(
+        EnrolmentToken, name="laptop", address="10.113.11.2", token="rosrv-enrol_x", expires=1795164925.0,  # noqa: S106
+        endpoint=endpoint, endpoint_reason=reason, script="#!/bin/sh\n# join",
+    )  # fmt: skip
+
+
+FOUND = ("10.0.0.5", "the only address here")
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[AdminRequest]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[AdminRequest[Any]]:
     """What the appliance was asked; it answers."""
-    requests: list[AdminRequest] = []
+    requests: list[AdminRequest[Any]] = []
 
-    def ask(_self: AdminSocket, request: AdminRequest) -> AdminAnswer:
+    def ask(_self: AdminSocket, request: AdminRequest[Any]) -> AdminAnswer[Any]:
         requests.append(request)
         match request:
             case HostList():
                 return AdminAnswer(True, OVERVIEW)
             case HostEndpoint():
-                return AdminAnswer(True, {"endpoint": "10.0.0.5", "reason": "the only address here"})
+                return AdminAnswer(True, Endpoint(*FOUND))
             case HostToken():
-                return AdminAnswer(True, TOKEN)
+                return AdminAnswer(True, token(request))
             case HostRevoke(name):
-                return AdminAnswer(
-                    True, {"name": name, "address": "10.113.11.2", "serial": "", "taken_back": 0}
-                )
+                return AdminAnswer(True, Revoked(1, name, "10.113.11.2", "", 0))
             case _:
                 raise AssertionError(request)
 
@@ -65,7 +74,7 @@ def run(*arguments: str) -> Any:
     return CliRunner().invoke(app, ["host", *arguments], env={"COLUMNS": "400"})
 
 
-def test_the_list_says_all_of_it(asked: list[AdminRequest]) -> None:
+def test_the_list_says_all_of_it(asked: list[AdminRequest[Any]]) -> None:
     """Tunnel, bytes, certificate that ends soon, ports, groups, divergence; machines in clear text; troubles."""
     text = run("list").stdout
     for words in (
@@ -77,7 +86,7 @@ def test_the_list_says_all_of_it(asked: list[AdminRequest]) -> None:
     assert asked == [HostList()]
 
 
-def test_a_group_of_hosts(asked: list[AdminRequest]) -> None:
+def test_a_group_of_hosts(asked: list[AdminRequest[Any]]) -> None:
     """Only those of the group, and nothing else."""
     text = run("list", "--group", "ocu").stdout
     assert "laptop" in text
@@ -86,7 +95,7 @@ def test_a_group_of_hosts(asked: list[AdminRequest]) -> None:
     assert asked
 
 
-def test_a_token_and_its_script(asked: list[AdminRequest], tmp_path: Path) -> None:
+def test_a_token_and_its_script(asked: list[AdminRequest[Any]], tmp_path: Path) -> None:
     """The token alone is on standard output; the script is its owner's, has no token in it, and replaces nothing."""
     out = tmp_path / "join.sh"
     flags = (
@@ -107,9 +116,7 @@ def test_a_token_and_its_script(asked: list[AdminRequest], tmp_path: Path) -> No
     assert done.stdout == "rosrv-enrol_x\n"
     assert "good once" in done.stderr
     assert out.stat().st_mode & 0o777 == 0o600
-    text = out.read_text()
-    assert 'url="https://[fd00::1]:8443"' in text
-    assert "rosrv-enrol_x" not in text
+    assert out.read_text() == "#!/bin/sh\n# join"
     (order,) = asked
     assert isinstance(order, HostToken)
     assert (order.seconds, order.new, order.kit["open"]) == (7200, True, "tcp/22")
@@ -119,17 +126,14 @@ def test_a_token_and_its_script(asked: list[AdminRequest], tmp_path: Path) -> No
     assert len(asked) == 1, "it was not asked in vain"
 
 
-def test_the_appliance_knows_its_own_address(asked: list[AdminRequest], tmp_path: Path) -> None:
+def test_the_appliance_knows_its_own_address(asked: list[AdminRequest[Any]], tmp_path: Path) -> None:
     """Nobody has to give it; which one was taken, and why, is said."""
     out = tmp_path / "join.sh"
     done = run("add", "laptop", "--token", "--out", str(out))
     assert done.exit_code == 0, done.output
     assert done.stdout == "rosrv-enrol_x\n"
     assert "the appliance is at 10.0.0.5 (the only address here); another: --appliance" in done.stderr
-    assert 'url="https://10.0.0.5:8443"' in out.read_text()
-    assert [type(one) for one in asked] == [HostEndpoint, HostToken]
-    assert isinstance(asked[1], HostToken)
-    assert asked[1].kit["endpoint"] == "10.0.0.5"
+    assert [type(one) for one in asked] == [HostToken]
     out.unlink()
     shown = json.loads(run("kit", "laptop", "--token", "--out", str(out), "--json").stdout)
     assert (shown["endpoint"], shown["endpoint_reason"]) == ("10.0.0.5", "the only address here")
@@ -140,7 +144,7 @@ def test_an_address_that_cannot_be_told_enrols_nobody(
 ) -> None:
     """Exit status 1, the reason in words or as JSON; nothing else is asked, and nothing is written."""
 
-    def ask(_self: AdminSocket, request: AdminRequest) -> AdminAnswer:
+    def ask(_self: AdminSocket, request: AdminRequest[Any]) -> AdminAnswer[Any]:
         assert request == HostEndpoint()
         return AdminAnswer(False, error="there are several; give it: --appliance ADDRESS", trouble="refused")
 
@@ -166,7 +170,7 @@ def test_an_address_that_cannot_be_told_enrols_nobody(
     ],
 )
 def test_what_makes_no_sense_is_said_before_anything_is_asked(
-    asked: list[AdminRequest], flags: tuple[str, ...], said: str
+    asked: list[AdminRequest[Any]], flags: tuple[str, ...], said: str
 ) -> None:
     """Exit status 2, in words."""
     done = run("add", "laptop", *flags)
@@ -175,23 +179,22 @@ def test_what_makes_no_sense_is_said_before_anything_is_asked(
     assert asked == []
 
 
-def test_one_who_was_awaited_is_awaited_no_longer(asked: list[AdminRequest]) -> None:
+def test_one_who_was_awaited_is_awaited_no_longer(asked: list[AdminRequest[Any]]) -> None:
     """Revoked before it came, in other words than a host that was there."""
     assert "its one-time token opens nothing" in run("revoke", "laptop").stdout
     assert asked
 
 
-KIT: dict[str, Any] = {
-    "name": "laptop", "address": "10.113.11.2", "appliance": "10.113.11.1", "master": "http://10.113.11.1:11311",
-    "certificate": "C", "authority": "A", "serial": "1f", "expires": 1795164925.0, "warning": None, "pin": "p",
-    "rest_url": "https://10.113.11.1:8443", "rest_trouble": "",
-}  # fmt: skip
+KIT = example(
+    KitParts, name="laptop", address="10.113.11.2", appliance="10.113.11.1", master="http://10.113.11.1:11311",
+    certificate="C", authority="A", serial="1f", expires=1795164925.0, pin="p", rest_url="https://10.113.11.1:8443",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", ["add", "kit"])
 @pytest.mark.parametrize("token", [(), ("--token",)])
 def test_what_cannot_be_written_is_not_ordered(
-    asked: list[AdminRequest], tmp_path: Path, verb: str, token: tuple[str, ...]
+    asked: list[AdminRequest[Any]], tmp_path: Path, verb: str, token: tuple[str, ...]
 ) -> None:
     """A new kit closes a tunnel and a token is shown once: neither happens when there is no place for what it gives."""
     for out, said in (
@@ -212,7 +215,7 @@ def test_an_order_that_is_refused_leaves_no_file(monkeypatch: pytest.MonkeyPatch
     """Nor does one that was interrupted; and the place is known to be good while the appliance is asked."""
     out, interrupted = tmp_path / "kit", [False]
 
-    def refuse(_self: AdminSocket, _request: AdminRequest) -> AdminAnswer:
+    def refuse(_self: AdminSocket, _request: AdminRequest[Any]) -> AdminAnswer[Any]:
         assert out.stat().st_mode & 0o777 == 0o600
         assert out.stat().st_size >= 64 << 10
         if interrupted[0]:
@@ -244,7 +247,7 @@ def test_a_kit_on_standard_output(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert (tmp_path / "rosrv-laptop.tar.gz").read_bytes()[-4:] != bytes(4), "it has its own size"
 
 
-def test_a_script_on_standard_output(asked: list[AdminRequest]) -> None:
+def test_a_script_on_standard_output(asked: list[AdminRequest[Any]]) -> None:
     """The token then stands among what is said; `--json` would want standard output, too."""
     done = run("add", "laptop", "--appliance", "10.0.0.1", "--token", "--out", "-")
     assert done.exit_code == 0, done.output

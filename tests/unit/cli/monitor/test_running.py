@@ -7,18 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from appliance.channel.admin import AdminAnswer
+from appliance.channel.admin import AdminAnswer, encode
+from appliance.channel.answers.monitors import Monitors, Replaced
 from appliance.cli.main import app
+from tests.support.answers import example
 
 GOOD = "a() {\n  event e(int x) /t pkg/T '{data:x}' { }\n}\n"
-REPLACED: dict[str, Any] = {
-    "revision": 2, "replaced": 1, "added": ["a.rv"], "changed": [], "removed": [], "moved": [], "warnings": [],
-    "monitors": [], "began": [],
-}  # fmt: skip
+REPLACED = example(Replaced, revision=2, replaced=1, added=["a.rv"])
+LISTED = example(Monitors)
 
 
 @pytest.fixture
@@ -40,7 +39,8 @@ def state(tmp_path: Path) -> Iterator[Path]:
                 request = lines.readline()
                 with (folder / "asked.json").open("ab") as asked:
                     asked.write(request)
-                peer.sendall(msgspec.json.encode(AdminAnswer(True, REPLACED)) + b"\n")
+                body = LISTED if b'"verb":"monitors"' in request else REPLACED
+                peer.sendall(encode(AdminAnswer(True, body)) + b"\n")
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()

@@ -1,0 +1,172 @@
+"""Routes whose handlers take and give structs (msgspec): how those are read and written, and what the contract says.
+
+A handler gives a struct, or `Tagged` with its ETag; the contract has the schema that is made of it. A body is taken by
+`Annotated[Kind, body(Kind)]`. Where an answer is something else, the handler gives a `Response`.
+"""
+
+import functools
+import json
+import re
+import typing
+from collections.abc import Awaitable, Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import msgspec
+from fastapi import APIRouter, Depends, Request, Response
+
+from appliance.api.preconditions import etag
+from appliance.api.problems import BadInput, ProblemError
+
+A = TypeVar("A")
+Responses = dict[int | str, dict[str, Any]]
+ETAG = {"ETag": {"description": "what If-Match takes of the next change", "schema": {"type": "string"}}}
+_JSON = "application/json"
+_PLACE = re.compile(r"(?s)(.*) - at `(?:key in )?\$(.*)`")
+
+
+class Tagged(NamedTuple, Generic[A]):
+    """An answer with the revision, or the tag, that its ETag has."""
+
+    body: A
+    tag: int | str
+
+
+def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
+    """A struct as JSON."""
+    headers = None if tag is None else {"ETag": etag(tag)}
+    return Response(msgspec.json.encode(body), status, headers, _JSON)
+
+
+class Contract:
+    """The structs that the contract speaks of."""
+
+    def __init__(self) -> None:
+        self._kinds: set[Any] = set()
+
+    def reference(self, kind: Any) -> dict[str, Any]:
+        """The schema of a struct, by its name."""
+        self._kinds.add(kind)
+        return {"$ref": f"#/components/schemas/{kind.__name__}"}
+
+    def components(self) -> dict[str, Any]:
+        """Their schemas, and those of what is in them."""
+        kinds = sorted(self._kinds, key=lambda kind: str(kind.__name__))
+        return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
+
+
+CONTRACT = Contract()
+
+
+def content(kind: Any) -> dict[str, Any]:
+    """An answer of this kind, as `responses=` of a route takes it."""
+    return {_JSON: {"schema": CONTRACT.reference(kind)}}
+
+
+class _Body:
+    """Reads a body of one kind; `text` names what may also be sent as text/plain, the field `text` of the kind."""
+
+    def __init__(self, kind: Any, text: str | None) -> None:
+        self.kind = kind
+        self.text = text
+
+    async def __call__(self, request: Request) -> Any:
+        """The body. Raises `ProblemError` (415, 422)."""
+        content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if content_type == "text/plain" and self.text is not None:
+            return self._of_text(_text(await request.body()))
+        if content_type == _JSON:
+            return self._of_json(_text(await request.body()))
+        if self.text is None:
+            raise ProblemError(422, "bad-input", "send a JSON object, as Content-Type application/json")
+        what = f'send {self.text} as Content-Type text/plain, or as JSON {{"text": …}}'
+        raise ProblemError(415, "wrong-type", what)
+
+    def _of_text(self, text: str) -> Any:
+        try:
+            return msgspec.convert({"text": text}, self.kind)
+        except msgspec.ValidationError as error:
+            raise _bad_input(error) from None
+
+    def _of_json(self, text: str) -> Any:
+        try:
+            return msgspec.json.decode(text, type=self.kind)
+        except msgspec.ValidationError as error:
+            raise _bad_input(error) from None
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise _not_json(text, error) from None
+
+    def schema(self) -> dict[str, Any]:
+        """How the contract describes it."""
+        kinds = content(self.kind)
+        if self.text is not None:
+            kinds["text/plain"] = {"schema": {"type": "string", "minLength": 1}}
+        return {"requestBody": {"required": True, "content": kinds}}
+
+    def responses(self) -> Responses:
+        """What the contract says of those that are not taken."""
+        wrong: Responses = {422: {"description": "A parameter or the body makes no sense."}}
+        if self.text is not None:
+            wrong[415] = {"description": "The body is neither text/plain nor JSON."}
+        return wrong
+
+
+def _text(data: bytes) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ProblemError(422, "bad-input", f"the body is not UTF-8 (byte {error.start})") from None
+
+
+def _bad_input(error: msgspec.ValidationError) -> ProblemError:
+    found = _PLACE.fullmatch(str(error))
+    text, place = (found[1], found[2]) if found is not None else (str(error), "")
+    bad = BadInput(f"body{place}", text)
+    return ProblemError(422, "bad-input", f"{bad.where}: {bad.text}", errors=[bad])
+
+
+def _not_json(text: str, error: Exception) -> ProblemError:
+    """What is wrong with it, and where, in the words of Python's reader."""
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as found:
+        detail = f"the body is not JSON: {found.msg}"
+        return ProblemError(422, "not-json", detail, line=found.lineno, column=found.colno)
+    except (RecursionError, ValueError):  # a number with thousands of digits
+        pass
+    return ProblemError(422, "not-json", f"the body is not JSON: {error}")
+
+
+def body(kind: type, *, text: str | None = None) -> Any:
+    """For the annotation of a handler's parameter: the body is of this kind, or the text that is called `text`."""
+    return Depends(_Body(kind, text))
+
+
+class Routes(APIRouter):
+    """FastAPI's router, for handlers that take and give structs."""
+
+    def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        """Add a handler; its answer, its ETag and its body are put into the contract."""
+        hints = typing.get_type_hints(endpoint, include_extras=True)
+        for hint in hints.values():
+            for part in getattr(hint, "__metadata__", ()):
+                if isinstance(getattr(part, "dependency", None), _Body):
+                    options["openapi_extra"] = part.dependency.schema()
+                    options["responses"] = part.dependency.responses() | (options.get("responses") or {})
+        given = hints.get("return")
+        tagged = typing.get_origin(given) is Tagged
+        kind = typing.get_args(given)[0] if tagged else given
+        if tagged or (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+            good = {"content": content(kind), **({"headers": ETAG} if tagged else {})}
+            options["responses"] = {200: {"description": "OK", **good}} | (options.get("responses") or {})
+            options["response_model"] = None
+            endpoint = _encoded(endpoint)
+        super().add_api_route(path, endpoint, **options)
+
+
+def _encoded(endpoint: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Response]]:
+    @functools.wraps(endpoint)
+    async def answered(*arguments: Any, **named: Any) -> Response:
+        given = await endpoint(*arguments, **named)
+        return answer(given.body, tag=given.tag) if isinstance(given, Tagged) else answer(given)
+
+    return answered

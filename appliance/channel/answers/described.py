@@ -1,0 +1,10 @@
+"""Short words for the fields of answers."""
+
+from typing import Any
+
+import msgspec
+
+
+def told(description: str, **bounds: Any) -> msgspec.Meta:
+    """What the contract says of a field, and its bounds."""
+    return msgspec.Meta(description=description, **bounds)

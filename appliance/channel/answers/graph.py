@@ -1,0 +1,89 @@
+"""The graph: who talks to whom, through the appliance or past it, and how much."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.described import told
+
+
+class Node(msgspec.Struct, frozen=True):
+    """A node; `lost`: it does not answer, its registrations are kept back until it returns."""
+
+    name: str
+    host: str
+    state: Literal["live", "lost"]
+    publishes: list[str]
+    subscribes: list[str]
+    offers: list[str]
+
+
+class Flow(msgspec.Struct, frozen=True, kw_only=True):
+    """What went through since RVMaster started, and what goes through now (a second's average)."""
+
+    messages: int
+    bytes: int
+    dropped: Annotated[int, told("messages that slow subscribers did not get")]
+    messages_per_second: float
+    bytes_per_second: float
+    delay_seconds: Annotated[
+        float, told("that the relay added to a message of the last second, on average; of services 0")
+    ]
+
+
+class Publisher(Flow, frozen=True, kw_only=True):
+    """A publisher of a topic, with what came from it."""
+
+    node: str
+
+
+class Connection(msgspec.Struct, frozen=True):
+    """A subscriber or client that is connected through the appliance to a node."""
+
+    from_: str = msgspec.field(name="from")
+    to: str
+    host: str
+
+
+class Topic(msgspec.Struct, frozen=True):
+    """A topic; `mediated`: its messages go through the appliance."""
+
+    name: str
+    type: str
+    mediated: bool
+    publishers: list[Publisher]
+    subscribers: list[str]
+    connections: list[Connection]
+
+
+class Service(Flow, frozen=True, kw_only=True):
+    """A service and the node that offers it."""
+
+    name: str
+    node: str
+    mediated: bool
+    connections: list[Connection]
+
+
+class Graph(msgspec.Struct, frozen=True):
+    """The graph at one moment, without the appliance's own nodes."""
+
+    nodes: list[Node]
+    topics: list[Topic]
+    services: list[Service]
+
+
+class Registration(msgspec.Struct, frozen=True):
+    """Something live that a call gave a host, as `appliance.policy.Live` has it."""
+
+    host: str
+    caller_id: str
+    call: str
+    resource: str
+    namespace: bool = False
+
+
+class Registrations(msgspec.Struct, frozen=True):
+    """Everything live that a policy may end."""
+
+    registrations: list[Registration]

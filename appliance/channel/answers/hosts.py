@@ -1,0 +1,174 @@
+"""The hosts that come through tunnels, machines in clear text, and what a change of them did."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.described import told
+
+PortsState = Literal["closed", "open", "unknown"]
+State = Literal["up", "down", "expired", "revoked", "not wanted", "awaited", "not enrolled"]
+
+
+class PortsSeen(msgspec.Struct, frozen=True):
+    """Whether a machine's ROS ports are closed to all but the appliance, as somebody saw who tried from outside."""
+
+    state: PortsState
+    checked: Annotated[float | None, told("seconds since the epoch; null: never")]
+    open: Annotated[list[int], told("TCP ports that accepted a connection, the first hundred")]
+    who: Annotated[str, told("the token by which it was told, or `operator`; empty: never tried")]
+
+
+class Host(msgspec.Struct, frozen=True):
+    """A host that comes through a tunnel; times are seconds since the epoch.
+
+    `awaited`: it has a token and has not enrolled yet. `not wanted`: hosts.yaml says that its tunnel stays closed.
+    """
+
+    name: str
+    address: Annotated[str | None, told("its virtual address, which it keeps for good")]
+    state: State
+    groups: Annotated[list[str], told("of hosts.yaml")]
+    declared: Annotated[bool, told("it is in hosts.yaml")]
+    wanted: Annotated[bool, told("hosts.yaml wants its tunnel, or does not know it")]
+    divergence: Annotated[str | None, told("what is different from hosts.yaml, in a sentence")]
+    serial: Annotated[str | None, told("of its certificate, in hexadecimal")]
+    enrolled: float | None
+    expires: Annotated[float | None, told("the end of its certificate")]
+    expires_soon: Annotated[bool, told("within 14 days, or a third of its life if that is shorter")]
+    renewing: Annotated[bool, told("it has a newer certificate that it has not put in place yet")]
+    revoked: float | None
+    remote: Annotated[str | None, told("where it really is; null: no tunnel")]
+    seconds: Annotated[int | None, told("age of the SA")]
+    bytes_in: int | None
+    bytes_out: int | None
+    last_seen: Annotated[float | None, told("when something last came through its tunnel")]
+    token_expires: Annotated[float | None, told("until when its one-time token can be used; null: none")]
+    ports: PortsSeen
+
+
+class Machine(msgspec.Struct, frozen=True):
+    """A machine in clear text on which nodes run, by its address."""
+
+    address: str
+    nodes: int
+    ports: PortsSeen
+
+
+class Hosts(msgspec.Struct, frozen=True):
+    """All hosts, and how the tunnels stand."""
+
+    revision: Annotated[int, told("the number in the ETag")]
+    hosts: list[Host]
+    machines: Annotated[list[Machine], told("machines of nodes without a tunnel")]
+    esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
+    key_exchange: Annotated[list[str], told("offered and accepted, the best first; empty: not known yet")]
+    post_quantum: Annotated[bool | None, told("whether ML-KEM is among them; null: not known yet")]
+    pool: str
+    address: Annotated[str, told("the appliance's own in the tunnels")]
+    hosts_file: str
+    troubles: Annotated[list[str], told("what a person should look at")]
+
+
+class KitParts(msgspec.Struct, frozen=True, kw_only=True):
+    """What an enrolled host's kit is made of, but for its private key; `kept` was kept with its one-time token.
+
+    `rest_url` is REST's through the tunnel, and `pin` that of the key of its server; empty where the host cannot renew
+    its certificate there: `rest_trouble` says why.
+    """
+
+    revision: int
+    name: str
+    address: str
+    appliance: str
+    master: str
+    rest_url: str
+    rest_trouble: str
+    pin: str
+    warning: str | None
+    serial: str
+    expires: float
+    certificate: str
+    authority: str
+    kept: dict[str, str] = {}
+
+
+class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
+    """A one-time token: shown this once."""
+
+    revision: Annotated[int, told("of the table of hosts, the number in the ETag")]
+    name: str
+    address: Annotated[str, told("the virtual address that is kept for it")]
+    token: str
+    expires: float
+    endpoint: Annotated[str, told("address or name at which the host reaches the appliance")]
+    endpoint_reason: Annotated[str, told("why this one, where none was given; else empty")]
+    url: Annotated[str, told("where the host brings it: POST /v1/enrol there")]
+    pin: Annotated[str, told("of the key of that server, as curl's --pinnedpubkey takes it")]
+    authority: Annotated[str, told("SHA-256 of the authority's certificate, in hexadecimal")]
+    script: Annotated[
+        str, told("join.sh: makes the key on the host, enrols it, starts and checks the tunnel")
+    ]
+
+
+class Renewed(msgspec.Struct, frozen=True):
+    """A host has put its new certificate in place."""
+
+    name: str
+
+
+class NewCertificate(msgspec.Struct, frozen=True):
+    """The certificate for the new key; the one before is good until `renewed` is called."""
+
+    name: str
+    serial: str
+    expires: float
+    certificate: str
+    authority: str
+
+
+class Revoked(msgspec.Struct, frozen=True):
+    """A host was let out for good; `serial` is empty for one that was awaited only."""
+
+    revision: int
+    name: str
+    address: str
+    serial: str
+    taken_back: Annotated[int, told("registrations and grants")]
+
+
+class PortsTold(msgspec.Struct, frozen=True):
+    """What was told of the ports of `name`, a host's name or an address, is known."""
+
+    revision: int
+    name: str
+    ports: PortsSeen
+
+
+class Reloaded(msgspec.Struct, frozen=True):
+    """hosts.yaml was read again."""
+
+    revision: int
+    declared: list[str]
+    opened: Annotated[list[str], told("hosts whose tunnel is wanted again")]
+    closed: Annotated[list[str], told("hosts whose tunnel is no longer wanted")]
+    divergence: list[str]
+
+
+class Endpoint(msgspec.Struct, frozen=True):
+    """At which address hosts reach the appliance, and why that one."""
+
+    endpoint: str
+    reason: str
+
+
+class RevocationList(msgspec.Struct, frozen=True):
+    """The authority's signed list of revoked certificates, in PEM."""
+
+    revocations: str
+
+
+class AuthorityCertificate(msgspec.Struct, frozen=True):
+    """The authority's certificate, in PEM."""
+
+    authority: str

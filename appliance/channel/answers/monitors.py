@@ -1,0 +1,75 @@
+"""The monitors: their state and counters, and what a change of them did."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.answers.described import told
+
+Tag = Annotated[
+    str,
+    told(
+        "another after every change, switch and resumption; in quotes it is the ETag, and what If-Match takes"
+    ),
+]
+RvState = tuple[int, int, list[tuple[str, str, int, int]]]
+
+
+class MonitorState(msgspec.Struct, frozen=True):
+    """A running monitor; counters since it was loaded or its relay began."""
+
+    name: str
+    file: Annotated[str, told("the specification file it stands in; a file may have several monitors")]
+    enabled: bool
+    held: Annotated[bool, told("blocks its topics until it is resumed")]
+    failing: bool
+    topics: list[str]
+    services: list[str]
+    events: int
+    verdicts: int
+    drops: int
+    changes: int
+    faults: int
+
+
+class Monitors(msgspec.Struct, frozen=True):
+    """The specifications in force; `loaded` is seconds since the epoch."""
+
+    revision: int
+    tag: Tag
+    who: str
+    note: str
+    loaded: float
+    folder: Annotated[str | None, told("what `reload` reads; null: no folder was given at start")]
+    differs_from_folder: bool
+    warnings: list[str]
+    refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
+    rv_state: Annotated[
+        RvState, told("ROSRV's `getRVState`: ROSMaster's port, RVMaster's, and where topics are carried")
+    ]
+    monitors: Annotated[list[MonitorState], told("in the order in which they see messages")]
+    files: Annotated[dict[str, str] | None, told("with `texts=1`: specifications by file name")] = None
+    definitions: Annotated[dict[str, str] | None, told("with `texts=1`: those that came with them")] = None
+
+
+class Replaced(msgspec.Struct, frozen=True):
+    """What a change of the specifications did; `replaced` is the revision before, `warnings` are lines."""
+
+    revision: int
+    tag: str
+    replaced: int
+    added: list[str]
+    changed: list[str]
+    removed: list[str]
+    warnings: list[str]
+    moved: list[str]
+    began: list[str]
+    kept: list[str]
+
+
+class Switched(msgspec.Struct, frozen=True):
+    """The monitors that were not so already."""
+
+    names: list[str]
+    revision: int
+    tag: Tag

@@ -1,0 +1,72 @@
+"""The policy: revisions, and what a change of it did."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.answers.described import told
+
+
+class Revision(msgspec.Struct, frozen=True):
+    """A policy that came into force; `loaded` is seconds since the epoch."""
+
+    revision: int
+    file: str
+    loaded: float
+    who: str
+    note: str
+    in_force: bool
+
+
+class Revisions(msgspec.Struct, frozen=True):
+    """The kept revisions, the newest first."""
+
+    revisions: list[Revision]
+
+
+class RevisionText(Revision, frozen=True):
+    """A kept revision with its text."""
+
+    text: str
+
+
+class PolicyInForce(RevisionText, frozen=True):
+    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
+
+    policy_file: Annotated[str, told("what `reload` reads")]
+    differs_from_file: bool
+    warnings: list[str]
+    confirm_by: float | None
+
+
+class PolicyKnown(PolicyInForce, frozen=True):
+    """A revision with all by which another text is judged beside it.
+
+    `robot` are the robot's addresses and networks, `hosts` the addresses of enrolled hosts by name. `cases` are the
+    policy's tests, None where there are none; `cases_error` says why they cannot be read.
+    """
+
+    robot: list[str]
+    hosts: dict[str, str]
+    cases_file: str
+    cases: str | None
+    cases_error: str | None
+
+
+class Loaded(msgspec.Struct, frozen=True):
+    """A policy came into force, in the place of the revision `replaced`."""
+
+    revision: int
+    replaced: int
+    warnings: list[str]
+    revoked: Annotated[int, told("registrations and connections that were taken back")]
+    confirm_by: Annotated[
+        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
+    ]
+
+
+class Confirmed(msgspec.Struct, frozen=True):
+    """Whether there was something to confirm."""
+
+    confirmed: bool
+    revision: int

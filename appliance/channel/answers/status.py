@@ -1,0 +1,151 @@
+"""How the running appliance stands: its processes, isolation, policy, graph, tunnels, audit log."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.described import told
+from appliance.channel.answers.hosts import PortsSeen
+
+
+class ProcessInfo(msgspec.Struct, frozen=True):
+    """One process of the appliance; `since` is RFC 3339 UTC."""
+
+    role: str
+    pid: int
+    since: str
+    restarts: int
+    walls: Annotated[
+        str,
+        told(
+            "what limits its calls of the kernel, its files and ports; empty: the supervisor, or not told yet"
+        ),
+    ] = ""
+    lacks: Annotated[list[str], told("what this machine's kernel lacks of them")] = []
+
+
+class FirewallRule(msgspec.Struct, frozen=True):
+    """A rule with what it has matched so far; `in_force` is false when the kernel has it no more."""
+
+    chain: str
+    purpose: str
+    rule: str
+    packets: int
+    octets: int
+    in_force: bool
+
+
+class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The firewall; what this isolation does not have is left out.
+
+    `translations` and `obstacles` are chains of other programs on the host, which translate or drop what is forwarded.
+    """
+
+    backend: str | None = None
+    not_used: Annotated[list[str] | None, told("other back ends, and why they are not used")] = None
+    rules: list[FirewallRule] | None = None
+    forwarding: Annotated[
+        list[FirewallRule] | None, told("on the host, towards the appliance's namespace")
+    ] = None
+    translations: list[str] | None = None
+    obstacles: list[str] | None = None
+
+
+class PolicyState(msgspec.Struct, frozen=True):
+    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
+
+    revision: int
+    file: Annotated[str, told("what `reload` reads")]
+    source: Annotated[str, told("where the text in force came from")]
+    who: str
+    differs_from_file: bool
+    warnings: int
+    confirm_by: float | None
+
+
+class IpsecState(msgspec.Struct, frozen=True):
+    """How the tunnels stand, and what a person should look at."""
+
+    esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
+    key_exchange: Annotated[list[str], told("offered and accepted, the best first; empty: not known yet")]
+    post_quantum: Annotated[bool | None, told("whether ML-KEM is among them; null: not known yet")]
+    charon: Annotated[str | None, told("its version")]
+    pool: str
+    address: Annotated[str, told("the appliance's own in the tunnels")]
+    hosts_file: str
+    enrolled: int
+    awaited: int
+    up: int
+    troubles: Annotated[list[str], told("what a person should look at")]
+    ports: Annotated[dict[str, PortsSeen], told("of every host that may have nodes, by name or address")]
+
+
+class MonitorsState(msgspec.Struct, frozen=True):
+    """The specifications in force, and the names of the monitors that need somebody."""
+
+    revision: int
+    tag: str
+    loaded: int
+    enabled: int
+    held: list[str]
+    failing: list[str]
+    refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
+    who: str
+    differs_from_folder: bool
+
+
+class ForwardingState(msgspec.Struct, frozen=True):
+    """How far the audit log is forwarded: `behind` records wait, the oldest for `seconds`; `missed` were removed.
+
+    `sent` messages since the forwarder started, up to the record `sequence` and the checkpoint `checkpoint`.
+    """
+
+    sent: int
+    sequence: int
+    checkpoint: int
+    behind: int
+    seconds: float
+    missed: int
+    trouble: Annotated[str, told("why nothing goes on, or empty")]
+    to: str
+    send: str
+
+
+class AuditState(msgspec.Struct, frozen=True):
+    """How far the audit log is behind, why it cannot be written, and what becomes of requests then."""
+
+    lag_records: int
+    lag_seconds: float
+    failed: str | None
+    on_failure: Literal["deny", "allow"]
+    degraded: str | None
+    forwarding: Annotated[ForwardingState | None, told("null: it is not to be forwarded")]
+
+
+class Status(msgspec.Struct, frozen=True):
+    """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
+
+    version: str
+    since: float
+    master: Annotated[str, told("where nodes find their master")]
+    processes: list[ProcessInfo]
+    isolation: str
+    relaying: Annotated[
+        str, told("`all`, or `monitored`: then what no monitor is on passes the appliance by")
+    ]
+    mediation: Annotated[str, told("`full`, or `monitored`: then nodes are told each other's own addresses")]
+    firewall: FirewallState
+    probe: Annotated[str, told("of the hidden ROS Master: `passed`, or what was seen; empty: not run yet")]
+    policy: PolicyState
+    ipsec: IpsecState
+    monitors: MonitorsState
+    rosmaster: str
+    relay: str
+    nodes: int
+    shadows: int
+    topics: int
+    services: int
+    connections: int
+    messages: int
+    dropped: int
+    audit: AuditState

@@ -1,0 +1,39 @@
+"""Access tokens of REST, and what its orders are signed under."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.described import told
+
+TokenRole = Literal["viewer", "operator", "admin"]
+
+
+class Token(msgspec.Struct, frozen=True):
+    """A token without its secret; times are seconds since the epoch."""
+
+    name: str
+    id: str
+    role: TokenRole
+    created: float
+    expires: float
+    revoked: float | None
+
+
+class Tokens(msgspec.Struct, frozen=True):
+    """All tokens that were made, the oldest first."""
+
+    tokens: list[Token]
+
+
+class NewToken(Token, frozen=True, kw_only=True):
+    """A token that was made, with its text: the only place where that ever stands."""
+
+    token: str
+
+
+class Challenge(msgspec.Struct, frozen=True):
+    """What the next order is signed under."""
+
+    challenge: str
+    seconds: Annotated[float, told("so long it is good, for one order")]

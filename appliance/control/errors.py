@@ -1,0 +1,5 @@
+"""What cannot be answered."""
+
+
+class UnknownThingError(Exception):
+    """There is nothing of the name or number that was asked for."""

@@ -1,0 +1,93 @@
+"""How the appliance stands: its status, its graph, what is live, what is measured. Nothing is changed by a look."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import appliance
+from appliance.channel import admin
+from appliance.channel.answers.graph import Graph, Registration, Registrations
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.status import AuditState, PolicyState, Status
+from appliance.control.assembly import Parts
+from appliance.control.measures import measures_of
+from appliance.control.monitor_orders import monitors_status
+from appliance.control.overview import graph_of
+from appliance.control.surroundings import Surroundings
+from appliance.hosts.hosts import Hosts
+from appliance.master.graph.registry import Kind, Life
+from appliance.master.policies import Policies
+from appliance.policy import Live
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Each method answers the request that it takes.
+
+    `audit()` is how the audit log stands, `live()` what a change of the policy may end.
+    """
+
+    parts: Parts
+    policies: Policies
+    hosts: Hosts
+    surroundings: Surroundings
+    audit: Callable[[], AuditState]
+    queued_deliveries: Callable[[], int]
+    live: Callable[[], list[Live]]
+    started: float = field(default_factory=time.time)
+
+    async def status(self, _request: admin.StatusWanted) -> Status:
+        """Processes, policy, registry, relay, firewall."""
+        return self._status()
+
+    async def graph(self, _request: admin.GraphWanted) -> Graph:
+        """Nodes, topics and services, and what flows."""
+        return graph_of(self.parts)
+
+    async def metrics(self, _request: admin.MetricsWanted) -> Measures:
+        """The status, and everything that is counted."""
+        return measures_of(self.parts, self._status(), self.hosts.rows(), self.queued_deliveries())
+
+    async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
+        """Everything live that a change of the policy may end."""
+        return Registrations([Registration(**live.fields()) for live in self.live()])
+
+    def _status(self) -> Status:
+        parts, registry, relay = self.parts, self.parts.registry, self.parts.relay
+        lives = [one.life for one in registry.all()]
+        return Status(
+            version=appliance.__version__,
+            since=self.started,
+            master=self.surroundings.master,
+            processes=self.surroundings.processes,
+            isolation=self.surroundings.firewall.isolation,
+            relaying="all" if parts.mediation.relay_all else "monitored",
+            mediation="full" if parts.mediation.stand_ins else "monitored",
+            firewall=self.surroundings.firewall.report,
+            probe=self.surroundings.probe,
+            policy=self._policy(),
+            ipsec=self.hosts.status(),
+            monitors=monitors_status(parts.monitors),
+            rosmaster="reachable" if parts.rosmaster.reachable else "being rebuilt",
+            relay=relay.presence,
+            nodes=lives.count(Life.LIVE),
+            shadows=lives.count(Life.SHADOW),
+            topics=len({one.resource for _node, one in registry.in_order() if one.kind is Kind.PUBLICATION}),
+            services=len({one.resource for _node, one in registry.in_order() if one.kind is Kind.SERVICE}),
+            connections=len(relay.connections),
+            messages=relay.carried.total.messages,
+            dropped=relay.carried.total.dropped,
+            audit=self.audit(),
+        )
+
+    def _policy(self) -> PolicyState:
+        policies = self.policies
+        return PolicyState(
+            revision=policies.revision,
+            file=str(policies.file),
+            source=policies.current.file,
+            who=policies.in_force.who,
+            differs_from_file=policies.differs_from_file,
+            warnings=len(policies.current.warnings),
+            confirm_by=policies.confirm_by,
+        )

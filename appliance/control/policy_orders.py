@@ -1,0 +1,97 @@
+"""What operators ask about the policy.
+
+Changes are made one at a time, and one that names the revision it is meant for is refused when another is in force by
+then.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from dataclasses import asdict
+from typing import Any
+
+from appliance.channel import admin
+from appliance.channel.answers import policy as answers
+from appliance.control.errors import UnknownThingError
+from appliance.master.policies import Policies, RevisionChangedError
+from appliance.policy import Known
+from appliance.store.state import RevisionRow, StateStore
+
+
+class PolicyOrders:
+    """Each method answers the request that it takes. They raise `PolicyRefusedError`, `RevisionChangedError`."""
+
+    def __init__(self, policies: Policies, store: StateStore) -> None:
+        self._policies = policies
+        self._store = store
+        self._lock = asyncio.Lock()
+
+    async def reload(self, request: admin.PolicyReload, who: str) -> answers.Loaded:
+        """Read the policy file again."""
+        by = "disk" if who == "operator" else who
+        async with self._changing(request.expected):
+            loaded = await self._policies.reload(who=by, confirm_within=request.confirm_within)
+        return answers.Loaded(**asdict(loaded))
+
+    async def load(self, request: admin.PolicyLoad, who: str) -> answers.Loaded:
+        """Bring another text into force."""
+        async with self._changing(request.expected):
+            loaded = await self._policies.load_text(
+                request.text, who=who, note=request.note, confirm_within=request.confirm_within
+            )
+        return answers.Loaded(**asdict(loaded))
+
+    async def roll_back(self, request: admin.PolicyRollback, who: str) -> answers.Loaded:
+        """Bring a kept revision into force."""
+        async with self._changing(request.expected):
+            loaded = self._policies.rollback(request.revision, who=who)
+        return answers.Loaded(**asdict(loaded))
+
+    async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.Confirmed:
+        """Keep a change that would go back by itself."""
+        async with self._changing(request.expected):
+            return answers.Confirmed(self._policies.confirm(who=who), self._policies.revision)
+
+    async def revisions(self, _request: admin.PolicyRevisions) -> answers.Revisions:
+        """The kept revisions."""
+        rows = self._policies.revisions()
+        return answers.Revisions([answers.Revision(**self._revision(row)) for row in rows])
+
+    async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
+        """A revision, and with what its text is judged. Raises `UnknownThingError`."""
+        return await asyncio.to_thread(self._known, request.revision, self._policies.known)
+
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: int | None) -> AsyncIterator[None]:
+        """Around a change; it is on the disk afterwards."""
+        async with self._lock:
+            if expected not in (None, self._policies.revision):
+                raise RevisionChangedError(expected, self._policies.revision)
+            yield
+            await self._store.settled()
+
+    def _known(self, revision: int | None, known: Known) -> answers.PolicyKnown:
+        policies = self._policies
+        row = policies.revision_row(revision)
+        if row is None:
+            raise UnknownThingError(f"there is no revision {revision}")
+        return answers.PolicyKnown(
+            **self._revision(row),
+            text=row.text,
+            policy_file=str(policies.file),
+            differs_from_file=policies.differs_from_file,
+            warnings=[str(one) for one in policies.current.warnings],
+            confirm_by=policies.confirm_by,
+            **policies.with_cases(known).fields(),
+        )
+
+    def _revision(self, row: RevisionRow) -> dict[str, Any]:
+        """The fields of `Revision`."""
+        return {
+            "revision": row.revision,
+            "file": row.file,
+            "loaded": row.loaded,
+            "who": row.who,
+            "note": row.note,
+            "in_force": row.revision == self._policies.revision,
+        }

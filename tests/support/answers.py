@@ -1,0 +1,54 @@
+"""Answers of the appliance for tests: what a test does not say is empty, nought or none."""
+
+import types
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+
+A = TypeVar("A", bound=msgspec.Struct)
+_EMPTY: dict[Any, Any] = {int: 0, float: 0.0, str: "", bool: False, list: [], dict: {}}
+
+
+def example(kind: type[A], **given: Any) -> A:
+    """A struct with these fields; those of structs in it are said as dictionaries."""
+    return msgspec.convert(_fields(kind, given), kind)
+
+
+def _fields(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
+    known = {one.encode_name: one for one in msgspec.structs.fields(kind)}
+    assert given.keys() <= known.keys(), f"{kind.__name__} has no {given.keys() - known.keys()}"
+    return {name: _value(one.type, given[name]) for name, one in known.items() if name in given} | {
+        name: _empty(one.type) for name, one in known.items() if name not in given and one.required
+    }
+
+
+def _value(kind: Any, given: Any) -> Any:
+    """What was said, with the rest of the structs in it."""
+    if get_origin(kind) is Annotated:
+        return _value(get_args(kind)[0], given)
+    if get_origin(kind) in (Union, types.UnionType):
+        return None if given is None else _value(get_args(kind)[0], given)
+    if _is_struct(kind) and isinstance(given, dict):
+        return _fields(kind, given)
+    if get_origin(kind) is list and isinstance(given, list):
+        return [_value(get_args(kind)[0], one) for one in given]
+    if get_origin(kind) is dict and isinstance(given, dict):
+        return {name: _value(get_args(kind)[1], one) for name, one in given.items()}
+    return given
+
+
+def _empty(kind: Any) -> Any:
+    origin, words = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _empty(words[0])
+    if origin in (Union, types.UnionType):
+        return None
+    if origin is Literal:
+        return words[0]
+    if origin is tuple:
+        return [_empty(one) for one in words]
+    return _fields(kind, {}) if _is_struct(kind) else _EMPTY[origin or kind]
+
+
+def _is_struct(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
