@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from appliance.audit.chain import Checkpoint, checkpoint_hash, parse_checkpoint
-from appliance.audit.findings import Finding, Kind
+from appliance.audit.findings import Kind, LogFinding
 from appliance.audit.signatures import ASKED_AT_ONCE, signature_is_right
 
 _HASH = 32
@@ -75,7 +75,7 @@ class CheckpointAudit:
         before: tuple[int, str],
         chain: dict[int, bytes],
         last_sequence: int,
-    ) -> Iterator[Finding]:
+    ) -> Iterator[LogFinding]:
         """Check all rows; `before` is the last checkpoint that retention removed (0 and zeros if none)."""
         number, previous = before
         self.last_number = number
@@ -97,7 +97,7 @@ class CheckpointAudit:
                 "signed by the signer, but not in the log: its end was cut off, or an old copy was put back",
             )
         if self._key is None and self._signed_seen:
-            yield Finding(
+            yield LogFinding(
                 Kind.NO_KEY, 0, 0, "checkpoints are signed, but there is no key to hold them against"
             )
 
@@ -107,7 +107,7 @@ class CheckpointAudit:
         previous: str,
         chain: dict[int, bytes],
         last_sequence: int,
-    ) -> Iterator[Finding]:
+    ) -> Iterator[LogFinding]:
         number, _sequence, text, signature, public_key = row
         self.removed += _removed(text)
         wrong = self._disagreement(row, previous, chain, last_sequence)
@@ -134,7 +134,7 @@ class CheckpointAudit:
             self.signed += 1
             self.signed_through = row[1]
 
-    def _signatures_removed(self) -> Iterator[Finding]:
+    def _signatures_removed(self) -> Iterator[LogFinding]:
         numbers, self._on_their_way = self._on_their_way, []
         for number in numbers:
             message = "the signer signed it, its signature was removed"
@@ -146,7 +146,7 @@ class CheckpointAudit:
         previous: str,
         chain: dict[int, bytes],
         last_sequence: int,
-    ) -> Finding | None:
+    ) -> LogFinding | None:
         number, sequence, text = row[:3]
         try:
             checkpoint = parse_checkpoint(text)
@@ -173,13 +173,13 @@ def _removed(text: bytes) -> list[int]:
 
 def _held_against_chain(
     checkpoint: Checkpoint, chain: dict[int, bytes], last_sequence: int
-) -> Finding | None:
+) -> LogFinding | None:
     if checkpoint.sequence > last_sequence:
         message = (
             f"records {last_sequence + 1} to {checkpoint.sequence} were removed from the end"
             f" (checkpoint {checkpoint.number} seals them)"
         )
-        return Finding(Kind.TRUNCATED, last_sequence + 1, checkpoint.sequence, message)
+        return LogFinding(Kind.TRUNCATED, last_sequence + 1, checkpoint.sequence, message)
     if checkpoint.sequence and checkpoint.sequence not in chain:
         return None  # the record it seals is missing, which is reported for the record
     if checkpoint.sequence and chain[checkpoint.sequence].hex() != checkpoint.hash:
@@ -187,13 +187,13 @@ def _held_against_chain(
             f"the chain at record {checkpoint.sequence} has another hash than checkpoint {checkpoint.number}:"
             " records up to there were written anew, or the checkpoint was changed"
         )
-        return Finding(Kind.CHECKPOINT_CHANGED, checkpoint.number, checkpoint.number, message)
+        return LogFinding(Kind.CHECKPOINT_CHANGED, checkpoint.number, checkpoint.number, message)
     return None
 
 
-def _finding(kind: Kind, first: int, last: int, message: str) -> Finding:
+def _finding(kind: Kind, first: int, last: int, message: str) -> LogFinding:
     name = f"checkpoint {first}" if first == last else f"checkpoints {first} to {last}"
-    return Finding(kind, first, last, f"{name}: {message}")
+    return LogFinding(kind, first, last, f"{name}: {message}")
 
 
 def checkpoint_rows(

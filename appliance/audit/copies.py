@@ -19,7 +19,7 @@ import msgspec
 
 from appliance.audit.chain import Checkpoint, parse_checkpoint
 from appliance.audit.database import LogUnreadableError, reading
-from appliance.audit.findings import Elsewhere, Finding, Kind
+from appliance.audit.findings import Elsewhere, Kind, LogFinding
 from appliance.audit.signatures import signature_is_right
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
@@ -148,7 +148,7 @@ class CopiesAudit:
 
     def check(
         self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
-    ) -> Iterator[Finding]:
+    ) -> Iterator[LogFinding]:
         """Compare; `chain` has the hash at each of `sequences` that is there, `removed` is how far retention went.
 
         `last` is the sequence of the last record; `stored` the hashes of the log's own checkpoints by number.
@@ -158,7 +158,7 @@ class CopiesAudit:
             message = (
                 f"the checkpoints kept elsewhere are of log {names}; this one, {self._log}, took its place"
             )
-            yield Finding(Kind.LOG_REPLACED, 0, 0, message)
+            yield LogFinding(Kind.LOG_REPLACED, 0, 0, message)
         found = list(self._compare(chain, removed, last, stored))
         yield from found
         if self._copies and not self._agreeing and not found:
@@ -166,11 +166,11 @@ class CopiesAudit:
                 f"of {len(self._copies)} checkpoints kept elsewhere none is of what is left of the log, which begins"
                 f" after record {removed}: they prove nothing of it"
             )
-            yield Finding(Kind.PROVES_NOTHING, 0, removed, message)
+            yield LogFinding(Kind.PROVES_NOTHING, 0, removed, message)
 
     def _compare(
         self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
-    ) -> Iterator[Finding]:
+    ) -> Iterator[LogFinding]:
         proven = removed
         for copy in self._copies:
             wrong = self._wrong_signature(copy)
@@ -185,7 +185,7 @@ class CopiesAudit:
                     f"records {last + 1} to {copy.sequence} are gone from the end: checkpoint {copy.number},"
                     " kept elsewhere, has sealed them"
                 )
-                yield Finding(Kind.TRUNCATED, last + 1, copy.sequence, message)
+                yield LogFinding(Kind.TRUNCATED, last + 1, copy.sequence, message)
                 return
             here = chain.get(copy.sequence)
             if here is None:
@@ -197,20 +197,20 @@ class CopiesAudit:
             self._agreeing.append(copy)
             if stored.get(copy.number, copy.text().hex()) != copy.text().hex():
                 message = f"checkpoint {copy.number}: another one than was given to the other machine"
-                yield Finding(Kind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
+                yield LogFinding(Kind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
 
-    def _rewritten(self, copy: SignedCheckpoint, proven: int) -> Finding:
+    def _rewritten(self, copy: SignedCheckpoint, proven: int) -> LogFinding:
         message = (
             f"records {proven + 1} to {copy.sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
             " sealed: history was written anew, by somebody who could sign"
         )
-        return Finding(Kind.REWRITTEN, proven + 1, copy.sequence, message)
+        return LogFinding(Kind.REWRITTEN, proven + 1, copy.sequence, message)
 
-    def _wrong_signature(self, copy: SignedCheckpoint) -> Finding | None:
+    def _wrong_signature(self, copy: SignedCheckpoint) -> LogFinding | None:
         name, number = f"checkpoint {copy.number}, kept elsewhere", copy.number
         if self._key is not None and copy.key != self._key.hex():
             message = f"{name}: signed with {copy.key}, expected is {self._key.hex()}"
-            return Finding(Kind.WRONG_KEY, number, number, message)
+            return LogFinding(Kind.WRONG_KEY, number, number, message)
         if not signature_is_right(bytes.fromhex(copy.key), bytes.fromhex(copy.signature), copy.text()):
-            return Finding(Kind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it")
+            return LogFinding(Kind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it")
         return None

@@ -16,7 +16,7 @@ from appliance.audit.chain import follows, link
 from appliance.audit.columns import to_columns
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.evidence import Chain
-from appliance.audit.findings import Finding, Kind
+from appliance.audit.findings import Kind, LogFinding
 from appliance.audit.output import Entry, entry_of
 from appliance.audit.signatures import signature_is_right
 
@@ -46,7 +46,7 @@ class ExportVerification(msgspec.Struct, frozen=True, kw_only=True):
     left_out: int
     logs: list[str]
     key: str
-    findings: list[Finding]
+    findings: list[LogFinding]
 
 
 class _Line(NamedTuple):
@@ -83,7 +83,7 @@ class _Walk:
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._findings: list[Finding] = []
+        self._findings: list[LogFinding] = []
         self._logs: set[str] = set()
         self._waiting = 0  # records that lead to the next line, and to a checkpoint only with it
         self._records = self._proven = self._left_out = 0
@@ -112,7 +112,7 @@ class _Walk:
 
     def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
         if len(self._findings) < _MOST_FINDINGS:
-            self._findings.append(Finding(kind, first, last, message))
+            self._findings.append(LogFinding(kind, first, last, message))
 
     def _step(self, line: _Line) -> None:
         entry, chain = line.entry, line.chain

@@ -27,7 +27,7 @@ class Kind(enum.StrEnum):
     PROVES_NOTHING = "proves nothing"
 
 
-class Finding(msgspec.Struct, frozen=True):
+class LogFinding(msgspec.Struct, frozen=True):
     """One thing that is wrong; `first` and `last` are sequences of records, or numbers of checkpoints."""
 
     kind: Kind
@@ -71,6 +71,6 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     signed_through: int
     unsealed: int
     key: str | None
-    findings: list[Finding]
+    findings: list[LogFinding]
     elsewhere: Elsewhere | None = None
     removal: str = ""

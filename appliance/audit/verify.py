@@ -22,7 +22,7 @@ from appliance.audit.chain import NO_CHECKPOINT, Removal, StoredColumns, follows
 from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
 from appliance.audit.copies import CopiesAudit, SignedCheckpoint
 from appliance.audit.database import reading
-from appliance.audit.findings import Elsewhere, Finding, Kind, Verification
+from appliance.audit.findings import Elsewhere, Kind, LogFinding, Verification
 from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_right
 
 _WINDOW = 64
@@ -149,8 +149,8 @@ class _Verifier:
         self._remembered = remembered
         self._checkpoints = CheckpointAudit(self._log, key, remembered)
         self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
-        self._findings: list[Finding] = []
-        self._further: Finding | None = None
+        self._findings: list[LogFinding] = []
+        self._further: LogFinding | None = None
         self._untold = 0
         self._sealed: dict[int, bytes] = {}
         self._reported: set[int] = set()
@@ -226,12 +226,12 @@ class _Verifier:
     def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
         if len(self._findings) < _MOST_FINDINGS:
             name = f"record {first}" if first == last else f"records {first} to {last}"
-            self._findings.append(Finding(kind, first, last, f"{name}: {message}"))
+            self._findings.append(LogFinding(kind, first, last, f"{name}: {message}"))
         else:
             first = first if self._further is None else self._further.first
             self._untold += 1
             message = f"records {first} to {last}: {self._untold} further findings, not told one by one"
-            self._further = Finding(kind, first, last, message)
+            self._further = LogFinding(kind, first, last, message)
 
     # --- the database itself --------------------------------------------------------------------------------
 
@@ -253,7 +253,7 @@ class _Verifier:
 
     def _structure(self, message: str) -> None:
         message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were no text
-        self._findings.append(Finding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
+        self._findings.append(LogFinding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
 
     def _last_removal(self) -> _Removal | None:
         """What retention removed last; its record is part of the chain that is walked."""
@@ -370,7 +370,7 @@ class _Verifier:
         for number in sorted(self._reported):
             if number > audit.last_number:
                 message = f"checkpoint {number}: the chain has its record, but it was removed"
-                self._findings.append(Finding(Kind.CHECKPOINT_MISSING, number, number, message))
+                self._findings.append(LogFinding(Kind.CHECKPOINT_MISSING, number, number, message))
 
 
 def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
