@@ -24,11 +24,25 @@ def lab() -> Iterator[Lab]:
         yield lab
 
 
-@pytest.fixture
-def appliance(lab: Lab) -> Iterator[Appliance]:
-    """An appliance that lets everything pass, on a host of its own (10.77.0.2), firewall in force."""
-    with Appliance(lab.host("appliance", "10.77.0.2/24")) as running:
+@pytest.fixture(scope="module")
+def common_lab() -> Iterator[Lab]:
+    """An Ethernet that the tests of a file share."""
+    need_root()
+    with Lab("rosrv-test") as lab:
+        yield lab
+
+
+@pytest.fixture(scope="module")
+def appliance(common_lab: Lab) -> Iterator[Appliance]:
+    """An appliance that lets everything pass, on a host of the common lab (10.77.0.2), firewall in force."""
+    with Appliance(common_lab.host("appliance", "10.77.0.2/24")) as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def common_robot(common_lab: Lab) -> Host:
+    """The host of the common lab that the robot's nodes run on (10.77.0.10)."""
+    return common_lab.host("robot", "10.77.0.10/24")
 
 
 @pytest.fixture

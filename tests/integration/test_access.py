@@ -35,25 +35,26 @@ shutdown = first
 """
 
 
-@pytest.fixture
-def appliance(lab: Lab) -> Iterator[Appliance]:
+@pytest.fixture(scope="module")
+def appliance(common_lab: Lab) -> Iterator[Appliance]:
     """An appliance with the policy of this file."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
+    host = common_lab.host("appliance", "10.77.0.2/24")
+    with Appliance(host, policy=POLICY, options=("--api", "off")) as running:
         yield running
 
 
 @pytest.fixture
-def ros(appliance: Appliance, robot: Host, tmp_path: Path) -> Iterator[RosSession]:
+def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
     """The nodes of the first machine; `ros.on(second)` starts them on the second."""
-    with RosSession(appliance.master_uri, tmp_path, robot) as session:
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
         yield session
 
 
-@pytest.fixture
-def second(lab: Lab) -> Host:
+@pytest.fixture(scope="module")
+def second(common_lab: Lab) -> Host:
     """The machine with fewer rights."""
-    return lab.host("second", "10.77.0.66/24")
+    return common_lab.host("second", "10.77.0.66/24")
 
 
 def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
@@ -73,7 +74,7 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
     assert "[Publishers] /topic1" in answer[1]
     heard = listener.wait_for_count(5, event="received")
     assert {event["publisher"] for event in heard} == {"/rightful"}
-    (record,) = appliance.recorded("--deny", resource="/topic1")
+    (record,) = appliance.recorded("--deny", resource="/topic1", caller_id="/forged")
     assert (record["host"], record["caller_id"], record["category"]) == ("10.77.0.66", "/forged", "publish")
     assert (record["rule"]["section"], record["rule"]["key"]) == ("Publishers", "/topic1")
     assert record["rule"]["line"] == POLICY.splitlines().index("/topic1 = first") + 1

@@ -1,5 +1,6 @@
 """A process of the appliance is killed while a robot works: nodes that run go on, and new ones can join."""
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,37 +11,39 @@ from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.requirements import needs
 
+CLIENTS: list[Client] = ["rospy", "roscpp"]
 ROLES = ["control", "relay", "rosmaster", "signer", "rosout"]
 
 
 @pytest.fixture
-def ros(appliance: Appliance, robot: Host, tmp_path: Path) -> Iterator[RosSession]:
+def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
     """The robot's nodes behind the appliance."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with RosSession(appliance.master_uri, tmp_path, robot) as session:
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
         yield session
 
 
-@pytest.mark.parametrize("to", ["rospy", "roscpp"])
 @pytest.mark.parametrize("role", ROLES)
-def test_kill(appliance: Appliance, ros: RosSession, role: str, to: Client) -> None:
+def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
     """Messages come again, a service answers, parameters are there, and a node started afterwards is heard."""
-    listener = ros.listener(to, "/chatter")
+    listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     ros.talker("rospy", "/chatter", name="python_voice")
     ros.talker("roscpp", "/chatter", name="cpp_voice")
     ros.service_server("roscpp", "/negate")
-    client = ros.service_client(to, "/negate")
-    ros.run("rosparam", "set", "/kept", "42")
-    for name in ("/python_voice", "/cpp_voice"):
+    clients = [ros.service_client(client, "/negate") for client in CLIENTS]
+    ros.run("rosparam", "set", "/kept", role)
+    for listener, name in itertools.product(listeners, ("/python_voice", "/cpp_voice")):
         listener.wait_for(event="received", publisher=name)
 
     killed = appliance.kill(role)
     ros.talker("rospy", "/chatter", name="late_voice")
-    after = listener.mark()
-    for name in ("/python_voice", "/cpp_voice", "/late_voice"):
-        listener.wait_for(event="received", publisher=name, since=after)
-    client.send("true")
-    client.wait_for(event="answered")
-    assert ros.run("rosparam", "get", "/kept").stdout.strip() == "42"
+    for listener in listeners:
+        after = listener.mark()
+        for name in ("/python_voice", "/cpp_voice", "/late_voice"):
+            listener.wait_for(event="received", publisher=name, since=after)
+    for client in clients:
+        client.send("true")
+        client.wait_for(event="answered")
+    assert ros.run("rosparam", "get", "/kept").stdout.strip() == role
     assert killed not in appliance.pids(role)
     assert {"/python_voice", "/cpp_voice", "/late_voice"} <= set(ros.run("rosnode", "list").stdout.split())

@@ -25,7 +25,7 @@ BUILD = ROOT / "build" / "tests"
 
 
 class RosSession:
-    """The nodes and tools of one test; ends all of them, newest first."""
+    """The nodes and tools of one test; ends all of them, at once: a rospy node takes a second to end."""
 
     def __init__(self, master_uri: str, home: Path, host: Host | None = None) -> None:
         self.master_uri, self.home = master_uri, home
@@ -131,6 +131,8 @@ class RosSession:
 
     def __exit__(self, *exc: object) -> None:
         for process in reversed(self.processes):
+            process.interrupt()
+        for process in self.processes:
             process.stop()
         deaf = [process.story() for process in self.processes if process.deaf]
         assert not deaf, "did not end when interrupted:\n" + "\n".join(deaf)

@@ -57,6 +57,7 @@ class Process:
         self.errors: list[str] = []
         self._changed = threading.Condition()
         self._ended = False
+        self._asked = False  # to end
         self.deaf = False  # whether `stop` had to use force
         self.popen = host.popen(
             command,
@@ -172,15 +173,22 @@ class Process:
                 event["text"] if set(event) == {"text"} else json.dumps(event) for event in self.events
             )
 
-    def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
-        """End the process: by the signal, and when it does not listen, by SIGABRT (a Python program then says where it
-        stands) and SIGKILL to its own session.
-        """
+    def interrupt(self, with_signal: int = signal.SIGINT) -> None:
+        """Ask the process to end, and do not wait for it: `stop` does."""
         if self.popen.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self.popen.stdin.close()  # a program that waits for its next order ends by this
         if self.running:
             self.popen.send_signal(with_signal)
+        self._asked = True
+
+    def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
+        """End the process: by the signal, and when it does not listen, by SIGABRT (a Python program then says where it
+        stands) and SIGKILL to its own session.
+        """
+        if not self._asked:
+            self.interrupt(with_signal)
+        if self.running:
             try:
                 self.popen.wait(timeout)
             except subprocess.TimeoutExpired:

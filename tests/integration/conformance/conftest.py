@@ -1,6 +1,5 @@
 """Masters on this machine's loopback, shared by the tests of a module: quick, and no namespaces are needed."""
 
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -47,9 +46,6 @@ def ros(local: LocalSite, tmp_path: Path) -> Iterator[RosSession]:
     """The nodes and tools of one test."""
     with RosSession(local.master_uri, tmp_path) as session:
         yield session
-        for process in session.processes:  # a rospy node takes a second to end: all at once
-            if process.running:
-                process.popen.send_signal(signal.SIGINT)
 
 
 @pytest.fixture(scope="module")
