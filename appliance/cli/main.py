@@ -20,7 +20,7 @@ VERBS: dict[str, Verb | Group] = {
         "Try whether this machine can run the appliance, and whether the running one does what it must.",
     ),
     "demo": Verb(
-        "appliance.cli.demo.verb:demo",
+        "appliance.cli.demo:demo",
         "Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.",
     ),
     "protect": Verb(

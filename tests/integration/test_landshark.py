@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.cli.demo.landshark import MASTER_URI, Actor, Stage
 from appliance.network.lab import Lab
+from examples.landshark.stage import MASTER_URI, Actor, Stage
 from tests.support.nodes import ROOT, has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster

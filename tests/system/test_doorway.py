@@ -1,4 +1,4 @@
-"""`appliance.cli.demo.doorway`: a loopback port of this machine that comes out on a host of a lab."""
+"""`examples.landshark.doorway`: a loopback port of this machine that comes out on a host of a lab."""
 
 import socket
 import threading
@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.cli.demo.doorway import CONNECTIONS, Doorway
 from appliance.network.lab import Host, Lab
+from examples.landshark.doorway import CONNECTIONS, Doorway
 from tests.support.requirements import need_root
 
 LIMIT = 30.0

@@ -1,4 +1,4 @@
-"""`rosrv demo`: the product at work, in about a minute.
+"""What `rosrv demo` shows: the product at work, in about a minute.
 
 A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator,
 and an attacker. The operator drives and fires; the attacker tries what ROS 1 lets anybody do; for each
@@ -15,14 +15,19 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 
-from appliance.cli.demo.doorway import Doorway
-from appliance.cli.demo.landshark import (
+from appliance.cli.output import say_json
+from appliance.cli.shipped import SHIPPED
+from appliance.network.lab import Lab
+from appliance.network.namespaces import NetworkError, has_privileges
+from examples.landshark.doorway import Doorway
+from examples.landshark.mistakes import Mistakes, Ways
+from examples.landshark.results import Result
+from examples.landshark.stage import (
     ATTACKER,
     MASTER_URI,
     NODE_PYTHON,
@@ -33,12 +38,6 @@ from appliance.cli.demo.landshark import (
     DemoError,
     Stage,
 )
-from appliance.cli.demo.mistakes import Mistakes, Ways
-from appliance.cli.demo.results import Result
-from appliance.cli.output import say_json
-from appliance.cli.shipped import SHIPPED
-from appliance.network.lab import Lab
-from appliance.network.namespaces import NetworkError, has_privileges
 
 RIGHTFUL = "watch the battery"  # what the policy lets the attacker's host do
 AROUND = "go past the master"  # does not come to the appliance at all
@@ -246,32 +245,14 @@ def require_everything() -> None:
             "the demonstration makes four hosts as network namespaces, which needs root: "
             "run it as root or with sudo, in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
         )
-    if not (SHIPPED / "examples").is_dir():
-        raise DemoError(f"the simulated robot is not in {SHIPPED}: install rosrv anew")
     imports = f"import {', '.join(_NODE_PACKAGES)}"
     if subprocess.run([NODE_PYTHON, "-c", imports], capture_output=True, check=False).returncode:
         packages = " ".join(f"python3-{name.replace('_', '-')}" for name in _NODE_PACKAGES)
         raise DemoError(f"ROS 1 is missing for {NODE_PYTHON}: sudo apt-get install rosout {packages}")
 
 
-def demo(
-    hold: Annotated[
-        bool, typer.Option("--hold", help="Keep everything running at the end, until Ctrl-C")
-    ] = False,
-    picture: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.svg", help="Draw the robot's ways, without and with monitors, from above"),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
-    ] = False,
-) -> None:
-    """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
-
-    Exit status: 0 the robot obeyed its operator and nobody else, 1 it did not.
-
-    Example: rosrv demo --hold --picture drive.svg
-    """
+def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
+    """Run the demonstration and tell it; `picture` is where the robot's ways are drawn. Returns the exit status."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -308,11 +289,11 @@ def demo(
                 signal.pause()
     except KeyboardInterrupt:
         errors.print("\nEnded; everything is cleared away.")
-        raise typer.Exit(130) from None
+        return 130
     except (DemoError, NetworkError) as error:
         errors.print(f"[red]rosrv demo:[/] {escape(str(error))}", soft_wrap=True)
-        raise typer.Exit(1) from None
-    raise typer.Exit(0 if good else 1)
+        return 1
+    return 0 if good else 1
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> None:

@@ -8,8 +8,8 @@ for half a second after its last command (`examples/landshark/nodes/physics.py`)
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from appliance.cli.demo.landshark import Event, Stage
-from appliance.cli.demo.results import Result
+from examples.landshark.results import Result
+from examples.landshark.stage import Event, Stage
 
 OBSTACLE = ("8", "0.5")  # the middle of it
 OUTSIDE = ("24", "0.5")  # metres; the zone ends at 20

@@ -25,9 +25,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from appliance.cli.demo.doorway import Doorway
 from appliance.cli.shipped import IS_CHECKOUT
 from appliance.network.lab import Host, Lab
+from examples.landshark.doorway import Doorway
 
 NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
 APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"
@@ -123,7 +123,7 @@ class Actor:
 
     def _read(self) -> None:
         output = self.process.stdout
-        assert output is not None  # noqa: S101  popen was told to make it
+        assert output is not None
         for line in output:
             with contextlib.suppress(ValueError):
                 said = json.loads(line)

@@ -1,0 +1,36 @@
+"""`rosrv demo`: the product at work. What it shows is `examples/landshark`, which comes with the program."""
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.cli.shipped import SHIPPED
+
+
+def demo(
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Keep everything running at the end, until Ctrl-C")
+    ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.svg", help="Draw the robot's ways, without and with monitors, from above"),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
+    ] = False,
+) -> None:
+    """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
+
+    Exit status: 0 the robot obeyed its operator and nobody else, 1 it did not.
+
+    Example: rosrv demo --hold --picture drive.svg
+    """
+    if not (SHIPPED / "examples").is_dir():
+        typer.echo(f"rosrv demo: the simulated robot is not in {SHIPPED}: install rosrv anew", err=True)
+        raise typer.Exit(1)
+    sys.path.insert(0, str(SHIPPED))
+    demonstration = importlib.import_module("examples.landshark.demonstration")
+    raise typer.Exit(demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json))

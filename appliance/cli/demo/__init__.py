@@ -1,1 +1,0 @@
-"""`rosrv demo`: the product at work."""
