@@ -35,7 +35,7 @@ def common_lab() -> Iterator[Lab]:
 @pytest.fixture(scope="module")
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
     """An appliance that lets everything pass, on a host of the common lab (10.77.0.2), firewall in force."""
-    with Appliance(common_lab.host("appliance", "10.77.0.2/24")) as running:
+    with Appliance(common_lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as running:
         yield running
 
 

@@ -8,6 +8,7 @@ The programs are in `rospy_nodes/` and `roscpp_nodes/`; both kinds print the sam
 the master by ROS_MASTER_URI and of its own address by ROS_IP, nothing else.
 """
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -142,9 +143,12 @@ def roscpp_program(name: str) -> Path:
     """The compiled node; compiled on first use and again when its source changes."""
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
     target = BUILD / name
-    if target.exists() and header.stat().st_mtime > target.stat().st_mtime:
-        target.unlink()
-    subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)
+    BUILD.mkdir(parents=True, exist_ok=True)
+    with (BUILD / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; the second finds what the first has made
+        if target.exists() and header.stat().st_mtime > target.stat().st_mtime:
+            target.unlink()
+        subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)
     return target
 
 

@@ -16,9 +16,9 @@ STRICT = OPEN_POLICY.replace("*", "10.9.9.9")
 Rows = dict[str, dict[str, str]]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with REST over TLS."""
+    """An appliance with REST over TLS; the last test stops it."""
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         running.rest()
         yield running
