@@ -47,6 +47,7 @@ PRIVATE = {
     "unit/relay/test_engine.py": _LET_GO,
     "unit/relay/test_shares.py": _LET_GO,
     "unit/relay/world.py": _LET_GO,
+    "unit/rosmop/interpreted.py": "the meaning of the form is compared with the generated code, step by step",
     "unit/rosmop/runtime/test_wire.py": "what is patched is shorter than what is encoded anew, with the same bytes",
     "unit/rosmop/test_batch.py": _LET_GO,
     "unit/rosmop/test_hostile.py": "the namespace of the generated code, which is what an attacker would reach for",
