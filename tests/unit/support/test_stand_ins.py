@@ -15,6 +15,7 @@ PUBLISHED = {
     "_marshaled_dispatch": "of xmlrpc.server: what its own request handler calls",
 }
 _LET_GO = "that nothing is kept of who is gone shows nowhere else"
+_COMPARED = "what is compiled is compared with what it means, part by part"
 _TURN = "one turn of what goes round by itself"
 _BY_HAND = (
     "what calls it is a process; here its parts are called by hand, in an order that hardly ever happens"
@@ -47,7 +48,9 @@ PRIVATE = {
     "unit/relay/test_engine.py": _LET_GO,
     "unit/relay/test_shares.py": _LET_GO,
     "unit/relay/world.py": _LET_GO,
-    "unit/rosmop/interpreted.py": "the meaning of the form is compared with the generated code, step by step",
+    "unit/rosmop/interpreted.py": _COMPARED,
+    "unit/rosmop/test_interpreter.py": _COMPARED,
+    "unit/rosmop/test_module.py": _COMPARED,
     "unit/rosmop/runtime/test_wire.py": "what is patched is shorter than what is encoded anew, with the same bytes",
     "unit/rosmop/test_batch.py": _LET_GO,
     "unit/rosmop/test_hostile.py": "the namespace of the generated code, which is what an attacker would reach for",
