@@ -88,7 +88,7 @@ def _use(node: ast.Call, place: str) -> Iterator[Use]:
     named = {one.arg: one.value for one in node.keywords if one.arg is not None}
     if called == "Record" and "event" in named:
         event = named["event"]
-    elif called in ("happened", "_own", "_make") and node.args:
+    elif called in ("happened", "_own", "_make", "Record", "_record") and node.args:
         event = node.args[0]
     else:
         return
@@ -115,7 +115,7 @@ def _severities(node: ast.Call, called: str) -> frozenset[str]:
         if isinstance(one, ast.Attribute) and getattr(one.value, "id", "") == "Severity" and one.attr in known
     }
     plain = not any(one.arg == "severity" for one in node.keywords)
-    return frozenset(found or ({Severity.INFO.value} if called == "happened" and plain else set()))
+    return frozenset(found or ({Severity.INFO.value} if called in ("happened", "_record") and plain else set()))
 
 
 def markdown() -> str:

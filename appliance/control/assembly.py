@@ -1,14 +1,13 @@
 """Makes the parts of RVMaster and connects them.
 
-Parts need each other in circles (who delivers calls to nodes reports the dead ones to who looks after the living, and
-that one delivers calls). Each builder makes some parts from those before it; what a part calls of a later one goes
-through `Wires`, the one place where the circles are.
+Each is made from those before it. What changes the graph returns what follows from it, and `Enactor` carries that
+out, so that no part calls one that is made after it; but for the faces, which serve calls and are closed by some.
 """
 
 import asyncio
 import socket
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import structlog
@@ -32,20 +31,23 @@ from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.table import MASTER_CALLS, master_table
-from appliance.master.graph.delivery import Delivery, NodeCall
+from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import Entries
+from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness, LivenessSettings
+from appliance.master.graph.liveness import Liveness, LivenessSettings, Watchlist
 from appliance.master.graph.publisher import OwnPublisher
 from appliance.master.graph.reconcile import Reconciler
-from appliance.master.graph.registrar import Registrar
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.graph.registry import Life, Registry
 from appliance.master.graph.reminders import Reminders
-from appliance.master.graph.revocation import Revocation
-from appliance.master.later import Later
+from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.policies import Policies
 from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.arrivals import Arrivals
+from appliance.master.reach.carried import Carried
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.inner import InnerFace
 from appliance.master.reach.mediation import Mediation
@@ -56,10 +58,10 @@ from appliance.master.roscore import own_parameters
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.master.standing import HostStanding
 from appliance.policy import Policy
+from appliance.policy.model import Address
 from appliance.recorder import Recorder
 from appliance.ros.standard import standard_definitions
 from appliance.rpc.bulk import bulk_turns
-from appliance.rpc.server import Handler
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
 from appliance.specifications.monitors import Monitors
@@ -96,33 +98,6 @@ class Foundation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Reach:
-    """How nodes are known, found, told and carried; and what the policy lets them be told of parameters."""
-
-    registry: Registry
-    places: Places
-    addresses: Addresses
-    delivery: Delivery
-    relay: RelayControl
-    mediation: Mediation
-    graph: Graph
-    rights: ParameterRights
-
-
-@dataclass(frozen=True, slots=True)
-class _Books:
-    """What holds ROSMaster, the registry and the policy together."""
-
-    rosmaster: RosMaster
-    registrar: Registrar
-    faces: Faces
-    mirror: ParameterMirror
-    reconciler: Reconciler
-    revocation: Revocation
-    liveness: Liveness
-
-
-@dataclass(frozen=True, slots=True)
 class Parts:
     """The parts that control itself starts, asks, restores and ends; `table` is the Master API."""
 
@@ -133,8 +108,10 @@ class Parts:
     delivery: Delivery
     relay: RelayControl
     revocation: Revocation
+    grants: Grants
     mediation: Mediation
     graph: Graph
+    enactor: Enactor
     rosmaster: RosMaster
     faces: Faces
     parameters: ParameterMirror
@@ -148,128 +125,33 @@ class Parts:
     inner: InnerFace
 
 
-class _Wires:
-    """What earlier parts call of later ones."""
-
-    def __init__(self) -> None:
-        self.liveness: Later[Liveness] = Later("liveness")
-        self.faces: Later[Faces] = Later("faces")
-        self.reconciler: Later[Reconciler] = Later("the reconcile loop")
-        self.node_handler: Later[Callable[[Incarnation], Handler]] = Later("the handler of outer faces")
-        self.revocation: Later[Revocation] = Later("the revocation")
-        self.rosmaster: Later[RosMaster] = Later("the ROS Master")
-
-    def node_troubled(self, incarnation: Incarnation, call: NodeCall, why: str) -> None:
-        _log.info("a node could not be told", node=incarnation.name, call=call.method, why=why)
-        self.liveness().missed(incarnation, call)
-
-    def look_at(self, incarnation: Incarnation) -> None:
-        self.liveness().look_at(incarnation)
-
-    def close_faces(self, incarnation: Incarnation) -> None:
-        self.faces().close(incarnation)
-
-    async def revive(self, incarnation: Incarnation) -> None:
-        await self.liveness().revive(incarnation)
-
-    def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        return self.revocation().may_have(incarnation, kind, resource)
-
-    def rosmaster_lost(self) -> None:
-        self.rosmaster().shut()
-        self.reconciler().wake()
-
-    def serve(self, incarnation: Incarnation) -> Handler:
-        return self.node_handler()(incarnation)
-
-
 def assemble(base: Foundation) -> Parts:
-    """All parts, connected; nothing serves yet."""
-    wires = _Wires()
-    reach = _make_reach(base, wires)
-    return _finish(base, wires, reach, _make_books(base, wires, reach))
-
-
-def _make_books(base: Foundation, wires: _Wires, reach: _Reach) -> _Books:
-    settings, registry, graph = base.settings, reach.registry, reach.graph
-    faces = wires.faces.fill(_make_faces(base, wires, reach))
-    rosmaster = wires.rosmaster.fill(
-        RosMaster(
-            settings.rosmaster_port,
-            lost=wires.rosmaster_lost,
-            limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
-            small={call.name for call in MASTER_CALLS.values() if call.small},
-        )
+    """All parts, each made from those before it; nothing serves yet."""
+    settings, registry, recorder = base.settings, base.registry, base.recorder
+    policies, monitors, values = base.policies, base.monitors, value_limits(base.settings)
+    port, offload = base.port(RVMASTER), int(base.settings.limits.offload_bytes)
+    # What decides, and touches nothing.
+    carried = Carried(recorder, registry, settings.relays)
+    grants = Grants(carried.used)
+    mediation = Mediation(
+        lambda: policies.current,
+        lambda: monitors.checked,
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
     )
-    mirror = ParameterMirror(
-        base.store.load_parameters(),
-        base.parameters_dirty.set,
-        _make_charges(base),
-        depth_limit=settings.limits.nesting,
-        note=base.store.note_parameter,
-        since=base.store.parameter_changes(),
-    )
-    registrar = Registrar(rosmaster, faces)
-    reconciler = wires.reconciler.fill(
-        Reconciler(
-            rosmaster,
-            registry,
-            faces,
-            graph,
-            mirror,
-            base.recorder,
-            own_parameters=own_parameters,
-            may_have=wires.may_have,
-        )
-    )
-    revocation = wires.revocation.fill(
-        Revocation(
-            registry,
-            graph,
-            reach.relay,
-            registrar,
-            base.recorder,
-            policy=lambda: base.policies.current,
-            parameters=lambda: mirror.tree,
-            put_back=reconciler.put_back,
-        )
-    )
-    liveness = wires.liveness.fill(
-        Liveness(
-            registry,
-            graph,
-            LivenessSettings(
-                settings.liveness.interval,
-                settings.liveness.silent,
-                settings.liveness.shadow,
-                settings.limits.node_call_seconds,
-            ),
-            value_limits(settings),
-            withdraw=registrar.withdraw_lost,
-            put_back=reconciler.put_back,
-            returned=revocation.returned,
-            standing=base.standing,
-        )
-    )
-    return _Books(rosmaster, registrar, faces, mirror, reconciler, revocation, liveness)
-
-
-def _make_charges(base: Foundation) -> ParameterCharges:
-    whole = int(base.settings.limits.parameter_bytes)
-    bounds = PARAMETER_BYTES.bounds.sized(whole, whole // 2)
-    pool = Pool("bytes of parameters", bounds, base.standing)
-    return ParameterCharges(pool, base.store, base.store.parameter_owners())
-
-
-def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
-    settings = base.settings
-    registry = base.registry
+    rights = ParameterRights(lambda: policies.current, recorder)
+    graph = Graph(registry, grants, mediation, may_be_told=rights.may_be_told)
+    host_limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
+    gate = Gate(lambda: policies.current, registry, host_limits)
+    mirror = _make_mirror(base)
+    revocation = Revocation(registry, grants, graph, lambda: policies.current, lambda: mirror.tree)
+    # What nodes, relays and ROSMaster are reached by.
     places = Places(
         settings.listen_address[0],
-        base.policies.current.ports,
+        policies.current.ports,
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
-        named_as=lambda host: base.policies.current.named_as(host),  # noqa: PLW0108 - the one in force then
+        named_as=lambda host: policies.current.named_as(host),  # noqa: PLW0108 - the one in force then
         relays=settings.relays,
     )
     addresses = Addresses(
@@ -277,180 +159,208 @@ def _make_reach(base: Foundation, wires: _Wires) -> _Reach:
         base.lifeline.route_to if settings.isolation == "netns" else None,
         base.sockets[RVMASTER].getsockname()[0],
     )
+    watchlist = Watchlist()
     delivery = Delivery(
         timeout=settings.limits.node_call_seconds,
-        limits=value_limits(settings),
-        troubled=wires.node_troubled,
+        limits=values,
+        troubled=watchlist.could_not_tell,
         standing=base.standing,
     )
     relay = RelayControl(
         registry,
+        grants,
         places,
-        base.store,
         delivery,
-        base.recorder,
-        allocation=base.monitors.allocation,
-        policy=lambda: base.policies.current,
-        broken=wires.look_at,
+        carried,
+        allocation=monitors.allocation,
+        policy=lambda: policies.current,
+        broken=watchlist.look_at,
     )
-    mediation = Mediation(
-        lambda: base.policies.current,
-        lambda: base.monitors.checked,
-        relay_all=settings.relaying == "all",
-        stand_ins=settings.mediation == "full",
+    rosmaster = RosMaster(
+        settings.rosmaster_port,
+        limits=limits_of_answers(values, int(settings.limits.parameter_bytes)),
+        small={call.name for call in MASTER_CALLS.values() if call.small},
     )
-    rights = ParameterRights(lambda: base.policies.current, base.recorder)
-    graph = Graph(
+    faces = Faces(
         registry,
-        relay,
-        delivery,
-        base.recorder,
-        mediation,
-        closed=wires.close_faces,
-        may_be_told=rights.may_be_told,
-    )
-    return _Reach(registry, places, addresses, delivery, relay, mediation, graph, rights)
-
-
-def _make_faces(base: Foundation, wires: _Wires, reach: _Reach) -> Faces:
-    return Faces(
-        reach.registry,
-        reach.places,
+        places,
         inner_port=base.port(INNER),
-        serve=wires.serve,
-        address_for=reach.addresses.told_to,
+        serve=lambda incarnation: pipeline.handler(node_table, target=incarnation),
         limits=base.doors.http,
         visitors=base.doors.visitors,
         turns=base.doors.turns,
         refuse=base.doors.refuse,
         troubled=base.doors.troubled,
-        revive=wires.revive,
-        forget=reach.graph.forgotten,
     )
-
-
-def _make_execution(
-    base: Foundation, reach: _Reach, books: _Books, gate: Gate, parameters: ParameterCalls
-) -> Execution:
-    return Execution(
-        gate=gate,
-        policy=lambda: base.policies.current,
-        recorder=base.recorder,
-        registry=reach.registry,
-        liveness=books.liveness,
-        parameters=parameters,
-        redecide_for=books.revocation.redecide_for,
-        large=int(base.settings.limits.offload_bytes),
+    entries = Entries(rosmaster, faces.inner_uri)
+    enactor = Enactor(
+        graph,
+        entries,
+        store=base.store,
+        recorder=recorder,
+        delivery=delivery,
+        relay=relay,
+        faces=faces,
+    )
+    # What acts by itself.
+    liveness = Liveness(
+        registry,
+        graph,
+        revocation,
+        enactor,
+        watchlist,
+        settings=LivenessSettings(
+            settings.liveness.interval,
+            settings.liveness.silent,
+            settings.liveness.shadow,
+            settings.limits.node_call_seconds,
+        ),
+        limits=values,
         standing=base.standing,
     )
-
-
-def _finish(base: Foundation, wires: _Wires, reach: _Reach, books: _Books) -> Parts:
-    """The parts on top: the calls, and what they are carried out with."""
-    settings, registry, relay = base.settings, reach.registry, reach.relay
-    mirror, liveness, port = books.mirror, books.liveness, base.port(RVMASTER)
-    offload = int(settings.limits.offload_bytes)
-    gate = Gate(
-        lambda: base.policies.current,
+    reconciler = Reconciler(
+        rosmaster,
+        entries,
         registry,
-        HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host),
+        faces,
+        graph,
+        revocation,
+        enactor,
+        mirror,
+        recorder,
+        own_parameters=own_parameters,
     )
+    reminders = Reminders(registry, relay, graph, enactor)
+    # The calls, and what they are carried out with.
+    arrivals = Arrivals(registry, graph, enactor, liveness, places=places, faces=faces, addresses=addresses)
     registration = RegistrationCalls(
-        books.rosmaster, registry, reach.graph, books.faces, relay, reach.mediation, gate, reach.rights
+        rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
     )
     lookups = LookupCalls(
-        books.rosmaster,
+        rosmaster,
         registry,
-        books.faces,
+        graph,
+        enactor,
+        faces,
         relay,
-        reach.mediation,
-        reach.addresses,
+        mediation,
+        addresses,
         port,
         stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
         unseen=settings.publish_as if settings.hide_publisher else None,
     )
-    parameters = ParameterCalls(books.rosmaster, mirror, reach.graph, reach.rights, offload)
-    search = ParameterSearch(books.rosmaster, mirror, reach.rights)
-    monitor_calls = MonitorCalls(base.monitors, registry, relay, books.rosmaster.port, port)
-    node_calls = NodeCalls(registry, relay, reach.mediation, reach.addresses, liveness, gate, port)
-    execution = _make_execution(base, reach, books, gate, parameters)
+    parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
+    search = ParameterSearch(rosmaster, mirror, rights)
+    monitor_calls = MonitorCalls(monitors, registry, relay, rosmaster.port, port)
+    node_calls = NodeCalls(registry, graph, enactor, relay, mediation, addresses, liveness, gate, port)
+    node_table = served(NODE_CALLS.values(), node_calls)
+    execution = Execution(
+        gate=gate,
+        policy=lambda: policies.current,
+        recorder=recorder,
+        registry=registry,
+        enactor=enactor,
+        liveness=liveness,
+        parameters=parameters,
+        redecide_for=lambda host, name: enactor.carry_out(revocation.redecide_for(host, name)),
+        large=offload,
+        standing=base.standing,
+    )
     pipeline = Pipeline(
         execution,
-        Multicall(execution, parameters, base.recorder, offload=offload),
-        addresses=reach.addresses,
-        recorder=base.recorder,
-        limits=value_limits(settings),
+        Multicall(execution, parameters, recorder, offload=offload),
+        addresses=addresses,
+        recorder=recorder,
+        limits=values,
         offload=offload,
         bulk=bulk_turns(base.standing),
     )
-    node_table = served(NODE_CALLS.values(), node_calls)
-    wires.node_handler.fill(lambda incarnation: pipeline.handler(node_table, target=incarnation))
     publisher = OwnPublisher(
         registry,
-        reach.graph,
-        books.registrar,
+        graph,
+        enactor,
+        entries,
         name=settings.publish_as,
         inner_port=base.port(INNER),
         wanted=lambda: _published(base),
         register=registration.register_publisher,
     )
-    reminders = Reminders(registry, relay, reach.graph)
-    _connect(base, reach, books, reminders, publisher)
-    return Parts(
+    parts = Parts(
         registry=registry,
-        recorder=base.recorder,
-        monitors=base.monitors,
-        places=reach.places,
-        delivery=reach.delivery,
+        recorder=recorder,
+        monitors=monitors,
+        places=places,
+        delivery=delivery,
         relay=relay,
-        revocation=books.revocation,
-        mediation=reach.mediation,
-        graph=reach.graph,
-        rosmaster=books.rosmaster,
-        faces=books.faces,
+        revocation=revocation,
+        grants=grants,
+        mediation=mediation,
+        graph=graph,
+        enactor=enactor,
+        rosmaster=rosmaster,
+        faces=faces,
         parameters=mirror,
         liveness=liveness,
         reminders=reminders,
-        reconciler=books.reconciler,
+        reconciler=reconciler,
         publisher=publisher,
         monitor_calls=monitor_calls,
         table=master_table(registration, lookups, parameters, search, monitor_calls),
         pipeline=pipeline,
         inner=InnerFace(registry),
     )
+    _connect(base, parts, revocation)
+    return parts
 
 
-def _connect(
-    base: Foundation, reach: _Reach, books: _Books, reminders: Reminders, publisher: OwnPublisher
-) -> None:
+def _make_mirror(base: Foundation) -> ParameterMirror:
+    whole = int(base.settings.limits.parameter_bytes)
+    bounds = PARAMETER_BYTES.bounds.sized(whole, whole // 2)
+    pool = Pool("bytes of parameters", bounds, base.standing)
+    return ParameterMirror(
+        base.store.load_parameters(),
+        base.parameters_dirty.set,
+        ParameterCharges(pool, base.store, base.store.parameter_owners()),
+        depth_limit=base.settings.limits.nesting,
+        note=base.store.note_parameter,
+        since=base.store.parameter_changes(),
+    )
+
+
+def _connect(base: Foundation, parts: Parts, revocation: Revocation) -> None:
     """What policy, hosts and specifications call when they change."""
-    relay, revocation = reach.relay, books.revocation
-    base.monitors.connect(Moving(relay, reach.graph, reminders))
+    relay, graph, enactor = parts.relay, parts.graph, parts.enactor
+    base.monitors.connect(Moving(relay, graph, enactor, parts.reminders))
     relay.statement, relay.heard, relay.lost = (
         base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
     )  # fmt: skip
-    base.monitors.published = publisher.wake
+    base.monitors.published = parts.publisher.wake
     if base.settings.monitors_on_rosout:
         relay.own_header = rosout.header(standard_definitions())
         said = rosout.Rosout(
             base.settings.publish_as, relay.publish, lambda name: base.monitors.checked.monitors.get(name, "")
         )
         base.monitors.records.told = said.reported
-    base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, revocation.expel
-    base.hosts.ports.machines = lambda: Counter(
-        str(one.host) for one in reach.registry.all() if one.life is Life.LIVE and not one.own
-    )
+
+    def expel(host: Address, reason: str) -> int:
+        effects = revocation.expel(host, reason)
+        enactor.carry_out(effects)
+        return revoked(effects)
 
     in_force = base.policies.current
 
     def policy_changed(policy: Policy) -> int:
         nonlocal in_force
         before, in_force = in_force, policy
-        reach.places.policy_changed(policy.ports)
-        revoked = revocation.redecide()
-        relay.policy_changed(before, policy)
-        return revoked
+        parts.places.policy_changed(policy.ports)
+        effects = [*revocation.redecide(), *graph.limits_changed(before, policy)]
+        enactor.carry_out(effects)
+        return revoked(effects)
 
+    base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, expel
+    base.hosts.ports.machines = lambda: Counter(
+        str(one.host) for one in base.registry.all() if one.life is Life.LIVE and not one.own
+    )
     base.policies.changed = policy_changed
 
 

@@ -46,7 +46,7 @@ from appliance.hosts.hosts import Hosts
 from appliance.hosts.rest_place import rest_place
 from appliance.hosts.table import HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels
-from appliance.master.graph.journal import StoreJournal, restore
+from appliance.master.graph.journal import restore
 from appliance.master.graph.registry import Life, Registry
 from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.reach.places import NoPortError
@@ -154,7 +154,7 @@ class _Control:
             allocation=Allocation(self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)),
         )
         monitors.start(restarted=restarted)
-        registry = Registry(StoreJournal(store))
+        registry = Registry()
         self._standing = standing = HostStanding(lambda: policies.current, registry.registrations_of)
         return Foundation(
             settings=self._settings,
@@ -362,7 +362,8 @@ class _Control:
     def _relay_link(self, index: int, descriptor: int) -> None:
         relay = self._parts.relay
         relay.attach(index, Channel(socket.socket(fileno=descriptor), messages.RelayLink))
-        self._parts.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
+        told = self._parts.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
+        self._parts.enactor.carry_out(told)
         self._parts.reminders.begin()
 
     async def _save_parameters(self) -> None:
@@ -412,21 +413,21 @@ def _open_audit(
 
 async def _restore(base: Foundation, parts: Parts) -> None:
     """Bring back the nodes of before a restart, with their ports and grants, as far as the policy allows."""
-    registry, places = parts.registry, parts.places
+    registry, places, enactor = parts.registry, parts.places, parts.enactor
     for name, sock in base.sockets.items():
         if name.startswith("port:"):
             places.adopt(name, sock)
     restore(registry, base.store)
-    parts.relay.load()
+    enactor.carry_out(parts.grants.restore(base.store.permissions()))
     claimed: set[int] = set()
     for incarnation in registry.all():
         if incarnation.life is Life.REPLACED:
             continue
         try:
-            await parts.faces.reopen(incarnation)
+            enactor.carry_out(await parts.faces.reopen(incarnation))
         except NoPortError as error:
             _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
-            registry.forget(incarnation)
+            enactor.carry_out(registry.forget(incarnation))
             continue
         claimed |= set(incarnation.ports)
     places.close_unclaimed(claimed)

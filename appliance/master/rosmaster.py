@@ -32,7 +32,7 @@ def limits_of_answers(limits: Limits, parameters: int) -> Limits:
 
 
 class RosMaster:
-    """ROSMaster at `127.0.0.1:port`; `lost()` hears when it seems to be gone. Times are seconds.
+    """ROSMaster at `127.0.0.1:port`; `doubtful` is set when it seems to be gone. Times are seconds.
 
     Calls that are `small` travel together.
     """
@@ -41,21 +41,20 @@ class RosMaster:
         self,
         port: int,
         *,
-        lost: Callable[[], None],
         limits: Limits,
         small: Collection[str] = (),
         timeout: float = 10.0,
         hold: float = 15.0,
     ) -> None:
         self.port = port
-        self._lost = lost
+        self.doubtful = asyncio.Event()
         self._hold = hold
         self._client = XmlRpcClient(
             NodeUri("http", "127.0.0.1", port, "/"),
             timeout=timeout,
             pool=32,
             limits=limits,
-            disconnected=lost,
+            disconnected=self._lost,
         )
         self._calls = BatchingClient(self._client, small)
         self._open = asyncio.Event()
@@ -104,7 +103,6 @@ class RosMaster:
         try:
             return await make()
         except (RefusedError, BrokenOffError):
-            self._open.clear()
             self._lost()
             raise
         finally:
@@ -116,6 +114,10 @@ class RosMaster:
         if isinstance(answer, CallFailedError):
             raise answer
         return answer
+
+    def _lost(self) -> None:
+        self._open.clear()
+        self.doubtful.set()
 
     def shut(self) -> None:
         """Let calls wait from now on: ROSMaster is away."""

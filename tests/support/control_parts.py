@@ -10,13 +10,15 @@ from typing import Any, Self, cast
 
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.delivery import NodeCall
+from appliance.master.graph.effects import NodeCall
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import Entries
+from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness, LivenessSettings
+from appliance.master.graph.liveness import Liveness, LivenessSettings, Watchlist
 from appliance.master.graph.reconcile import Reconciler
-from appliance.master.graph.registrar import Registrar
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
-from appliance.master.graph.revocation import Revocation
+from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.rosmaster import RosMaster
 from appliance.policy import compile_policy
 from appliance.policy.model import Address, Decision
@@ -25,8 +27,6 @@ from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError, RefusedError
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.shares.pool import Standing
-from appliance.specifications.allocation import SERVICE
-from appliance.store.state import PermissionRow
 from tests.support.parameters import mirror
 from tests.support.serving import serving
 
@@ -90,32 +90,20 @@ class Deliveries:
         """As `Delivery`."""
 
 
-class Grants(Nothing):
-    """The relays: the grants, and who returned."""
+class Relays(Nothing):
+    """The relays: which nodes they were told of again."""
 
     def __init__(self) -> None:
-        self.rows: list[PermissionRow] = []
         self.returned: list[str] = []
+        self.carried = Nothing()
 
-    def node_returned(self, incarnation: Incarnation) -> None:
+    def place_node(self, incarnation: Incarnation) -> None:
         """As `RelayControl`."""
         self.returned.append(incarnation.name)
-
-    def permissions(self) -> list[PermissionRow]:
-        """As `RelayControl`."""
-        return list(self.rows)
-
-    def grant_service(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
-        """As `RelayControl`."""
-        self.rows.append(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
 
     def port(self, incarnation: Incarnation, _kind: Kind, _resource: str) -> int:
         """As `RelayControl`."""
         return incarnation.relay_port
-
-    def revoke(self, row: PermissionRow) -> None:
-        """As `RelayControl`."""
-        self.rows.remove(row)
 
 
 class HiddenMaster:
@@ -181,13 +169,18 @@ class HiddenMaster:
 
 
 class Inner:
-    """The faces: URIs only; an incarnation that is not known yet is made."""
+    """Faces and arrivals: URIs only; an incarnation that is not known yet is made."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
+        self.closed: list[str] = []
+
+    def close(self, incarnation: Incarnation) -> None:
+        """As `Faces`."""
+        self.closed.append(incarnation.key)
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """As `Faces`."""
+        """As `Arrivals`."""
         return self._registry.find(caller.caller_id, caller.peer.host, api.text)
 
     def nobody(self) -> str:
@@ -195,7 +188,7 @@ class Inner:
         return node_uri("127.0.0.1", _INNER_PORT, "/nobody/")
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """As `Faces`."""
+        """As `Arrivals`."""
         known = self.known(caller, api)
         if known is None:
             known = Incarnation(new_key(), caller.caller_id, HOST, api.uri, api.text, "10.0.0.1", 1, 2)
@@ -262,81 +255,82 @@ class ControlParts:
         """`silent` is seconds without an answer until a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
-        self.registry = Registry(Nothing())
-        self.records, self.deliveries, self.relay = Records(), Deliveries(), Grants()
-        self.hidden, self.faces, self.clients = HiddenMaster(), Inner(self.registry), Clients()
-        self.closed: list[str] = []
+        self.registry, self.grants = Registry(), Grants(set)
+        self.records, self.deliveries, self.relay = Records(), Deliveries(), Relays()
+        self.hidden, self.clients = HiddenMaster(), Clients()
+        self.faces = Inner(self.registry)
         self.mediation, self.addresses, self.parameters = (
             Modes(),
             Addresses(),
             mirror(),
         )
-        rights = ParameterRights(lambda: self.current, cast(Any, self.records))
+        recorder = cast(Any, self.records)
+        rights = ParameterRights(lambda: self.current, recorder)
         self.graph = Graph(
-            self.registry,
-            cast(Any, self.relay),
-            cast(Any, self.deliveries),
-            cast(Any, self.records),
-            cast(Any, self.mediation),
-            closed=lambda one: self.closed.append(one.key),
-            may_be_told=rights.may_be_told,
+            self.registry, self.grants, cast(Any, self.mediation), may_be_told=rights.may_be_told
         )
-        self.rosmaster = RosMaster(1, lost=lambda: None, limits=Limits(), hold=1.0)
+        self.revocation = Revocation(
+            self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
+        )
+        self.rosmaster = RosMaster(1, limits=Limits(), hold=1.0)
         self.rosmaster._calls = cast(Any, self.hidden)
+        self.entries = Entries(self.rosmaster, self.faces.inner_uri)
+        self.enactor = Enactor(
+            self.graph,
+            self.entries,
+            store=cast(Any, Nothing()),
+            recorder=recorder,
+            delivery=cast(Any, self.deliveries),
+            relay=cast(Any, self.relay),
+            faces=cast(Any, self.faces),
+        )
         self.reconciler = Reconciler(
             self.rosmaster,
+            self.entries,
             self.registry,
             cast(Any, self.faces),
             self.graph,
+            self.revocation,
+            self.enactor,
             self.parameters,
-            cast(Any, self.records),
+            recorder,
             own_parameters=dict,
-            may_have=self._may_have,
         )
-        self.registrar = Registrar(self.rosmaster, cast(Any, self.faces))
-        self.revocation = Revocation(
+        self.watchlist = Watchlist()
+        self.liveness = Liveness(
             self.registry,
             self.graph,
-            cast(Any, self.relay),
-            self.registrar,
-            cast(Any, self.records),
-            policy=lambda: self.current,
-            parameters=lambda: self.parameters.tree,
-            put_back=self.reconciler.put_back,
+            self.revocation,
+            self.enactor,
+            self.watchlist,
+            settings=LivenessSettings(silent=silent),
+            limits=Limits(),
+            standing=lambda _host: Standing.REGISTERED,
         )
-        self.liveness = self._make_liveness(silent)
+        cast(Any, self.liveness).client = self.clients.client
         self._serve = serving(
             policy=lambda: self.current,
             registry=self.registry,
             graph=self.graph,
+            enactor=self.enactor,
             rosmaster=self.rosmaster,
             mirror=self.parameters,
             recorder=self.records,
             rights=rights,
             faces=self.faces,
+            arrivals=self.faces,
             relay=self.relay,
             mediation=self.mediation,
             addresses=self.addresses,
             liveness=self.liveness,
-            redecide_for=self.revocation.redecide_for,
+            redecide_for=self.redecide_for,
         )
 
-    def _may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        return self.revocation.may_have(incarnation, kind, resource)
-
-    def _make_liveness(self, silent: float) -> Liveness:
-        liveness = Liveness(
-            self.registry,
-            self.graph,
-            LivenessSettings(silent=silent),
-            Limits(),
-            withdraw=self.registrar.withdraw_lost,
-            put_back=self.reconciler.put_back,
-            returned=self.revocation.returned,
-            standing=lambda _host: Standing.REGISTERED,
-        )
-        cast(Any, liveness).client = self.clients.client
-        return liveness
+    def redecide_for(self, host: Address, caller_id: str) -> int:
+        """What one caller has is decided again; how much was taken back."""
+        effects = self.revocation.redecide_for(host, caller_id)
+        self.enactor.carry_out(effects)
+        return revoked(effects)
 
     @classmethod
     async def begun(cls) -> Self:
@@ -364,13 +358,15 @@ class ControlParts:
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
         """ROSMaster takes a registration, and control writes it down."""
-        await self.reconciler._register(node, Registration(kind, resource, detail, 0))
-        self.graph.registered(node, kind, resource, detail)
+        await self.entries.make(node, Registration(kind, resource, detail, 0))
+        self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
 
     def reload(self, text: str) -> int:
         """This policy comes into force; how much was taken back."""
         self.current = compile_policy(text, file="policy")
-        return self.revocation.redecide()
+        effects = self.revocation.redecide()
+        self.enactor.carry_out(effects)
+        return revoked(effects)
 
     async def round(self) -> None:
         """One round of the reconcile loop."""
@@ -382,7 +378,9 @@ class ControlParts:
         await self.settle()
 
     async def settle(self) -> None:
-        """Wait until everything that was begun is done."""
+        """Look at the nodes on the watchlist, and wait until everything that was begun is done."""
+        self.liveness.look_at_watched()
         while others := asyncio.all_tasks() - self._not_ours:
             await asyncio.wait(others, timeout=5.0)
             assert all(task.done() for task in others), "it does not end"
+            self.liveness.look_at_watched()

@@ -27,12 +27,14 @@ def serving(
     policy: Callable[[], Policy],
     registry: Registry,
     graph: Any,
+    enactor: Any,
     rosmaster: Any,
     mirror: ParameterMirror,
     recorder: Any,
     rights: Any,
     addresses: Any,
     faces: Any = None,
+    arrivals: Any = None,
     relay: Any = None,
     mediation: Any = None,
     liveness: Any = None,
@@ -41,12 +43,13 @@ def serving(
 ) -> Handler:
     """The handler of RVMaster's listener, where every host has a node."""
     gate = Gate(policy, registry, HostLimits())
-    parameters = ParameterCalls(rosmaster, mirror, graph, rights, offload)
+    parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
     execution = Execution(
         gate=gate,
         policy=policy,
         recorder=recorder,
         registry=registry,
+        enactor=enactor,
         liveness=liveness,
         parameters=parameters,
         redecide_for=redecide_for,
@@ -65,10 +68,14 @@ def serving(
     monitors: Any = None
     return pipeline.handler(
         master_table(
-            RegistrationCalls(rosmaster, registry, graph, faces, relay, mediation, gate, rights),
+            RegistrationCalls(
+                rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
+            ),
             LookupCalls(
                 rosmaster,
                 registry,
+                graph,
+                enactor,
                 faces,
                 relay,
                 mediation,

@@ -27,6 +27,7 @@ from appliance.master.calls.gate import Contest, Gate, contested
 from appliance.master.calls.parameters import ParameterCalls, Write
 from appliance.master.calls.registration import given_up
 from appliance.master.calls.write_turns import WriteTurns
+from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.liveness import Liveness
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
@@ -66,9 +67,10 @@ class Execution:
         policy: Callable[[], Policy],
         recorder: Recorder,
         registry: Registry,
+        enactor: Enactor,
         liveness: Liveness,
         parameters: ParameterCalls,
-        redecide_for: Callable[[Address, str], int],
+        redecide_for: Callable[[Address, str], None],
         large: int,
         standing: Callable[[Address], Standing],
     ) -> None:
@@ -76,6 +78,7 @@ class Execution:
         self._policy = policy
         self._recorder = recorder
         self._registry = registry
+        self._enactor = enactor
         self._liveness = liveness
         self._parameters = parameters
         self._redecide_for = redecide_for
@@ -145,7 +148,7 @@ class Execution:
         policy, verb = self._policy(), attempt.call.verb
         denied = self._recorded(attempt, decision)
         if denied is not None and verb is Verb.UNREGISTER:
-            given_up(self._registry, attempt)
+            self._enactor.carry_out(given_up(self._registry, attempt))
         obstacle = await self._obstacle()
         if obstacle is not None:
             return [0, obstacle, attempt.call.denial]

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import cast
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.graph.registrar import key_of_stand_in
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import key_of_stand_in
+from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.addresses import Addresses
 from appliance.master.reach.faces import Faces
@@ -29,6 +31,8 @@ class LookupCalls:
 
     rosmaster: RosMaster
     registry: Registry
+    graph: Graph
+    enactor: Enactor
     faces: Faces
     relay: RelayControl
     mediation: Mediation
@@ -53,7 +57,8 @@ class LookupCalls:
         answer, incarnation = await self._provider(caller, service)
         if incarnation is not None:
             if self.mediation.carries_service(service):
-                self.relay.grant_service(incarnation, service, caller.peer.host, caller.caller_id)
+                granted = self.graph.service_granted(incarnation, service, caller.peer.host, caller.caller_id)
+                self.enactor.carry_out(granted)
                 port = self.relay.port(incarnation, Kind.SERVICE, service)
                 uri = service_uri(self.addresses.told_to(caller.peer), port)
             else:

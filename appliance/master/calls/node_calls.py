@@ -14,6 +14,8 @@ from appliance.master.caller import Answer, Caller
 from appliance.master.calls.arguments import MESSAGE, PROTOCOLS, TOPIC
 from appliance.master.calls.call import Call, Identity, Verb, method
 from appliance.master.calls.gate import Gate
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.graph import Graph
 from appliance.master.graph.liveness import Liveness
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.addresses import Addresses
@@ -31,6 +33,8 @@ class NodeCalls:
     """Answers for the node that `caller.target` is. `port` is RVMaster's."""
 
     registry: Registry
+    graph: Graph
+    enactor: Enactor
     relay: RelayControl
     mediation: Mediation
     addresses: Addresses
@@ -50,7 +54,8 @@ class NodeCalls:
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # who has no way but the relay
         if not own and not self.mediation.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
-        self.relay.grant_topic(target, topic, caller.peer.host, caller.caller_id)
+        granted = self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
+        self.enactor.carry_out(granted)
         address = self.addresses.told_to(caller.peer)
         port = self.relay.port(target, Kind.PUBLICATION, topic)
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]

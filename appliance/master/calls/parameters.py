@@ -12,6 +12,7 @@ from appliance.master.batch import Wanted
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
@@ -42,6 +43,7 @@ class ParameterCalls:
     rosmaster: RosMaster
     mirror: ParameterMirror
     graph: Graph
+    enactor: Enactor
     rights: ParameterRights
     large: int
 
@@ -140,10 +142,12 @@ class ParameterCalls:
                 continue
             if reserved is not None and _is_set(outcome, write):
                 self.mirror.set(write.key, write.value, reserved)
-                self.graph.parameter_set(write.key, write.value, write.caller.caller_id)
+                self.enactor.carry_out(
+                    self.graph.parameter_set(write.key, write.value, write.caller.caller_id)
+                )
             elif reserved is None and outcome[0] == 1:
                 self.mirror.delete(write.key)
-                self.graph.parameter_deleted(write.key)
+                self.enactor.carry_out(self.graph.parameter_deleted(write.key))
         return outcomes
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:

@@ -12,9 +12,11 @@ from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.gate import Gate
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import NO_SERVICE, stand_in
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.registrar import NO_SERVICE, stand_in
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
+from appliance.master.reach.arrivals import Arrivals
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.mediation import Mediation
 from appliance.master.reach.relays import RelayControl
@@ -28,7 +30,9 @@ class RegistrationCalls:
     rosmaster: RosMaster
     registry: Registry
     graph: Graph
+    enactor: Enactor
     faces: Faces
+    arrivals: Arrivals
     relay: RelayControl
     mediation: Mediation
     gate: Gate
@@ -44,7 +48,7 @@ class RegistrationCalls:
                 "registerPublisher", caller.caller_id, topic, topic_type, inner
             )
             if answer[0] == 1:
-                self.graph.registered(node, Kind.PUBLICATION, topic, topic_type)
+                self.enactor.carry_out(self.graph.registered(node, Kind.PUBLICATION, topic, topic_type))
                 hidden = self.mediation.hides_publishers(topic)
                 answer[2] = list(self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden))
             return answer
@@ -59,7 +63,7 @@ class RegistrationCalls:
                 "registerSubscriber", caller.caller_id, topic, topic_type, inner
             )
             if answer[0] == 1:
-                self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type)
+                self.enactor.carry_out(self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type))
                 answer[2] = list(self.graph.list_for(node, topic))
             return answer
 
@@ -73,7 +77,9 @@ class RegistrationCalls:
                 "registerService", caller.caller_id, service, stand_in(node), inner
             )
             if answer[0] == 1:
-                self.graph.registered(node, Kind.SERVICE, service, str(service_api.uri.port))
+                self.enactor.carry_out(
+                    self.graph.registered(node, Kind.SERVICE, service, str(service_api.uri.port))
+                )
             return answer
 
     async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
@@ -86,7 +92,7 @@ class RegistrationCalls:
                 await self.rosmaster.call("unsubscribeParam", *told)
                 return [0, hidden, 0]
             if answer[0] == 1:
-                self.graph.registered(node, Kind.PARAMETER, key, "")
+                self.enactor.carry_out(self.graph.registered(node, Kind.PARAMETER, key, ""))
             return answer
 
     async def unregister_publisher(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
@@ -117,26 +123,26 @@ class RegistrationCalls:
         answer = await self.rosmaster.call("unregisterService", caller.caller_id, service, uri)
         _speak_as_asked(answer, uri, service_api)
         if answer[0] == 1 and provider is not None:
-            self.graph.unregistered(provider, Kind.SERVICE, service)
+            self.enactor.carry_out(self.graph.unregistered(provider, Kind.SERVICE, service))
         return answer
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`unsubscribeParam(caller_id, caller_api, key)`."""
-        node = self.faces.known(caller, caller_api)
+        node = self.arrivals.known(caller, caller_api)
         inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
         answer = await self.rosmaster.call("unsubscribeParam", caller.caller_id, inner, key)
         if answer[0] == 1 and node is not None:
-            self.graph.unregistered(node, Kind.PARAMETER, key)
+            self.enactor.carry_out(self.graph.unregistered(node, Kind.PARAMETER, key))
         return answer
 
     async def _unregister(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
-        node = self.faces.known(caller, caller_api) or self._told_as(caller, caller_api)
+        node = self.arrivals.known(caller, caller_api) or self._told_as(caller, caller_api)
         inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
         method = "unregisterPublisher" if kind is Kind.PUBLICATION else "unregisterSubscriber"
         answer = await self.rosmaster.call(method, caller.caller_id, topic, inner)
         _speak_as_asked(answer, inner, caller_api)
         if answer[0] == 1 and node is not None:
-            self.graph.unregistered(node, kind, topic)
+            self.enactor.carry_out(self.graph.unregistered(node, kind, topic))
         return answer
 
     def _told_as(self, caller: Caller, api: ApiUri) -> Incarnation | None:
@@ -153,10 +159,10 @@ class RegistrationCalls:
         """
         spare = self.gate.to_make_room(caller, api)
         if spare is not None:
-            self.graph.forgotten(spare)
-        incarnation = await self.faces.incarnation_for(caller, api)
+            self.enactor.carry_out(self.graph.forgotten(spare))
+        incarnation = await self.arrivals.incarnation_for(caller, api)
         while self.registry.by_key(incarnation.key) is not incarnation:  # it made room before this went on
-            incarnation = await self.faces.incarnation_for(caller, api)
+            incarnation = await self.arrivals.incarnation_for(caller, api)
         incarnation.calls += 1
         try:
             yield incarnation
@@ -164,17 +170,19 @@ class RegistrationCalls:
             incarnation.calls -= 1
 
 
-def given_up(registry: Registry, denied: Attempt) -> None:
+def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
     """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
     kind, caller = denied.call.kind, denied.caller
     asked = next(one for one in denied.arguments if isinstance(one, ApiUri))
+    kept: list[Durable] = []
     for one in registry.all():
         shelved = None if kind is None else one.shelf.get((kind, denied.resource))
         if shelved is None or (one.name, one.host) != (caller.caller_id, caller.peer.host):
             continue
         by_port = shelved.kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
         if by_port or one.api_text == asked.text:
-            registry.unshelve(one, shelved.kind, shelved.resource)
+            kept += registry.unshelve(one, shelved.kind, shelved.resource)
+    return kept
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 
 import structlog
 
+from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import FaultReceived, Limits, Value
+from appliance.ros.xmlrpc import FaultReceived, Limits
 from appliance.rpc.client import CallFailedError, XmlRpcClient
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Bounds, Pool, Standing
@@ -23,28 +24,6 @@ from appliance.shares.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
 
 _log = structlog.get_logger()
 MASTER_NAME = "/master"
-_CALL_BYTES = 200  # a call with nothing in it, and a text with nothing in it, as Python keeps them
-_TEXT_BYTES = 60
-
-
-@dataclass(frozen=True, slots=True)
-class NodeCall:
-    """One call to a node: method and parameters after the caller's name.
-
-    `size` is about how many bytes it takes, where that is known; a list of publishers is measured here.
-    """
-
-    method: str
-    parameters: tuple[Value, ...]
-    size: int = 0
-
-    @property
-    def weight(self) -> int:
-        """About how many bytes it takes while it waits."""
-        if self.size:
-            return self.size
-        texts = [one for given in self.parameters for one in (given if isinstance(given, list) else [given])]
-        return _CALL_BYTES + sum(_TEXT_BYTES + len(one) for one in texts if isinstance(one, str))
 
 
 @dataclass(slots=True)

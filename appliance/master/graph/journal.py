@@ -2,55 +2,46 @@
 
 import ipaddress
 
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.graph.registry import (
+    Durable,
+    EraseNode,
+    EraseRegistration,
+    Incarnation,
+    Kind,
+    Life,
+    Registration,
+    Registry,
+    SaveNode,
+    SaveRegistration,
+)
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
 
 _SHELVED = "revoked "  # before the kind of a registration that the policy took back
 
 
-class StoreJournal:
-    """The registry's `Journal` on the state store."""
-
-    def __init__(self, store: StateStore) -> None:
-        self._store = store
-
-    def incarnation_saved(self, incarnation: Incarnation) -> None:
-        """A new incarnation, or a changed `life`."""
-        self._store.save_incarnation(
-            IncarnationRow(
-                incarnation.key, incarnation.name, str(incarnation.host), incarnation.api_text, incarnation.told,
-                incarnation.outer_port, incarnation.relay_port, incarnation.own, incarnation.life.value,
-                incarnation.changed, incarnation.more_relay_ports,
+def write(effect: Durable, store: StateStore) -> None:
+    """Keep one change of the registry."""
+    match effect:
+        case SaveNode(node):
+            store.save_incarnation(
+                IncarnationRow(
+                    node.key, node.name, str(node.host), node.api_text, node.told, node.outer_port, node.relay_port,
+                    node.own, node.life.value, node.changed, node.more_relay_ports,
+                )
+            )  # fmt: skip
+        case EraseNode(key):
+            store.forget_incarnation(key)
+        case SaveRegistration(key, one, shelved):
+            store.save_registration(
+                RegistrationRow(key, _kept_kind(one.kind, shelved), one.resource, one.detail, one.order)
             )
-        )  # fmt: skip
+        case EraseRegistration(key, kind, resource, shelved):
+            store.remove_registration(key, _kept_kind(kind, shelved), resource)
 
-    def incarnation_forgotten(self, key: str) -> None:
-        """The incarnation and all its registrations are gone."""
-        self._store.forget_incarnation(key)
 
-    def registration_saved(self, key: str, registration: Registration) -> None:
-        """A registration was made."""
-        self._store.save_registration(
-            RegistrationRow(
-                key, registration.kind.value, registration.resource, registration.detail, registration.order
-            )
-        )
-
-    def registration_removed(self, key: str, kind: Kind, resource: str) -> None:
-        """A registration is gone."""
-        self._store.remove_registration(key, kind.value, resource)
-
-    def registration_shelved(self, key: str, registration: Registration) -> None:
-        """A registration was taken back by the policy and is remembered."""
-        kind = f"{_SHELVED}{registration.kind.value}"
-        self._store.save_registration(
-            RegistrationRow(key, kind, registration.resource, registration.detail, registration.order)
-        )
-
-    def registration_unshelved(self, key: str, kind: Kind, resource: str) -> None:
-        """A registration that was taken back is remembered no longer."""
-        self._store.remove_registration(key, f"{_SHELVED}{kind.value}", resource)
+def _kept_kind(kind: Kind, shelved: bool) -> str:
+    return f"{_SHELVED}{kind.value}" if shelved else kind.value
 
 
 def restore(registry: Registry, store: StateStore) -> int:

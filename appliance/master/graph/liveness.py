@@ -7,14 +7,16 @@ answers again gets them back, because a ROS 1 node never registers twice.
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import structlog
 
-from appliance.master.graph.delivery import NodeCall
+from appliance.master.graph.effects import NodeCall
+from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.graph.revocation import Revocation
 from appliance.master.presence import Presence, Probe
 from appliance.master.reach.relays import RELAY_NAME
 from appliance.policy.model import Address
@@ -48,7 +50,7 @@ class LivenessSettings:
 
 
 @dataclass(slots=True)
-class _Missed:
+class Missed:
     """What a node could not be told: topics, and whether it were parameters; when it was told again, monotonic."""
 
     topics: set[str] = field(default_factory=set)
@@ -56,34 +58,74 @@ class _Missed:
     made_up: float | None = None
 
 
-class Liveness:
-    """Looks at nodes. `withdraw(incarnation, registrations)` and `put_back(…)` tell ROSMaster.
+class Watchlist:
+    """Nodes that are to be looked at, for something of them broke: filled by who calls them, read by `Liveness`."""
 
-    `returned(incarnation)` hears of a node that was away, once what it had counts again. Hosts take turns: nodes of one
-    that answer nothing delay no look at another's.
-    """
+    def __init__(self) -> None:
+        self._nodes: dict[str, Incarnation] = {}
+        self._missed: dict[str, Missed] = {}
+        self._filled = asyncio.Event()
+
+    def look_at(self, node: Incarnation) -> None:
+        """Something of a node broke."""
+        self._nodes[node.key] = node
+        self._filled.set()
+
+    def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
+        """A node could not be told this: it is looked at, and told how things are once it answers."""
+        _log.info("a node could not be told", node=node.name, call=call.method, why=why)
+        missed = self._missed.setdefault(node.key, Missed())
+        if call.method == "publisherUpdate":
+            missed.topics.add(str(call.parameters[0]))
+        missed.parameters |= call.method == "paramUpdate"
+        self.look_at(node)
+
+    async def filled(self) -> None:
+        """Wait until there is a node to look at."""
+        await self._filled.wait()
+
+    def take(self) -> list[Incarnation]:
+        """The nodes to look at, once."""
+        self._filled.clear()
+        nodes, self._nodes = self._nodes, {}
+        return list(nodes.values())
+
+    def to_make_up(self, node: Incarnation, interval: float) -> Missed | None:
+        """What a node has missed; None within `interval` seconds after the last time: who answers may take nothing."""
+        missed, now = self._missed.get(node.key), time.monotonic()
+        if missed is None or (missed.made_up is not None and now - missed.made_up < interval):
+            return None
+        self._missed[node.key] = Missed(made_up=now)
+        return missed
+
+    def keep_only(self, keys: Collection[str]) -> None:
+        """What other nodes have missed does not matter any more."""
+        self._missed = {key: missed for key, missed in self._missed.items() if key in keys}
+
+
+class Liveness:
+    """Looks at nodes. Hosts take turns: nodes of one that answer nothing delay no look at another's."""
 
     def __init__(
         self,
         registry: Registry,
         graph: Graph,
+        revocation: Revocation,
+        enactor: Enactor,
+        watchlist: Watchlist,
+        *,
         settings: LivenessSettings,
         limits: Limits,
-        *,
-        withdraw: Callable[[Incarnation, list[Registration]], Awaitable[None]],
-        put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
-        returned: Callable[[Incarnation], None],
         standing: Callable[[Address], Standing],
     ) -> None:
         self._registry = registry
         self._graph = graph
+        self._revocation = revocation
+        self._enactor = enactor
+        self._watchlist = watchlist
         self._settings = settings
         self._limits = limits
-        self._withdraw = withdraw
-        self._put_back = put_back
-        self._returned = returned
         self._answered: dict[str, float] = {}
-        self._missed: dict[str, _Missed] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, standing)
 
@@ -92,14 +134,29 @@ class Liveness:
         return XmlRpcClient(incarnation.call_uri, timeout=self._settings.call, limits=self._limits)
 
     async def run(self) -> None:
-        """Look at every incarnation every `interval` seconds, until cancelled."""
+        """Look at every incarnation every `interval` seconds, and at those on the watchlist, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._look_at_all())
+            tasks.create_task(self._watch())
+
+    async def _look_at_all(self) -> None:
         while True:
             await asyncio.sleep(self._settings.interval)
             known = self._registry.all()
             self._answered = {one.key: self._answered[one.key] for one in known if one.key in self._answered}
-            self._missed = {one.key: self._missed[one.key] for one in known if one.key in self._missed}
+            self._watchlist.keep_only({one.key for one in known})
             for incarnation in known:
                 self.look_at(incarnation)
+
+    async def _watch(self) -> None:
+        while True:
+            await self._watchlist.filled()
+            self.look_at_watched()
+
+    def look_at_watched(self) -> None:
+        """Look at the nodes on the watchlist now."""
+        for incarnation in self._watchlist.take():
+            self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
         """Look at a node now (unless it is being looked at).
@@ -111,14 +168,6 @@ class Liveness:
             task = asyncio.get_running_loop().create_task(self._look(incarnation))
             self._looks[incarnation.key] = task
             task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
-
-    def missed(self, incarnation: Incarnation, call: NodeCall) -> None:
-        """The node could not be told this: it is looked at, and told how things are once it answers."""
-        missed = self._missed.setdefault(incarnation.key, _Missed())
-        if call.method == "publisherUpdate":
-            missed.topics.add(str(call.parameters[0]))
-        missed.parameters |= call.method == "paramUpdate"
-        self.look_at(incarnation)
 
     async def probe(self, incarnation: Incarnation) -> Probe:
         """Whether the node is there, asked now."""
@@ -140,12 +189,13 @@ class Liveness:
     async def revive(self, incarnation: Incarnation) -> None:
         """A shadow registers: it is there again, and so is all it had."""
         self._answered[incarnation.key] = time.monotonic()
-        await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
+        await self._bring_back(incarnation)
 
-    def _bring_back(self, incarnation: Incarnation) -> list[Registration]:
-        registrations = self._graph.returned(incarnation)
-        self._returned(incarnation)
-        return registrations
+    async def _bring_back(self, incarnation: Incarnation) -> None:
+        self._enactor.carry_out(self._graph.returned(incarnation))
+        registrations = incarnation.in_order()
+        self._enactor.carry_out(self._revocation.returned(incarnation))
+        await self._enactor.put_back(incarnation, registrations)
 
     async def _look(self, incarnation: Incarnation) -> None:
         await self._turns.enter(incarnation.host)
@@ -169,17 +219,15 @@ class Liveness:
             await self._make_up(incarnation)
 
     async def _make_up(self, incarnation: Incarnation) -> None:
-        """Tell a node what it has missed: once in a while, for one that answers may still take no update."""
-        missed, now = self._missed.get(incarnation.key), time.monotonic()
-        if missed is None or (missed.made_up is not None and now - missed.made_up < self._settings.interval):
+        """Tell a node what it has missed."""
+        missed = self._watchlist.to_make_up(incarnation, self._settings.interval)
+        if missed is None:
             return
-        topics, parameters = missed.topics, missed.parameters
-        self._missed[incarnation.key] = _Missed(made_up=now)
-        for topic in sorted(topics):
-            self._graph.remind(incarnation, topic)
+        for topic in sorted(missed.topics):
+            self._enactor.carry_out(self._graph.remind(incarnation, topic))
         subscribed = [one for one in incarnation.registrations.values() if one.kind is Kind.PARAMETER]
-        if parameters and subscribed:
-            await self._tell(self._put_back, incarnation, subscribed)
+        if missed.parameters and subscribed:
+            await self._enactor.put_back(incarnation, subscribed)
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Whether it answers: True, False, or None when it refuses connections; and why."""
@@ -202,8 +250,8 @@ class Liveness:
                 self._forget(incarnation)
             return
         registrations = list(incarnation.registrations.values())
-        self._graph.lost(incarnation, why)
-        await self._tell(self._withdraw, incarnation, registrations)
+        self._enactor.carry_out(self._graph.lost(incarnation, why))
+        await self._enactor.take_out(incarnation, registrations)
 
     async def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
         age = time.time() - incarnation.changed
@@ -213,18 +261,7 @@ class Liveness:
         elif age > self._settings.shadow:
             self._forget(incarnation)
         elif answered and self._registry.occupant(incarnation.name) is None:
-            await self._tell(self._put_back, incarnation, self._bring_back(incarnation))
-
-    async def _tell(
-        self,
-        tell: Callable[[Incarnation, list[Registration]], Awaitable[None]],
-        incarnation: Incarnation,
-        registrations: list[Registration],
-    ) -> None:
-        try:
-            await tell(incarnation, registrations)
-        except CallFailedError as error:
-            _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
+            await self._bring_back(incarnation)
 
     def _forget(self, incarnation: Incarnation) -> None:
-        self._graph.forgotten(incarnation)
+        self._enactor.carry_out(self._graph.forgotten(incarnation))

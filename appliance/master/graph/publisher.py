@@ -12,8 +12,9 @@ from collections.abc import Awaitable, Callable
 import structlog
 
 from appliance.master.caller import Answer, ApiUri, Caller
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import Entries
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.registrar import Registrar
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.reach.places import NoPortError
 from appliance.ros.uris import node_uri, parse_node_uri
@@ -35,7 +36,8 @@ class OwnPublisher:
         self,
         registry: Registry,
         graph: Graph,
-        registrar: Registrar,
+        enactor: Enactor,
+        entries: Entries,
         *,
         name: str,
         inner_port: int,
@@ -44,7 +46,8 @@ class OwnPublisher:
     ) -> None:
         self._registry = registry
         self._graph = graph
-        self._registrar = registrar
+        self._enactor = enactor
+        self._entries = entries
         self._register = register
         self._name = name
         self._uri = node_uri(_LOOPBACK, inner_port, PUBLISHER_PATH)
@@ -74,8 +77,9 @@ class OwnPublisher:
         for incarnation in self._mine():
             for topic in incarnation.resources(Kind.PUBLICATION):
                 if incarnation.api_text != self._uri or topic not in wanted:
-                    await self._registrar.withdraw(incarnation, Kind.PUBLICATION, topic)
-                    self._graph.unregistered(incarnation, Kind.PUBLICATION, topic)
+                    await self._entries.end(incarnation, Kind.PUBLICATION, topic)
+                    gone = self._graph.unregistered(incarnation, Kind.PUBLICATION, topic)
+                    self._enactor.carry_out(gone)
         for topic, type_name in wanted.items():
             peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
             caller = Caller(peer, self._name, time.monotonic_ns(), own=True)

@@ -17,11 +17,12 @@ from typing import cast
 
 import structlog
 
-from appliance.master.caller import Answer
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.entries import NAME, NO_SERVICE, Entries, stand_in
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.parameter_updates import settled
-from appliance.master.graph.registrar import NO_SERVICE, stand_in
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.graph.registry import Kind, Life, Registry
+from appliance.master.graph.revocation import Revocation
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.faces import Faces
 from appliance.master.rosmaster import RosMaster
@@ -31,50 +32,48 @@ from appliance.rpc.client import CallFailedError
 
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1
-_NAME = "/master"
 Seen = set[tuple[Kind, str, str]]
 
 
 class Reconciler:
-    """Runs rounds when woken and every `interval` seconds. `ready` is set after the first whole round.
-
-    `may_have(node, kind, resource)` says whether the policy in force grants it.
-    """
+    """Runs rounds when ROSMaster is in doubt and every `interval` seconds. `ready` is set after the first whole one."""
 
     def __init__(  # noqa: PLR0917 - the parts it compares
         self,
         rosmaster: RosMaster,
+        entries: Entries,
         registry: Registry,
         faces: Faces,
         graph: Graph,
+        revocation: Revocation,
+        enactor: Enactor,
         parameters: ParameterMirror,
         recorder: Recorder,
         *,
         own_parameters: Callable[[], Tree],
-        may_have: Callable[[Incarnation, Kind, str], bool],
         interval: float = 30.0,
     ) -> None:
         self._rosmaster = rosmaster
+        self._entries = entries
         self._registry = registry
         self._faces = faces
         self._graph = graph
+        self._revocation = revocation
+        self._enactor = enactor
         self._parameters = parameters
         self._recorder = recorder
         self._own_parameters = own_parameters
-        self._may_have = may_have
         self._interval = interval
-        self._pid: int | None = None
-        self._woken = asyncio.Event()
         self.ready = asyncio.Event()
 
     def wake(self) -> None:
         """Something happened: run a round now."""
-        self._woken.set()
+        self._rosmaster.doubtful.set()
 
     async def run(self) -> None:
         """Run until cancelled; a round that fails is tried again until it succeeds."""
         while True:
-            self._woken.clear()
+            self._rosmaster.doubtful.clear()
             try:
                 await self._round()
             except CallFailedError as error:
@@ -85,87 +84,51 @@ class Reconciler:
             self.ready.set()
             try:
                 async with asyncio.timeout(self._interval):
-                    await self._woken.wait()
+                    await self._rosmaster.doubtful.wait()
             except TimeoutError:
                 pass
 
     async def _round(self) -> None:
         async with self._rosmaster.alone():
-            pid = (await self._rosmaster.call_now("getPid", _NAME))[2]
-            if pid == self._pid:
+            pid = (await self._rosmaster.call_now("getPid", NAME))[2]
+            if pid == self._entries.pid:
                 await self._compare()
             elif (
-                self._pid is None
-                and (await self._rosmaster.call_now("hasParam", _NAME, "/run_id"))[2] is True
+                self._entries.pid is None
+                and (await self._rosmaster.call_now("hasParam", NAME, "/run_id"))[2] is True
             ):
-                tree = (await self._rosmaster.call_now("getParam", _NAME, "/"))[2]
+                tree = (await self._rosmaster.call_now("getParam", NAME, "/"))[2]
                 self._parameters.replace(cast(Tree, tree))
                 await self._compare()
                 self._tell_parameters()
             else:
                 await self._rebuild()
-            self._pid = cast(int, pid)
+            self._entries.pid = cast(int, pid)
 
     def _tell_parameters(self) -> None:
         """Control is new: what it had not told yet, or not even heard of as done, is told."""
         for node, registration in self._registry.in_order():
             if registration.kind is Kind.PARAMETER:
                 value, _ = standing_at(self._parameters.tree, registration.resource)
-                self._graph.tell_parameter(
-                    node, registration.resource, {} if value is None else settled(value)
-                )
+                told = {} if value is None else settled(value)
+                self._enactor.carry_out(self._graph.tell_parameter(node, registration.resource, told))
 
     # --- a new ROSMaster ---
 
     async def _rebuild(self) -> None:
         tree = {**self._own_parameters(), **self._parameters.tree}
-        await self._rosmaster.call_now("setParam", _NAME, "/", tree)
+        await self._rosmaster.call_now("setParam", NAME, "/", tree)
         self._parameters.replace(tree)
         made = 0
         for incarnation, registration in self._registry.in_order():
-            await self._register(incarnation, registration)
+            await self._entries.make(incarnation, registration)
             made += 1
-        self._graph.tell_everybody()
+        self._enactor.carry_out(self._graph.tell_everybody())
         if made:
             text = (
                 f"a new ROS Master was told {made} registrations and {len(tree)} parameter namespaces again"
             )
             self._recorder.happened("reconciled", text, registrations=made)
-
-    async def _register(self, incarnation: Incarnation, registration: Registration) -> Answer:
-        name, inner, resource = incarnation.name, self._faces.inner_uri(incarnation), registration.resource
-        call = self._rosmaster.call_now
-        match registration.kind:
-            case Kind.PUBLICATION:
-                return await call("registerPublisher", name, resource, registration.detail, inner)
-            case Kind.SUBSCRIPTION:
-                return await call("registerSubscriber", name, resource, registration.detail, inner)
-            case Kind.SERVICE:
-                return await call("registerService", name, resource, stand_in(incarnation), inner)
-            case Kind.PARAMETER:
-                return await call("subscribeParam", name, inner, resource)
-
-    async def put_back(self, incarnation: Incarnation, registrations: list[Registration]) -> None:
-        """Register what a returned node had, as far as it still has it when ROSMaster can be told.
-
-        What was taken from it meanwhile is left out; and an earlier life of a node would have ROSMaster end the later.
-        """
-        try:
-            async with self._rosmaster.alone():
-                if (await self._rosmaster.call_now("getPid", _NAME))[2] != self._pid:
-                    raise CallFailedError("the ROS Master is new: the next round tells it everything")
-                for one in registrations:
-                    if (
-                        incarnation.life is Life.LIVE
-                        and (one.kind, one.resource) in incarnation.registrations
-                    ):
-                        answer = await self._register(incarnation, one)
-                        if one.kind is Kind.PARAMETER and answer[0] == 1:
-                            # It heard of no change in the meantime, and ROSMaster tells each change once.
-                            self._graph.tell_parameter(incarnation, one.resource, answer[2])
-        except CallFailedError:
-            self.wake()
-            raise
 
     # --- the same ROSMaster ---
 
@@ -184,7 +147,7 @@ class Reconciler:
             if key not in seen or uris.get(pair[0].name) != self._faces.inner_uri(pair[0])
         ]
         for incarnation, registration in missing:
-            await self._register(incarnation, registration)
+            await self._entries.make(incarnation, registration)
         extra = [one for one in seen if one not in wanted]
         for kind, resource, name in sorted(extra):
             await self._settle(kind, resource, name, uris.get(name))
@@ -193,7 +156,7 @@ class Reconciler:
             self._recorder.happened("reconciled", text, made=len(missing), settled=len(extra))
 
     async def _seen(self) -> Seen:
-        state = (await self._rosmaster.call_now("getSystemState", _NAME))[2]
+        state = (await self._rosmaster.call_now("getSystemState", NAME))[2]
         publishers, subscribers, services = cast(list[list[tuple[str, list[str]]]], state)
         return {
             (kind, resource, name)
@@ -209,7 +172,7 @@ class Reconciler:
     async def _inner_uris(self, nodes: set[str]) -> dict[str, str]:
         names = sorted(nodes)
         answers = await asyncio.gather(
-            *(self._rosmaster.call_now("lookupNode", _NAME, name) for name in names)
+            *(self._rosmaster.call_now("lookupNode", NAME, name) for name in names)
         )
         return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
 
@@ -221,12 +184,13 @@ class Reconciler:
             and kind is not Kind.SERVICE
             and incarnation.name == name
             and (kind, resource) not in incarnation.shelf
-            and self._may_have(incarnation, kind, resource)
+            and self._revocation.may_have(incarnation, kind, resource)
         ):
             types = dict(
-                cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", _NAME))[2])
+                cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", NAME))[2])
             )
-            self._graph.registered(incarnation, kind, resource, types.get(resource, "*"))
+            adopted = self._graph.registered(incarnation, kind, resource, types.get(resource, "*"))
+            self._enactor.carry_out(adopted)
             return
         # A service's real port is not known to ROSMaster, so an offer that was not written down is withdrawn.
         call = self._rosmaster.call_now

@@ -2,7 +2,7 @@
 
 An *incarnation* is one life of a node: its name and the API URI it registered with, from one host. It holds the
 two faces and the relay port that stand for the node. The registry is plain state: it does no I/O and has no clock;
-what has to be durable is handed to the `Journal` it was made with.
+every change returns what is to be kept of it (`Durable`), for `enactor` to carry out.
 
 Invariants:
 
@@ -20,7 +20,6 @@ from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from appliance.channel import own_node
 from appliance.policy.model import Address
@@ -123,38 +122,55 @@ class Incarnation:
         """The outer URI when `hidden`, else the real one; the appliance's own nodes have no other for anybody."""
         return self.outer_uri(told) if hidden or self.own else self.real_uri
 
+    def in_order(self) -> list[Registration]:
+        """What it registered, in the order in which it did."""
+        return sorted(self.registrations.values(), key=lambda one: one.order)
+
     def resources(self, kind: Kind) -> list[str]:
         """What it registered of that kind, in order."""
         return [one.resource for one in self.registrations.values() if one.kind is kind]
 
 
-class Journal(Protocol):
-    """Where the registry writes what must survive a crash of control."""
+@dataclass(frozen=True, slots=True)
+class SaveNode:
+    """Keep an incarnation: it is new, or its `life` or its ports have changed."""
 
-    def incarnation_saved(self, incarnation: Incarnation) -> None:
-        """A new incarnation, or a changed `life`."""
+    node: Incarnation
 
-    def incarnation_forgotten(self, key: str) -> None:
-        """The incarnation and all its registrations are gone."""
 
-    def registration_saved(self, key: str, registration: Registration) -> None:
-        """A registration was made (or made again with another detail)."""
+@dataclass(frozen=True, slots=True)
+class EraseNode:
+    """The incarnation and all its registrations are gone."""
 
-    def registration_removed(self, key: str, kind: Kind, resource: str) -> None:
-        """A registration is gone."""
+    key: str
 
-    def registration_shelved(self, key: str, registration: Registration) -> None:
-        """A registration was taken back by the policy and is remembered."""
 
-    def registration_unshelved(self, key: str, kind: Kind, resource: str) -> None:
-        """A registration that was taken back is remembered no longer."""
+@dataclass(frozen=True, slots=True)
+class SaveRegistration:
+    """Keep a registration of the incarnation with this key; `shelved` is one that the policy took back."""
+
+    key: str
+    registration: Registration
+    shelved: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class EraseRegistration:
+    """A registration is gone, or is not remembered on the shelf any more."""
+
+    key: str
+    kind: Kind
+    resource: str
+    shelved: bool = False
+
+
+Durable = SaveNode | EraseNode | SaveRegistration | EraseRegistration
 
 
 class Registry:
     """All incarnations that are known, by key, by name and by topic."""
 
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
+    def __init__(self) -> None:
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
@@ -251,12 +267,12 @@ class Registry:
 
     # --- changing ---
 
-    def add(self, incarnation: Incarnation) -> None:
+    def add(self, incarnation: Incarnation) -> list[Durable]:
         """Make a new incarnation known; it holds nothing yet."""
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
-        self._journal.incarnation_saved(incarnation)
+        return [SaveNode(incarnation)]
 
     def restore(self, incarnation: Incarnation) -> None:
         """Put back an incarnation that was read from the store, with its registrations."""
@@ -272,76 +288,69 @@ class Registry:
             for registration in incarnation.registrations.values():
                 self._index(incarnation, registration)
 
-    def changed_ports(self, incarnation: Incarnation) -> None:
-        """Keep the ports of an incarnation that has others than when it was added."""
-        self._journal.incarnation_saved(incarnation)
-
-    def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Registration:
+    def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
         """Record that ROSMaster took this registration."""
+        kept: list[Durable] = []
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
-            self.revive(incarnation, incarnation.changed)
+            kept += self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
-        known = incarnation.registrations.get((kind, resource))
-        if known is not None and known.detail == detail:
-            registration = known
-        else:
+        registration = incarnation.registrations.get((kind, resource))
+        if registration is None or registration.detail != detail:
             self._order += 1
-            order = known.order if known is not None else self._order
-            self._registrations_of[incarnation.host] += known is None
+            order = registration.order if registration is not None else self._order
+            self._registrations_of[incarnation.host] += registration is None
             registration = Registration(kind, resource, detail, order)
             incarnation.registrations[kind, resource] = registration
-            self._journal.registration_saved(incarnation.key, registration)
+            kept.append(SaveRegistration(incarnation.key, registration))
         self._index(incarnation, registration)
-        self.unshelve(incarnation, kind, resource)
-        return registration
+        return kept + self.unshelve(incarnation, kind, resource)
 
-    def shelve(self, incarnation: Incarnation, registration: Registration) -> None:
+    def shelve(self, incarnation: Incarnation, registration: Registration) -> list[Durable]:
         """Remember what the policy took back: should it be granted again, the node would not ask for it."""
         incarnation.shelf[registration.kind, registration.resource] = registration
-        self._journal.registration_shelved(incarnation.key, registration)
+        return [SaveRegistration(incarnation.key, registration, shelved=True)]
 
-    def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        """It is registered again, or the node gave it up."""
-        if incarnation.shelf.pop((kind, resource), None) is not None:
-            self._journal.registration_unshelved(incarnation.key, kind, resource)
+    def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
+        """It is registered again, or the node gave it up; nothing to be kept if it was not on the shelf."""
+        if incarnation.shelf.pop((kind, resource), None) is None:
+            return []
+        return [EraseRegistration(incarnation.key, kind, resource, shelved=True)]
 
-    def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        """Record that a registration is gone; whether there was one."""
+    def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
+        """Record that a registration is gone; nothing to be kept if there was none."""
         if incarnation.registrations.pop((kind, resource), None) is None:
-            return False
+            return []
         self._registrations_of[incarnation.host] -= 1
         self._unindex(incarnation, kind, resource)
-        self._journal.registration_removed(incarnation.key, kind, resource)
-        return True
+        return [EraseRegistration(incarnation.key, kind, resource)]
 
-    def replace(self, incarnation: Incarnation, when: float) -> list[Registration]:
-        """Another incarnation took the name: this one's registrations are gone. Returns what it had."""
-        lost = list(incarnation.registrations.values())
-        for registration in lost:
-            self.unregister(incarnation, registration.kind, registration.resource)
-        self._retire(incarnation, Life.REPLACED, when)
-        return lost
+    def replace(self, incarnation: Incarnation, when: float) -> list[Durable]:
+        """Another incarnation took the name: this one's registrations are gone."""
+        kept = [
+            kept
+            for kind, resource in list(incarnation.registrations)
+            for kept in self.unregister(incarnation, kind, resource)
+        ]
+        return kept + self._retire(incarnation, Life.REPLACED, when)
 
-    def overshadow(self, incarnation: Incarnation, when: float) -> list[Registration]:
+    def overshadow(self, incarnation: Incarnation, when: float) -> list[Durable]:
         """The node does not answer: its registrations count for nobody until it returns."""
-        for registration in incarnation.registrations.values():
-            self._unindex(incarnation, registration.kind, registration.resource)
-        self._retire(incarnation, Life.SHADOW, when)
-        return list(incarnation.registrations.values())
+        for kind, resource in incarnation.registrations:
+            self._unindex(incarnation, kind, resource)
+        return self._retire(incarnation, Life.SHADOW, when)
 
-    def revive(self, incarnation: Incarnation, when: float) -> list[Registration]:
+    def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
         """A shadow answers again and its name is free: it is live as before."""
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
         for registration in incarnation.registrations.values():
             self._index(incarnation, registration)
-        self._journal.incarnation_saved(incarnation)
-        return sorted(incarnation.registrations.values(), key=lambda one: one.order)
+        return [SaveNode(incarnation)]
 
-    def forget(self, incarnation: Incarnation) -> None:
+    def forget(self, incarnation: Incarnation) -> list[Durable]:
         """Drop an incarnation for good; its ports may go to another."""
-        for registration in incarnation.registrations.values():
-            self._unindex(incarnation, registration.kind, registration.resource)
+        for kind, resource in incarnation.registrations:
+            self._unindex(incarnation, kind, resource)
         if self._live.get(incarnation.name) is incarnation:
             del self._live[incarnation.name]
         if self._by_key.pop(incarnation.key, None) is not None:
@@ -350,14 +359,14 @@ class Registry:
         identity = incarnation.name, incarnation.host, incarnation.api_text
         if self._known.get(identity) is incarnation:
             del self._known[identity]
-        self._journal.incarnation_forgotten(incarnation.key)
+        return [EraseNode(incarnation.key)]
 
-    def _retire(self, incarnation: Incarnation, life: Life, when: float) -> None:
+    def _retire(self, incarnation: Incarnation, life: Life, when: float) -> list[Durable]:
         incarnation.life, incarnation.changed = life, when
         incarnation.told_lists.clear()
         if self._live.get(incarnation.name) is incarnation:
             del self._live[incarnation.name]
-        self._journal.incarnation_saved(incarnation)
+        return [SaveNode(incarnation)]
 
     def _index(self, incarnation: Incarnation, registration: Registration) -> None:
         holders = self._topics.setdefault((registration.kind, registration.resource), {})

@@ -9,6 +9,7 @@ told to drop the publisher and to take it again.
 
 import asyncio
 
+from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.relays import RelayControl
@@ -20,10 +21,11 @@ _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look
 class Reminders:
     """Looks whether everybody is back whenever a relay was attached."""
 
-    def __init__(self, registry: Registry, relay: RelayControl, graph: Graph) -> None:
+    def __init__(self, registry: Registry, relay: RelayControl, graph: Graph, enactor: Enactor) -> None:
         self._registry = registry
         self._relay = relay
         self._graph = graph
+        self._enactor = enactor
         self._round: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
@@ -43,10 +45,12 @@ class Reminders:
             if not absent:
                 return
             for subscriber, topic, publishers in absent:
-                if number < _GENTLE:
+                gentle = number < _GENTLE
+                self._enactor.carry_out(
                     self._graph.remind(subscriber, topic)
-                else:
-                    self._graph.renew(subscriber, topic, publishers)
+                    if gentle
+                    else self._graph.renew(subscriber, topic, publishers)
+                )
 
     def absent(self) -> list[tuple[Incarnation, str, list[Incarnation]]]:
         """Subscribers, topics, and the publishers they hold a grant for and are not connected to."""

@@ -4,58 +4,39 @@ What is no longer allowed is taken back, and remembered: what is allowed again (
 confirmed in time) is put back, because a ROS 1 node never registers twice.
 """
 
-import asyncio
 import ipaddress
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any
+from collections.abc import Callable, Iterable
 
-import structlog
-
-from appliance.audit.record import Severity
-from appliance.master.graph.graph import Graph
-from appliance.master.graph.registrar import CALLS, Registrar
+from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack
+from appliance.master.graph.entries import CALLS
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Graph, revocation
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.master.reach.own_node import OWN, ROSOUT
-from appliance.master.reach.relays import RelayControl
 from appliance.policy import Policy
 from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision
-from appliance.recorder import Recorder
 from appliance.ros.parameter_tree import Tree
-from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow
 
-_log = structlog.get_logger()
-
 
 class Revocation:
-    """Decides again what the registry and the relay's grants hold, by `policy()` and the parameters that are now.
-
-    `put_back(incarnation, registrations)` tells ROSMaster of those that the node still has when it is their turn.
-    """
+    """Decides again what the registry and the grants hold, by the policy and the parameters (`tree`) at that moment."""
 
     def __init__(
         self,
         registry: Registry,
+        grants: Grants,
         graph: Graph,
-        relay: RelayControl,
-        registrar: Registrar,
-        recorder: Recorder,
-        *,
         policy: Callable[[], Policy],
-        parameters: Callable[[], Tree],
-        put_back: Callable[[Incarnation, list[Registration]], Awaitable[None]],
+        tree: Callable[[], Tree],
     ) -> None:
         self._registry = registry
+        self._grants = grants
         self._graph = graph
-        self._relay = relay
-        self._registrar = registrar
-        self._recorder = recorder
         self._policy = policy
-        self._parameters = parameters
-        self._put_back = put_back
-        self._last: asyncio.Task[None] | None = None
+        self._tree = tree
 
     def live(self) -> list[Live]:
         """What `redecide` decides: all that nodes have by the policy."""
@@ -65,57 +46,65 @@ class Revocation:
                 for incarnation, registration in self._registrations()
                 if not incarnation.own
             ),
-            *(self._permitted(row) for row in self._relay.permissions() if not self._is_own(row)),
+            *(self._granted(row) for row in self._grants.all() if not self._is_own(row)),
         ]
 
-    def redecide(self) -> int:
-        """Take back what the running policy no longer allows; how much that was. What it grants again is put back."""
-        count = self._redecide(self._registrations(), self._relay.permissions())
-        self._grant_again()
-        return count
+    def redecide(self) -> Effects:
+        """Take back what the running policy no longer allows, and put back what it grants again."""
+        effects = self._redecide(self._registrations(), self._grants.all())
+        for incarnation in self._registry.live():
+            effects += self.returned(incarnation)
+        return effects
 
-    def redecide_for(self, host: Address, caller_id: str) -> int:
-        """The same for what one caller has: his call was decided before the policy changed, and carried out after."""
+    def redecide_for(self, host: Address, caller_id: str) -> Effects:
+        """Take back what one caller may not have: his call was decided before the policy changed, made after."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
-            [row for row in self._relay.permissions() if (row.host, row.caller_id) == (str(host), caller_id)],
+            [row for row in self._grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
         )
 
     def _redecide(
         self, registrations: list[tuple[Incarnation, Registration]], grants: list[PermissionRow]
-    ) -> int:
-        count = 0
+    ) -> Effects:
+        effects: Effects = []
         for incarnation, registration in registrations:
             decision = self._decide(incarnation, registration.kind, registration.resource)
             if not decision.allowed:
-                self._take_back(incarnation, registration, decision)
-                count += 1
+                effects += self._take_back(incarnation, registration, decision)
         for row in grants:
-            decision = self._decide_permission(row)
+            decision = self._decide_grant(row)
             if not decision.allowed:
-                self._relay.revoke(row)
-                self._record(row, decision)
-                count += 1
-        return count
+                effects += self._revoke(row, decision)
+        return effects
 
-    def expel(self, host: Address, reason: str) -> int:
-        """Take back all that a host has, whatever the policy says; how much that was."""
-        decision, count = Decision(False, None, reason), 0
+    def expel(self, host: Address, reason: str) -> Effects:
+        """Take back all that a host has, whatever the policy says."""
+        effects: Effects = []
+        decision = Decision(False, None, reason)
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
-                self._take_back(incarnation, registration, decision)
-                count += 1
-        for row in self._relay.permissions():
+                effects += self._take_back(incarnation, registration, decision)
+        for row in self._grants.all():
             if row.host == str(host):
-                self._relay.revoke(row)
-                self._record(row, decision)
-                count += 1
-        return count
+                effects += self._revoke(row, decision)
+        return effects
 
-    def returned(self, incarnation: Incarnation) -> None:
-        """A node that was away is back: it gets what was taken from it and has been granted again meanwhile."""
-        if self._registry.holder(incarnation.name) in (None, incarnation):
-            self._give_back(incarnation)
+    def returned(self, incarnation: Incarnation) -> Effects:
+        """Give a running node what was taken from it and is granted now: it never registers twice.
+
+        The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn.
+        """
+        holder = self._registry.holder(incarnation.name)
+        if holder is not None and holder is not incarnation:
+            return []
+        effects: Effects = []
+        back: list[Registration] = []
+        for one in sorted(incarnation.shelf.values(), key=lambda one: one.order):
+            if self.may_have(incarnation, one.kind, one.resource):
+                effects += self._graph.granted_again(incarnation, one)
+                if (one.kind, one.resource) in incarnation.registrations:
+                    back.append(one)
+        return [*effects, PutBack(incarnation, tuple(back))] if back else effects
 
     def _registrations(self) -> list[tuple[Incarnation, Registration]]:
         """Every registration that counts now or will when its node is back, in the order they were made."""
@@ -127,28 +116,15 @@ class Revocation:
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 
-    def _take_back(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> None:
-        self._graph.revoked(incarnation, registration, decision)
+    def _take_back(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> Effects:
+        effects = self._graph.revoked(incarnation, registration, decision)
         if incarnation.life is Life.LIVE:  # else ROSMaster has been told
-            self._tell(incarnation, registration)
+            effects.append(TakeBack(incarnation, registration))
+        return effects
 
-    def _grant_again(self) -> None:
-        """Put back what an earlier policy took from running nodes and this one grants: they never register twice."""
-        for incarnation in self._registry.live():
-            self.returned(incarnation)
-
-    def _give_back(self, incarnation: Incarnation) -> None:
-        """The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn."""
-        allowed = [
-            one for one in incarnation.shelf.values() if self.may_have(incarnation, one.kind, one.resource)
-        ]
-        back = [
-            one
-            for one in sorted(allowed, key=lambda one: one.order)
-            if self._graph.granted_again(incarnation, one)
-        ]
-        if back:
-            self._in_background(self._told(self._put_back(incarnation, back), incarnation))
+    def _revoke(self, row: PermissionRow, decision: Decision) -> Effects:
+        record = revocation(decision, row.host, row.caller_id, row.kind, row.resource)
+        return [*self._grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         """Whether the policy in force grants a node what it has, had, or seems to have."""
@@ -160,56 +136,23 @@ class Revocation:
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
         return may_keep(self._policy(), self._registered(incarnation, kind, resource))
 
-    def _decide_permission(self, row: PermissionRow) -> Decision:
+    def _decide_grant(self, row: PermissionRow) -> Decision:
         if self._is_own(row):
             return Decision(True, None, OWN)
-        return may_keep(self._policy(), self._permitted(row))
+        return may_keep(self._policy(), self._granted(row))
 
     def _is_own(self, row: PermissionRow) -> bool:
         holder = self._registry.holder(row.caller_id)
         return row.kind == TOPIC and holder is not None and holder.own
 
     def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
-        return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self._parameters())
+        return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self._tree())
 
-    def _permitted(self, row: PermissionRow) -> Live:
+    def _granted(self, row: PermissionRow) -> Live:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"
         return Live(ipaddress.ip_address(row.host), row.caller_id, call, row.resource)
 
-    def _tell(self, incarnation: Incarnation, registration: Registration) -> None:
-        self._in_background(self._told(self._withdraw(incarnation, registration), incarnation))
 
-    async def _withdraw(self, incarnation: Incarnation, registration: Registration) -> None:
-        kind, resource = registration.kind, registration.resource
-        if (kind, resource) not in incarnation.registrations:  # else it has been granted again
-            await self._registrar.withdraw(incarnation, kind, resource)
-
-    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
-        """After what is under way: ROSMaster hears of changes in the order they were made."""
-        before = self._last
-
-        async def in_turn() -> None:
-            if before is not None:
-                await asyncio.wait([before])
-            await work
-
-        self._last = asyncio.get_running_loop().create_task(in_turn())
-
-    async def _told(self, telling: Awaitable[None], incarnation: Incarnation) -> None:
-        try:
-            await telling
-        except CallFailedError as error:
-            _log.warning("ROSMaster was not told", node=incarnation.name, error=str(error))  # reconcile will
-
-    def _record(self, row: PermissionRow, decision: Decision) -> None:
-        self._recorder.happened(
-            "revoked",
-            decision.reason,
-            severity=Severity.WARNING,
-            decision="deny",
-            host=row.host,
-            caller_id=row.caller_id,
-            category=row.kind,
-            resource=row.resource,
-            rule=decision.rule,
-        )
+def revoked(effects: Iterable[Effect]) -> int:
+    """How many registrations and grants these effects take back."""
+    return sum(isinstance(one, Record) and one.event == "revoked" for one in effects)

@@ -2,7 +2,6 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
@@ -10,8 +9,10 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.answers.graph import Flow
 from appliance.channel.messages import TopicTraffic
+from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.limits import LimitRule
 from appliance.recorder import Recorder
+from appliance.store.state import PermissionRow
 
 MOST_RESOURCES = 2000
 OTHERS = "(others)"  # no name of ROS has a bracket
@@ -72,20 +73,11 @@ class Traffic:
 
 
 class Carried:
-    """Connections and traffic of all relays; `name(key)` is the name of an incarnation, None of an unknown one."""
+    """Connections and traffic of all relays, of which there are `relays`."""
 
-    def __init__(
-        self,
-        recorder: Recorder,
-        name: Callable[[str], str | None],
-        relays: int,
-        *,
-        is_own: Callable[[str, str, str], bool],
-    ) -> None:
-        """`name` is of a key; `is_own` says of host, caller id and topic whether our own node subscribes there."""
+    def __init__(self, recorder: Recorder, registry: Registry, relays: int) -> None:
         self._recorder = recorder
-        self._name_of = name
-        self._is_own = is_own
+        self._registry = registry
         self._relays = relays
         self.connections: dict[tuple[int, int], Connection] = {}
         self.traffic: dict[tuple[str, str], Traffic] = {}
@@ -99,6 +91,13 @@ class Carried:
 
         Of at most `MOST_RESOURCES`; the rest is under `OTHERS`.
         """
+
+    def used(self) -> set[PermissionRow]:
+        """The grants that somebody is connected by."""
+        return {
+            PermissionRow(one.key, one.kind, one.resource, one.host, one.caller_id)
+            for one in self.connections.values()
+        }
 
     @property
     def total(self) -> Traffic:
@@ -137,7 +136,7 @@ class Carried:
         """A relay's counters; the last words about a node that is forgotten count for nothing."""
         now = time.monotonic()
         for row in rows:
-            if self._name_of(row.key) is not None:
+            if self._registry.by_key(row.key) is not None:
                 self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
 
     def unrecorded(self, connections: int) -> None:
@@ -269,4 +268,15 @@ class Carried:
         )
 
     def _name(self, key: str) -> str:
-        return self._name_of(key) or ""
+        node = self._registry.by_key(key)
+        return node.name if node is not None else ""
+
+    def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
+        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
+        holder = self._registry.holder(caller_id)
+        return (
+            holder is not None
+            and holder.own
+            and host in (str(holder.host), holder.told)
+            and (Kind.SUBSCRIPTION, topic) in holder.registrations
+        )

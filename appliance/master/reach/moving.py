@@ -8,6 +8,7 @@ them again, since neither client library leaves a connection for a list it knows
 from collections.abc import Sequence
 
 from appliance.channel.messages import Message
+from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.reminders import Reminders
 from appliance.master.reach.relays import RelayControl
@@ -17,9 +18,10 @@ from appliance.specifications.allocation import TOPIC, Move, Resource
 class Moving:
     """The relays that there are, with the graph whose topics they carry."""
 
-    def __init__(self, relay: RelayControl, graph: Graph, reminders: Reminders) -> None:
+    def __init__(self, relay: RelayControl, graph: Graph, enactor: Enactor, reminders: Reminders) -> None:
         self._relay = relay
         self._graph = graph
+        self._enactor = enactor
         self._reminders = reminders
 
     def send(self, message: Message, relay: int) -> bool:
@@ -39,6 +41,6 @@ class Moving:
         self._relay.place_moved(moves)
         for move in moves:
             if move.kind == TOPIC:
-                self._graph.renew_all(move.name)
+                self._enactor.carry_out(self._graph.renew_all(move.name))
         if moves:
             self._reminders.begin()

@@ -1,9 +1,8 @@
-"""Control's side of the relays: states what is wanted, answers where publishers are, keeps who may have what.
+"""Control's side of the relays: states what is wanted, answers where publishers are.
 
-What is wanted is derived from the registry (nodes, publications, services) and the grants, which are kept in the
-store because a ROS node never asks twice. Each topic and service is stated to the relay that carries it
-(`allocation`), a node to every relay that carries something of it. When a relay (re)appears everything of its is
-stated afresh between `StateBegan` and `StateEnded`; what is not said again is gone.
+What is wanted is derived from the registry (nodes, publications, services) and the grants. Each topic and service is
+stated to the relay that carries it (`allocation`), a node to every relay that carries something of it. When a relay
+(re)appears everything of its is stated afresh between `StateBegan` and `StateEnded`; what is not said again is gone.
 """
 
 import asyncio
@@ -14,23 +13,19 @@ from appliance.channel import messages
 from appliance.channel.answers.graph import Flow
 from appliance.channel.channel import Channel
 from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.carried import Carried, Connection, Traffic
 from appliance.master.reach.places import Places
 from appliance.master.reach.relay_post import RelayPost
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
-from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
-from appliance.shares.pool import Bounds
-from appliance.shares.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
-from appliance.store.state import PermissionRow, StateStore
+from appliance.store.state import PermissionRow
 
 RELAY_NAME = "/rosrv"
-_CLEARED_AT_ONCE = 1000
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
 
@@ -41,34 +36,29 @@ class RelayControl:
     def __init__(
         self,
         registry: Registry,
+        grants: Grants,
         places: Places,
-        store: StateStore,
         delivery: Delivery,
-        recorder: Recorder,
+        carried: Carried,
         *,
         allocation: Allocation,
         policy: Callable[[], Policy],
         broken: Callable[[Incarnation], None],
-        grants: Bounds = GRANTS.bounds,
     ) -> None:
         self._registry = registry
         self._grants = grants
         self._places = places
-        self._store = store
+        self.carried = carried
         self._delivery = delivery
         self._broken = broken
         self._allocation = allocation
         self._policy = policy
         self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
-        self._permissions: dict[str, set[PermissionRow]] = {}
-        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
-        self._granted = 0
         self._asking: set[asyncio.Task[None]] = set()
         self.statement: Callable[[int], messages.Message | None] = lambda relay: None  # noqa: ARG005 - set when wired
         self.heard: Callable[[messages.Message, int], None] = lambda message, relay: None  # noqa: ARG005 - the same
         self.lost: Callable[[int], None] = lambda relay: None  # noqa: ARG005 - the same
         self.own_header: messages.OwnHeaderStated | None = None  # of what control publishes itself
-        self.carried = Carried(recorder, self._known_name, allocation.relays, is_own=self._is_own)
 
     @property
     def presence(self) -> str:
@@ -97,16 +87,6 @@ class RelayControl:
         return self.carried.flow(key, resource)
 
     # --- the links ---
-
-    def load(self) -> None:
-        """Read the kept grants."""
-        for row in self._store.permissions():
-            if not row.caller_id:  # of an earlier version, for every name of the host: it looks up again
-                self._store.remove_permission(row)
-                continue
-            self._permissions.setdefault(row.key, set()).add(row)
-            self._of_host.setdefault(row.host, {})[row] = None
-            self._granted += 1
 
     def attach(self, index: int, channel: Channel) -> None:
         """A relay is there: serve its link and state everything that it is to carry."""
@@ -159,9 +139,9 @@ class RelayControl:
                 self._place_one(
                     post, incarnation, registration.kind, registration.resource, registration.detail
                 )
-        for row in self._permissions.get(incarnation.key, ()):
+        for row in self._grants.of(incarnation.key):
             if self.carries(post.index, row.kind, row.resource):
-                self._state(row)
+                self.place_grant(row)
 
     def _place_one(
         self, post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str, detail: str
@@ -176,26 +156,29 @@ class RelayControl:
                 (listening.fileno(),),
             )
         if kind is Kind.PUBLICATION:
-            post.send(self._publication(self._policy(), incarnation, resource, detail))
+            post.send(self._publication(incarnation, resource, detail))
         else:
             post.send(messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail)))
 
-    def _state(self, row: PermissionRow) -> None:
+    def place_grant(self, row: PermissionRow) -> None:
+        """A subscriber or client is let in."""
         post = self._post(row.kind, row.resource)
         if row.kind == TOPIC:
             post.send(_grant(self._policy(), row))
         else:
             post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id))
 
-    def placed(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
-        """The incarnation registered a publication or a service."""
-        if kind in _WORDS:
-            self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
+    def revoke_grant(self, row: PermissionRow) -> None:
+        """A subscriber or client is let in no more; its connection is cut."""
+        _revoke(self._post(row.kind, row.resource), row)
 
-    def withdrawn(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        """The incarnation has a publication or a service no longer."""
-        if kind in _WORDS:
-            _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
+    def place(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
+        """Carry a publication or a service."""
+        self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
+
+    def withdraw(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        """Carry a publication or a service no longer."""
+        _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
 
     def withdraw_moving(self, moves: Iterable[Move]) -> None:
         """Stop carrying what is about to be carried by another relay; the allocation is still the old one.
@@ -217,50 +200,26 @@ class RelayControl:
                 detail = incarnation.registrations[kind, move.name].detail
                 self._place_one(post, incarnation, kind, move.name, detail)
                 for row in self._rows_of(incarnation, move):
-                    self._state(row)
+                    self.place_grant(row)
 
     def _rows_of(self, incarnation: Incarnation, move: Move) -> list[PermissionRow]:
-        rows = self._permissions.get(incarnation.key, ())
+        rows = self._grants.of(incarnation.key)
         return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
 
-    def node_withdrawn(self, incarnation: Incarnation) -> None:
-        """The incarnation is gone (for now): nothing of it is carried."""
+    def withdraw_node(self, incarnation: Incarnation) -> None:
+        """Carry nothing of an incarnation."""
         for post in self._posts:
             if incarnation.key in post.placed:
                 post.placed.discard(incarnation.key)
                 post.send(messages.NodeWithdrawn(incarnation.key))
 
-    def node_returned(self, incarnation: Incarnation) -> None:
-        """The incarnation is back with all it had."""
+    def place_node(self, incarnation: Incarnation) -> None:
+        """Carry all that an incarnation has."""
         for post in self._posts:
             self._place(post, incarnation)
 
-    def forgotten(self, incarnation: Incarnation) -> None:
-        """The incarnation is gone for good, its grants with it."""
-        self.node_withdrawn(incarnation)
-        for row in self._permissions.pop(incarnation.key, ()):
-            self._drop(row)
-        self.carried.forgotten(incarnation.key)
-
-    def policy_changed(self, before: Policy, now: Policy) -> None:
-        """Another policy is in force: the relays are told of limits that are others now."""
-        if not before.limits_anything and not now.limits_anything:
-            return
-        for incarnation in self._registry.live():
-            for registration in incarnation.registrations.values():
-                if registration.kind is not Kind.PUBLICATION:
-                    continue
-                topic, detail = registration.resource, registration.detail
-                was, is_now = (self._publication(one, incarnation, topic, detail) for one in (before, now))
-                if was != is_now:
-                    self._post(TOPIC, topic).send(is_now)
-            for row in self._permissions.get(incarnation.key, ()):
-                if row.kind == TOPIC and _grant(before, row) != _grant(now, row):
-                    self._state(row)
-
-    def _publication(
-        self, policy: Policy, incarnation: Incarnation, topic: str, detail: str
-    ) -> messages.PublicationPlaced:
+    def _publication(self, incarnation: Incarnation, topic: str, detail: str) -> messages.PublicationPlaced:
+        policy = self._policy()
         return messages.PublicationPlaced(
             incarnation.key,
             topic,
@@ -271,83 +230,15 @@ class RelayControl:
 
     def unconnected(self) -> list[PermissionRow]:
         """Grants for topics of live publishers whose subscriber is not connected."""
-        there = {
-            (one.key, one.resource, one.host, one.caller_id) for one in self.carried.connections.values()
-        }
+        used = self.carried.used()
         return [
             row
             for incarnation in self._registry.live()
-            for row in self._permissions.get(incarnation.key, ())
+            for row in self._grants.of(incarnation.key)
             if row.kind == TOPIC
             and (Kind.PUBLICATION, row.resource) in incarnation.registrations
-            and (row.key, row.resource, row.host, row.caller_id) not in there
+            and row not in used
         ]
-
-    # --- grants ---
-
-    def permissions(self) -> list[PermissionRow]:
-        """Every grant."""
-        return [row for rows in self._permissions.values() for row in rows]
-
-    def grant_topic(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> None:
-        """This subscriber may have this topic of that publisher."""
-        self._grant(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
-
-    def grant_service(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
-        """This client may call this service of that provider. Nobody calls without a name."""
-        if caller_id:
-            self._grant(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
-
-    def _grant(self, row: PermissionRow) -> None:
-        rows = self._permissions.setdefault(row.key, set())
-        mine = self._of_host.setdefault(row.host, {})
-        mine[row] = mine.pop(row, None)  # it is the newest, whenever it was granted first
-        if row not in rows:
-            rows.add(row)
-            self._store.save_permission(row)
-            self._granted += 1
-            if len(mine) > self._grants.host:
-                self._clear_unused(row.host, row)
-            elif self._granted > self._grants.whole:
-                self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
-        self._state(row)
-
-    def _clear_unused(self, host: str, newest: PermissionRow) -> None:
-        """A host that has too many grants loses its oldest ones that nobody is connected by."""
-        used = {
-            (one.key, one.kind, one.resource, one.host, one.caller_id)
-            for one in self.carried.connections.values()
-        }
-        unused = [
-            row
-            for row in self._of_host[host]
-            if row != newest and (row.key, row.kind, row.resource, row.host, row.caller_id) not in used
-        ]
-        for row in unused[:_CLEARED_AT_ONCE]:
-            self.revoke(row)
-
-    def _drop(self, row: PermissionRow) -> None:
-        self._store.remove_permission(row)
-        mine = self._of_host.get(row.host, {})
-        if row in mine:
-            del mine[row]
-            self._granted -= 1
-        if not mine:
-            self._of_host.pop(row.host, None)
-
-    def revoke(self, row: PermissionRow) -> None:
-        """Take a grant back; its connection is cut."""
-        rows = self._permissions.get(row.key, set())
-        rows.discard(row)
-        self._drop(row)
-        _revoke(self._post(row.kind, row.resource), row)
-
-    def revoke_subscriber(self, host: Address, caller_id: str, topic: str) -> None:
-        """The subscriber gave the topic up: its grants for it, on every publisher, are gone."""
-        for publisher in list(self._registry.registered(Kind.PUBLICATION, topic)):
-            row = PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id)
-            if row in self._permissions.get(publisher.key, ()):
-                self.revoke(row)
 
     # --- what the relays say ---
 
@@ -405,20 +296,6 @@ class RelayControl:
             self._broken(incarnation)
             return
         post.send(messages.UpstreamFound(key, topic, str(incarnation.host), port))
-
-    def _known_name(self, key: str) -> str | None:
-        incarnation = self._registry.by_key(key)
-        return incarnation.name if incarnation is not None else None
-
-    def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
-        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
-        holder = self._registry.holder(caller_id)
-        return (
-            holder is not None
-            and holder.own
-            and host in (str(holder.host), holder.told)
-            and (Kind.SUBSCRIPTION, topic) in holder.registrations
-        )
 
 
 def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:

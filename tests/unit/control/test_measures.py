@@ -1,13 +1,16 @@
 """Tests of what control measures: bounded, whatever names others choose."""
 
+import ipaddress
 from typing import Any, cast
 
 import pytest
 
 from appliance.channel.messages import TopicTraffic
 from appliance.control.measures import by_resource, carried_of, from_zero
+from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reach import carried
 from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried
+from appliance.ros.uris import parse_node_uri
 
 
 def test_sums_by_name() -> None:
@@ -39,7 +42,11 @@ def test_few_topics_have_a_histogram_of_their_own() -> None:
 def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that restarts is another incarnation: its topic counts on, bounded in names."""
     monkeypatch.setattr(carried, "MOST_RESOURCES", 2)
-    counted = Carried(cast(Any, None), lambda _key: "/node", 1, is_own=lambda *_: False)
+    registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
+    for number in range(4):
+        uri = f"http://10.0.0.5:400{number}/"
+        registry.add(Incarnation(f"k{number}", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2))
+    counted = Carried(cast(Any, None), registry, 1)
     for number in range(4):
         rows = [
             TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),

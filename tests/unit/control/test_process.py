@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _restore
-from appliance.master.graph.journal import StoreJournal
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.journal import write
+from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import StateStore
 from tests.support.control_parts import Nothing
@@ -26,20 +26,22 @@ def fail(reason: str) -> None:
 class Ports(Nothing):
     """Every port can be had again."""
 
-    async def reopen(self, _incarnation: Incarnation) -> None:
+    async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
         """As `Faces`."""
+        return []
 
 
 async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path) -> None:
     """The policy may have changed while the appliance was down: it is applied when all nodes are there again."""
     store = StateStore(tmp_path, failed=fail)
-    before = Registry(StoreJournal(store))
+    before = Registry()
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
-    before.add(node)
-    before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
+    kept = before.add(node) + before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
+    for effect in kept:
+        write(effect, store)
     await store.settled()
-    registry = Registry(StoreJournal(store))
+    registry = Registry()
     decided: list[tuple[object, list[str]]] = []
 
     def changed(policy: object) -> int:
@@ -47,7 +49,9 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
         return 1
 
     policies = SimpleNamespace(current="the new policy", changed=changed)
-    parts = SimpleNamespace(registry=registry, relay=Nothing(), faces=Ports(), places=Nothing())
+    parts = SimpleNamespace(
+        registry=registry, grants=Nothing(), enactor=Nothing(), faces=Ports(), places=Nothing()
+    )
     base = SimpleNamespace(sockets={}, store=store, policies=policies)
     await _restore(cast(Any, base), cast(Any, parts))
     store.close()

@@ -81,7 +81,7 @@ def held(world: ControlParts) -> set[Row]:
         for each in node.registrations.values()
     } | {
         (row.host, row.caller_id, "subscription" if row.kind == "topic" else "call", row.resource)
-        for row in world.relay.rows
+        for row in world.grants.all()
     }
 
 
@@ -100,8 +100,9 @@ async def taken(
             )
             nodes[host, name] = node
             world.registry.add(node)
-        world.graph.registered(nodes[host, name], kind, resource, "t")
-    world.relay.rows = [PermissionRow("key", kind, thing, host, name) for host, name, kind, thing in grants]
+        world.enactor.carry_out(world.graph.registered(nodes[host, name], kind, resource, "t"))
+    for host, name, kind, thing in grants:
+        world.grants.give(PermissionRow("key", kind, thing, host, name))
     before = held(world)
     seen = [Live.of(live.fields()) for live in world.revocation.live()]
     named = endings(compile_policy(policy, file="policy"), seen)

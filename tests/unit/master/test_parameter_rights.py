@@ -37,7 +37,7 @@ def told(world: ControlParts) -> list[tuple[Value, ...]]:
 async def test_what_came_to_be_below_a_key_is_told_to_who_may_read_it(key: str, value: Value) -> None:
     """A subscription to a value is none to what others put in its place: that is held back, and recorded."""
     world, node = await subscribed(EXACT)
-    world.graph.tell_parameter(node, key, value)
+    world.enactor.carry_out(world.graph.tell_parameter(node, key, value))
     assert not told(world)
     assert ("deny", key) in world.records.events
 
@@ -47,11 +47,11 @@ async def test_what_may_be_read_is_told() -> None:
     world, node = await subscribed(EXACT)
     updates: list[tuple[str, Value]] = [("/arm", 7), ("/arm", {}), ("/arm/free", 1)]
     for key, value in updates:
-        world.graph.tell_parameter(node, key, value)
+        world.enactor.carry_out(world.graph.tell_parameter(node, key, value))
     assert told(world) == [(f"{key}/", value) for key, value in updates]
     for policy in (OPEN, WHOLE):
         world, node = await subscribed(policy)
-        world.graph.tell_parameter(node, "/arm/speed", 4711)
+        world.enactor.carry_out(world.graph.tell_parameter(node, "/arm/speed", 4711))
         assert told(world) == [("/arm/speed/", 4711)]
 
 

@@ -17,7 +17,7 @@ from appliance.master.calls.call import Attempt, Call, Identity, Verb
 from appliance.master.calls.gate import Contest, Gate, HostLimits
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.graph.registrar import CALLS
+from appliance.master.graph.entries import CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
 from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.learn import Observation, learn
@@ -28,7 +28,7 @@ from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
-from tests.support.control_parts import ControlParts, Nothing
+from tests.support.control_parts import ControlParts
 
 HOST = ipaddress.ip_address("10.0.0.5")
 NAME, THING, KEY_GIVEN = "/me", "/thing", "/arm/speed"
@@ -109,7 +109,7 @@ def argument_of(parameter: Parameter[Any]) -> Any:
 
 def gate_says(policy: Policy, call: Call[Any], tree: Tree) -> Decision:
     """What RVMaster answers to the call."""
-    gate = Gate(lambda: policy, Registry(Nothing()), HostLimits())
+    gate = Gate(lambda: policy, Registry(), HostLimits())
     name = "" if call.identity is Identity.NOBODY else NAME
     arguments = tuple(argument_of(one) for one in call.method.parameters)
     caller = Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0)

@@ -43,17 +43,10 @@ write default  = adm
 """
 
 
-class NobodyIsKept:
-    """A journal that keeps nothing."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_: None
-
-
 def gate(rules: str) -> Gate:
     """The gate under a policy with these rules for parameters, and nobody registered."""
     policy = compile_policy(BASE + rules, file="test.ini")
-    return Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+    return Gate(lambda: policy, Registry(), HostLimits())
 
 
 def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -> Decision:
@@ -119,7 +112,7 @@ def test_without_the_section_everything_is_as_it_was() -> None:
     text = BASE.replace("[Parameters]\n", "") + rules
     policy = compile_policy(text, file="test.ini")
     peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
-    here = Gate(lambda: policy, Registry(NobodyIsKept()), HostLimits())
+    here = Gate(lambda: policy, Registry(), HostLimits())
     decision = here.decide(Attempt(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0)), tree)
     assert isinstance(decision, Decision)
     assert decision.allowed
@@ -130,7 +123,7 @@ API = "http://127.0.0.1:4000/"
 
 def held(name: str, host: str, *, own: bool) -> Registry:
     """A registry in which a node of this host, or one of the appliance's, holds a name."""
-    registry = Registry(NobodyIsKept())
+    registry = Registry()
     address, uri = ipaddress.ip_address(host), parse_node_uri(API)
     node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)
     registry.add(node)
@@ -221,7 +214,7 @@ def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words:
 def test_a_host_has_as_many_registrations_as_are_left() -> None:
     """Three times as many: however many hosts register all they can, the next finds room."""
     policy = compile_policy(BASE + LIMITED + "[Publishers]\ndefault = *\n", file="test.ini")
-    registry = Registry(NobodyIsKept())
+    registry = Registry()
     limits = HostLimits(nodes=500, registrations=60, registrations_in_all=100)
     gate = Gate(lambda: policy, registry, limits)
     counts = []

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.master.caller import Caller
 from appliance.master.calls.lookups import LookupCalls
-from appliance.master.graph.registrar import stand_in
+from appliance.master.graph.entries import stand_in
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.ros.uris import parse_node_uri
 
@@ -25,13 +25,6 @@ ORDERS = [
 pytestmark = pytest.mark.anyio
 
 
-class Nothing:
-    """A journal that keeps nothing."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_given: None
-
-
 class Race:
     """ROSMaster and registry while `/server` is started anew and offers its service again.
 
@@ -40,7 +33,7 @@ class Race:
     """
 
     def __init__(self) -> None:
-        self.registry = Registry(cast(Any, Nothing()))
+        self.registry = Registry()
         self.old, self.new = (self._incarnation(key, port) for key, port in (("old", 4000), ("new", 4001)))
         self.registry.register(self.old, Kind.SERVICE, SERVICE, "5000")
         self.provider = self.old
@@ -75,8 +68,8 @@ class Race:
         else:
             self.gates[name].set()
 
-    def grant_service(self, incarnation: Incarnation, *_given: object) -> None:
-        """As the relay's control."""
+    def service_granted(self, incarnation: Incarnation, *_given: object) -> None:
+        """As `Graph`."""
         self.granted.append(incarnation)
 
     def calls(self) -> LookupCalls:
@@ -86,9 +79,9 @@ class Race:
             "registry": self.registry,
             "faces": None,
             "mediation": SimpleNamespace(carries_service=lambda _name: True),
-            "relay": SimpleNamespace(
-                grant_service=self.grant_service, port=lambda one, _kind, _name: one.relay_port
-            ),
+            "graph": self,
+            "enactor": SimpleNamespace(carry_out=lambda _effects: None),
+            "relay": SimpleNamespace(port=lambda one, _kind, _name: one.relay_port),
             "addresses": SimpleNamespace(told_to=lambda _peer: "10.0.0.1"),
         }
         return LookupCalls(**parts, port=11311, stop=lambda _reason: None)

@@ -107,9 +107,13 @@ class OrderedServer:
         self.tree = mirror()
         self.requests: list[list[str]] = []
         self.parameters = there
-        self.calls = ParameterCalls(cast(Any, self), there, cast(Any, self), cast(Any, None), 1 << 20)
+        me = cast(Any, self)
+        self.calls = ParameterCalls(me, there, me, me, cast(Any, None), 1 << 20)
         self.broken: Exception | None = None
         self.told: list[tuple[str, str | None]] = []
+
+    def carry_out(self, _effects: object) -> None:
+        """As `Enactor`."""
 
     def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
         """As `Graph`."""

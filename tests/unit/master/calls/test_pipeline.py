@@ -95,8 +95,9 @@ class Site:
         self.go.set()
         self.serve = serving(
             policy=lambda: policy,
-            registry=Registry(Anything()),
+            registry=Registry(),
             graph=Anything(),
+            enactor=Anything(),
             rosmaster=self,
             mirror=self.parameters,
             recorder=self.recorder,

@@ -40,7 +40,7 @@ async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> Non
     world.reload(OPEN + "[Clients]\n")
     await world.round()
     await call
-    assert world.relay.rows == []
+    assert world.grants.all() == []
 
 
 async def test_what_a_tool_unregisters_by_what_it_was_told() -> None:

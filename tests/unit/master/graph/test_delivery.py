@@ -6,7 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph.delivery import Delivery, NodeCall
+from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.ros.xmlrpc import FaultReceived, Limits, Value
 from appliance.rpc.client import CallFailedError

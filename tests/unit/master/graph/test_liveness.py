@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.graph import liveness
-from appliance.master.graph.delivery import NodeCall
+from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import RefusedError
@@ -58,7 +58,7 @@ async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None
     await world.register(mouth, Kind.PUBLICATION, "/t")
     world.deliveries.told.clear()
     world.clients.silent = {"/ear"}
-    world.liveness.missed(ear, NodeCall("publisherUpdate", ("/t", [])))
+    world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/t", [])), "away")
     await world.settle()
     assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
     world.clients.silent = set()
@@ -73,7 +73,7 @@ async def test_a_node_that_answers_and_takes_no_list_is_not_told_without_end() -
     ear = world.node("/ear", 1)
     await world.register(ear, Kind.SUBSCRIPTION, "/t")
     for _ in range(5):
-        world.liveness.missed(ear, NodeCall("publisherUpdate", ("/t", [])))
+        world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/t", [])), "away")
         await world.settle()
     assert world.deliveries.told == [("/ear", "publisherUpdate", ("/t", []))]
 
@@ -86,7 +86,7 @@ async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
     await world.register(mouth, Kind.PUBLICATION, "/secret")
     world.reload(POLICY.format("", "/secret=\n"))
     world.deliveries.told.clear()
-    world.liveness.missed(ear, NodeCall("publisherUpdate", ("/secret", [])))
+    world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/secret", [])), "away")
     await world.settle()
     assert world.deliveries.told == [("/ear", "publisherUpdate", ("/secret", []))]
 

@@ -32,7 +32,7 @@ async def test_what_was_granted_and_not_written_down_is_adopted() -> None:
     await world.round()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/first")
-    await world.reconciler._register(node, Registration(Kind.PUBLICATION, "/second", "t", 0))
+    await world.entries.make(node, Registration(Kind.PUBLICATION, "/second", "t", 0))
     await world.round()
     assert node.resources(Kind.PUBLICATION) == ["/first", "/second"]
 
@@ -44,7 +44,7 @@ async def test_what_rosmaster_has_is_no_right(kind: Kind) -> None:
     node = world.node("/n")
     await world.register(node, kind, "/first")
     world.reload(NO_SECRET)
-    await world.reconciler._register(node, Registration(kind, "/secret", "t", 0))
+    await world.entries.make(node, Registration(kind, "/secret", "t", 0))
     await world.round()
     assert node.resources(kind) == ["/first"]
     assert world.hidden.has(kind, "/secret") == []
@@ -120,8 +120,8 @@ async def test_a_new_master_is_whole_before_it_is_asked_anything() -> None:
     world.rosmaster.shut()
     world.hidden.restart()
     with pytest.raises(CallFailedError):
-        await world.reconciler.put_back(node, list(node.registrations.values()))
-    assert (world.rosmaster.reachable, world.reconciler._woken.is_set()) == (False, True)
+        await world.entries.put_back(node, list(node.registrations.values()))
+    assert (world.rosmaster.reachable, world.rosmaster.doubtful.is_set()) == (False, True)
     await world.round()
-    assert (world.rosmaster.reachable, world.reconciler._pid) == (True, world.hidden.pid)
+    assert (world.rosmaster.reachable, world.entries.pid) == (True, world.hidden.pid)
     assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/t", "/u")] == [["/n"], ["/other"]]

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.ros.uris import parse_node_uri
-from tests.support.stand_ins import NoJournal
 
 HOSTS = [ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")]
 STEP = st.tuples(
@@ -31,7 +30,7 @@ def incarnation(number: int) -> Incarnation:
 @given(steps=st.lists(STEP, max_size=40))
 def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
     """One live incarnation a name; shadows count for nobody; the indexes are what a look at everything finds."""
-    registry = Registry(NoJournal())
+    registry = Registry()
     known = [incarnation(number) for number in range(6)]
     for one in known:
         registry.add(one)
@@ -82,7 +81,7 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
 
 def test_the_one_that_was_lost_first_makes_room() -> None:
     """Of a host's nodes that are gone, the one that went first is dropped first; a live one never is."""
-    registry = Registry(NoJournal())
+    registry = Registry()
     known = [incarnation(number) for number in (0, 2, 4)]
     for one in known:
         registry.add(one)
@@ -96,7 +95,7 @@ def test_the_one_that_was_lost_first_makes_room() -> None:
 
 def test_who_has_nothing_makes_room_first() -> None:
     """A node that gave up all it had goes before one that is lost, and for other hosts, too; not one that asks now."""
-    registry = Registry(NoJournal())
+    registry = Registry()
     lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
     for one in (lost, idle, busy):
         registry.add(one)
@@ -117,7 +116,7 @@ def test_who_has_nothing_makes_room_first() -> None:
 
 def test_forgetting_one_life_leaves_the_next_findable() -> None:
     """Two incarnations of one identity (name, host and URI again): the later one is found when the first is dropped."""
-    registry = Registry(NoJournal())
+    registry = Registry()
     first, second = incarnation(0), incarnation(0)
     registry.add(first)
     registry.replace(first, 1.0)
@@ -133,7 +132,7 @@ def test_a_name_is_restored_to_the_one_that_has_something(order: tuple[int, int]
     """An idle life of a node, kept as live beside the one that has its name, does not take it at a restart."""
     known = [incarnation(0), incarnation(3)]
     known[1].registrations[Kind.PUBLICATION, "/x"] = Registration(Kind.PUBLICATION, "/x", "t", 1)
-    registry = Registry(NoJournal())
+    registry = Registry()
     for number in order:
         registry.restore(known[number])
     assert registry.holder("/n0") is known[1]

@@ -11,7 +11,6 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.graph.reminders import Reminders
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
-from tests.support.stand_ins import NoJournal
 
 HOST = ipaddress.ip_address("10.0.0.5")
 
@@ -28,6 +27,9 @@ class Told:
         """As `RelayControl`."""
         self.absent_for -= 1
         return [self.row] if self.absent_for >= 0 else []
+
+    def carry_out(self, _effects: object) -> None:
+        """As `Execution`."""
 
     def remind(self, subscriber: Incarnation, topic: str) -> None:
         """As `Graph`."""
@@ -53,14 +55,14 @@ def test_reminded_until_back(
 ) -> None:
     """Nobody is told who is back; who stays away is told to take the publisher anew, and nobody for ever."""
     monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
-    registry = Registry(NoJournal())
+    registry = Registry()
     node(registry, "/ear", Kind.SUBSCRIPTION)
     node(registry, "/other", Kind.SUBSCRIPTION)
     node(registry, "/mouth", Kind.PUBLICATION)
     told = Told(PermissionRow("key of /mouth", "topic", "/chatter", str(HOST), "/ear"), absent_for)
 
     async def run() -> None:
-        looks = Reminders(registry, cast(Any, told), cast(Any, told))
+        looks = Reminders(registry, cast(Any, told), cast(Any, told), cast(Any, told))
         looks.begin()
         assert looks._round is not None
         await looks._round

@@ -3,6 +3,7 @@
 import pytest
 
 from appliance.master.graph.registry import Kind, Life
+from appliance.master.graph.revocation import revoked
 from appliance.policy import compile_policy
 from appliance.ros.xmlrpc import Value
 from appliance.store.state import PermissionRow
@@ -56,7 +57,7 @@ async def test_a_revoked_host_keeps_nothing_of_nodes_that_are_away() -> None:
     await world.register(node, Kind.PUBLICATION, "/plain")
     world.clients.silent = {"/n"}
     await world.look(node)
-    assert world.revocation.expel(node.host, "the host was revoked") == 1
+    assert revoked(world.revocation.expel(node.host, "the host was revoked")) == 1
     assert not node.registrations
 
 
@@ -126,8 +127,9 @@ async def test_only_what_one_caller_has_is_decided_again() -> None:
     mine = PermissionRow(other.key, "topic", "/secret", str(node.host), "/n")
     called = PermissionRow(other.key, "service", "/secret", str(node.host), "/n")
     theirs = PermissionRow(node.key, "topic", "/secret", str(node.host), "/m")
-    world.relay.rows = [mine, called, theirs]
+    for row in (mine, called, theirs):
+        world.grants.give(row)
     world.current = compile_policy(NO_SECRET + "[Clients]\n", file="policy")
-    assert world.revocation.redecide_for(node.host, "/n") == 3
+    assert world.redecide_for(node.host, "/n") == 3
     assert (node.resources(Kind.PUBLICATION), other.resources(Kind.PUBLICATION)) == ([], ["/secret"])
-    assert world.relay.rows == [theirs]
+    assert world.grants.all() == [theirs]

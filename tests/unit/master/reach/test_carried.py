@@ -1,12 +1,15 @@
 """What becomes of a relay's reports of refused connections."""
 
+import ipaddress
 from typing import Any, cast
 
 import pytest
 
 from appliance.audit.record import Severity
 from appliance.channel.messages import ConnectionRefused
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.carried import Carried
+from appliance.ros.uris import parse_node_uri
 
 
 class Kept:
@@ -27,12 +30,15 @@ class Kept:
 def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, attack: bool) -> None:
     """rosout connects to a node that has gone meanwhile: no denial. Others in its name are denied."""
     kept = Kept()
-    told = Carried(
-        cast(Any, kept),
-        lambda _key: "/talker",
-        1,
-        is_own=lambda *asked: asked == ("10.0.0.2", "/rosout", "/rosout"),
-    )
+    registry = Registry()
+    for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
+        uri = f"http://10.0.0.2:4000/{key}"
+        address = ipaddress.ip_address("10.0.0.2")
+        node = Incarnation(key, name, address, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, own=own)
+        registry.add(node)
+        if own:
+            registry.register(node, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
+    told = Carried(cast(Any, kept), registry, 1)
     told.refused(ConnectionRefused("k", "topic", topic, host, "/rosout", "[/talker] is not a publisher", 1))
     (record,) = kept.records
     assert record["decision"] == ("deny" if attack else None)
@@ -43,6 +49,6 @@ def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, 
 def test_a_refusal_without_a_name_has_no_category() -> None:
     """Who says nothing before he is refused has asked for neither a topic nor a service."""
     kept = Kept()
-    told = Carried(cast(Any, kept), lambda _key: None, 1, is_own=lambda *_: False)
+    told = Carried(cast(Any, kept), Registry(), 1)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))
     assert (kept.records[0]["category"], kept.records[0]["count"]) == (None, 2)

@@ -15,7 +15,6 @@ from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.uris import parse_node_uri
 from appliance.rpc.server import Peer
-from tests.support.control_parts import Nothing
 
 URI = "http://127.0.0.1:4000/"
 
@@ -40,7 +39,7 @@ def decide(caller_id: str, method: str, resource: str) -> Decision:
         for one in call.method.parameters
     )
     attempt = Attempt(Caller(peer, caller_id, 0, own=True), call, arguments)
-    decision = Gate(lambda: policy, Registry(Nothing()), HostLimits()).decide(attempt, {})
+    decision = Gate(lambda: policy, Registry(), HostLimits()).decide(attempt, {})
     assert isinstance(decision, Decision)
     return decision
 

@@ -10,20 +10,25 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.carried import Carried
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.policy import Policy, compile_policy
+from appliance.policy.model import Address
 from appliance.recorder import Recorder
 from appliance.ros.uris import parse_node_uri
 from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
 from appliance.store.state import PermissionRow, StateStore
-from tests.support.stand_ins import NoJournal
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
+_UNUSED = object()  # a part that nothing is asked of
 
 
 class Ports:
@@ -91,21 +96,34 @@ class World:
 
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
-        self.registry = Registry(NoJournal())
+        self.registry = Registry()
         self.allocation = Allocation(2)
         self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
+        carried = Carried(cast(Recorder, self), self.registry, 2)
+        self.grants = Grants(carried.used, grants)
         self.relay = RelayControl(
             self.registry,
+            self.grants,
             cast(Places, self.ports),
-            cast(StateStore, NoPermissions()),
             cast(Delivery, NoDelivery()),
-            cast(Recorder, self),
+            carried,
             allocation=self.allocation,
             policy=lambda: self.policy,
             broken=lambda _incarnation: None,
-            grants=grants,
+        )
+        self.graph = Graph(
+            self.registry, self.grants, cast(Any, _UNUSED), may_be_told=lambda _node, _key, _value: True
+        )
+        self.enactor = Enactor(
+            self.graph,
+            cast(Any, _UNUSED),
+            store=cast(StateStore, NoPermissions()),
+            recorder=cast(Recorder, self),
+            delivery=cast(Delivery, NoDelivery()),
+            relay=self.relay,
+            faces=cast(Any, _UNUSED),
         )
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
@@ -121,12 +139,20 @@ class World:
             (Kind.SERVICE, "/serve", "4001"),
         ):
             self.registry.register(self.node, kind, name, detail)
-            self.relay.placed(self.node, kind, name, detail)
+            self.relay.place(self.node, kind, name, detail)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
         """As `Recorder`."""
         self.records.append((event, reason, fields))
         return ""
+
+    def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
+        """The node's topic is granted."""
+        self.enactor.carry_out(self.graph.topic_granted(self.node, topic, host, caller_id))
+
+    def limits_changed(self, before: Policy, now: Policy) -> None:
+        """Another policy is in force."""
+        self.enactor.carry_out(self.graph.limits_changed(before, now))
 
     def put(self, **topics: int) -> None:
         """These topics belong to these relays."""
@@ -150,7 +176,7 @@ async def test_each_relay_is_told_what_it_carries() -> None:
     assert messages.PublicationPlaced("key", "/right", "std_msgs/String") == second.heard()[-1]
     assert [relay.port(node, Kind.PUBLICATION, name) for name in ("/left", "/right")] == [2, 3]
     assert relay.port(node, Kind.SERVICE, "/serve") == 2
-    relay.grant_topic(node, "/right", HOST, "/ear")
+    world.grant_topic("/right", HOST, "/ear")
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
     assert (first.heard(), second.heard()) == ([], [grant])
     again = Link()
@@ -159,9 +185,9 @@ async def test_each_relay_is_told_what_it_carries() -> None:
         messages.StateBegan(2), placed, messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
         messages.StateEnded(2),
     ]  # fmt: skip
-    relay.withdrawn(node, Kind.PUBLICATION, "/left")
+    relay.withdraw(node, Kind.PUBLICATION, "/left")
     assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
-    relay.node_withdrawn(node)
+    relay.withdraw_node(node)
     assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
     world.close()
 
@@ -170,8 +196,8 @@ async def test_a_topic_moves_with_its_grants() -> None:
     """Withdrawn by the old allocation, placed by the new one; other topics are not touched."""
     world = World()
     relay, (first, second) = world.relay, world.links
-    relay.grant_topic(world.node, "/right", HOST, "/ear")
-    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    world.grant_topic("/right", HOST, "/ear")
+    world.grant_topic("/left", HOST, "/ear")
     for link in world.links:
         link.heard()
     moves = [Move(TOPIC, "/right", 1, 0)]
@@ -194,14 +220,14 @@ async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -
     """Not on the relay it came from either, should the topic come back to it; so it is with a service."""
     world = World()
     relay, (first, second) = world.relay, world.links
-    relay.grant_service(world.node, "/serve", HOST, "/c")
+    world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/c"))
     first.heard()
     away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
     relay.withdraw_moving(away)
     assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
     world.allocation.adopt(Plan({}, {(SERVICE, "/serve"): 1}))
     relay.place_moved(away)
-    relay.revoke(relay.permissions()[0])
+    world.enactor.carry_out(world.grants.take(world.grants.all()[0]))
     assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
     relay.withdraw_moving(back)
     world.put()
@@ -259,26 +285,26 @@ async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change
     """With publications and grants, to the relay that carries the topic; what has not changed is not said again."""
     world = World()
     relay, (first, second) = world.relay, world.links
-    relay.grant_topic(world.node, "/right", HOST, "/ear")
-    relay.grant_topic(world.node, "/left", HOST, "/ear")
+    world.grant_topic("/right", HOST, "/ear")
+    world.grant_topic("/left", HOST, "/ear")
     first.heard()
     second.heard()
     line = "/right = publisher 10.0.0.5 30 Hz, topic 1 MB/s, subscriber 5 Hz"
     before, world.policy = world.policy, policy(line)
-    relay.policy_changed(before, world.policy)
+    world.limits_changed(before, world.policy)
     placed = messages.PublicationPlaced(
         "key", "/right", "std_msgs/String", messages.FlowLimit(30), messages.FlowLimit(bytes=1e6)
     )
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", messages.FlowLimit(5))
     assert (first.heard(), second.heard()) == ([], [placed, grant])
-    relay.policy_changed(world.policy, policy(line))
+    world.limits_changed(world.policy, policy(line))
     assert second.heard() == []
     relay.attach(1, cast(Channel, second))
     told = second.heard()
     assert placed in told
     assert grant in told
     before, world.policy = world.policy, policy()
-    relay.policy_changed(before, world.policy)
+    world.limits_changed(before, world.policy)
     assert second.heard() == [
         messages.PublicationPlaced("key", "/right", "std_msgs/String"),
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
@@ -307,12 +333,12 @@ async def test_grants_of_all_hosts_are_bounded() -> None:
     """A host at its share, and of all hosts that with most, loses what nobody is connected by; others lose nothing."""
     world = World(Bounds(whole=100, host=60, strangers=0, kept=0))
     robot = ipaddress.ip_address("10.0.0.9")
-    world.relay.grant_topic(world.node, "/left", robot, "/ear")
+    world.grant_topic("/left", robot, "/ear")
     for number in range(200):
-        world.relay.grant_topic(world.node, "/left", ipaddress.ip_address("10.1.0.1"), f"/ear{number}")
+        world.grant_topic("/left", ipaddress.ip_address("10.1.0.1"), f"/ear{number}")
         for guest in range(2, 5):
             address = ipaddress.ip_address(f"10.1.0.{guest}")
-            world.relay.grant_topic(world.node, "/left", address, f"/ear{number}")
-        assert len(world.relay.permissions()) <= 100
-    assert "10.0.0.9" in {row.host for row in world.relay.permissions()}
+            world.grant_topic("/left", address, f"/ear{number}")
+        assert len(world.grants.all()) <= 100
+    assert "10.0.0.9" in {row.host for row in world.grants.all()}
     world.close()

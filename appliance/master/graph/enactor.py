@@ -1,0 +1,158 @@
+"""Carries out what follows from changes of the graph (`effects`): the one place where they touch the world."""
+
+import asyncio
+from collections.abc import Iterable, Sequence
+from typing import assert_never
+
+import structlog
+
+from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.effects import (
+    CloseNode,
+    DropCalls,
+    Effect,
+    EraseGrant,
+    Place,
+    PlaceGrant,
+    PlaceNode,
+    PutBack,
+    Record,
+    RevokeGrant,
+    SaveGrant,
+    TakeBack,
+    TellNode,
+    Withdraw,
+    WithdrawNode,
+)
+from appliance.master.graph.entries import Entries
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.journal import write
+from appliance.master.graph.registry import (
+    EraseNode,
+    EraseRegistration,
+    Incarnation,
+    Registration,
+    SaveNode,
+    SaveRegistration,
+)
+from appliance.master.reach.faces import Faces
+from appliance.master.reach.relays import RelayControl
+from appliance.recorder import Recorder
+from appliance.rpc.client import CallFailedError
+from appliance.store.state import StateStore
+
+_log = structlog.get_logger()
+
+
+class Enactor:
+    """Tells nodes, relays, ROSMaster, the store and the audit log. ROSMaster hears of changes in their order."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        entries: Entries,
+        *,
+        store: StateStore,
+        recorder: Recorder,
+        delivery: Delivery,
+        relay: RelayControl,
+        faces: Faces,
+    ) -> None:
+        self._graph = graph
+        self._entries = entries
+        self._store = store
+        self._recorder = recorder
+        self._delivery = delivery
+        self._relay = relay
+        self._faces = faces
+        self._last: asyncio.Task[None] | None = None  # of what ROSMaster is told
+
+    def carry_out(self, effects: Iterable[Effect]) -> None:
+        """Do all of this, now and in this order; what ROSMaster is told is done in its turn."""
+        for effect in effects:
+            match effect:
+                case TellNode(node, call):
+                    self._delivery.push(node, call)
+                case DropCalls(node):
+                    self._delivery.drop(node)
+                case CloseNode(node):
+                    self._relay.carried.forgotten(node.key)
+                    self._faces.close(node)
+                case PutBack() | TakeBack():
+                    self._last = asyncio.get_running_loop().create_task(self._tell_master(effect, self._last))
+                case SaveGrant(row):
+                    self._store.save_permission(row)
+                case EraseGrant(row):
+                    self._store.remove_permission(row)
+                case SaveNode() | EraseNode() | SaveRegistration() | EraseRegistration():
+                    write(effect, self._store)
+                case Record():
+                    self._recorder.happened(
+                        effect.event,
+                        effect.reason,
+                        severity=effect.severity,
+                        host=effect.host,
+                        caller_id=effect.caller_id,
+                        category=effect.category,
+                        resource=effect.resource,
+                        rule=effect.rule,
+                        decision=effect.decision,
+                    )
+                case _:
+                    self._tell_relays(effect)
+
+    def _tell_relays(
+        self, effect: Place | Withdraw | PlaceNode | WithdrawNode | PlaceGrant | RevokeGrant
+    ) -> None:
+        match effect:
+            case Place(node, kind, resource, detail):
+                self._relay.place(node, kind, resource, detail)
+            case Withdraw(node, kind, resource):
+                self._relay.withdraw(node, kind, resource)
+            case PlaceNode(node):
+                self._relay.place_node(node)
+            case WithdrawNode(node):
+                self._relay.withdraw_node(node)
+            case PlaceGrant(row):
+                self._relay.place_grant(row)
+            case RevokeGrant(row):
+                self._relay.revoke_grant(row)
+            case _:
+                assert_never(effect)
+
+    # --- ROSMaster ---
+
+    async def put_back(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
+        """Tell ROSMaster what a returned node has. A call that fails is made up for by the reconcile loop."""
+        try:
+            values = await self._entries.put_back(node, registrations)
+        except CallFailedError as error:
+            _not_told(node, error)
+            return
+        for key, value in values:
+            self.carry_out(self._graph.tell_parameter(node, key, value))
+
+    async def take_out(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
+        """Tell ROSMaster what a lost node has no more. A call that fails is made up for by the reconcile loop."""
+        try:
+            await self._entries.end_lost(node, registrations)
+        except CallFailedError as error:
+            _not_told(node, error)
+
+    async def _tell_master(self, effect: PutBack | TakeBack, before: asyncio.Task[None] | None) -> None:
+        if before is not None:
+            await asyncio.wait([before])
+        if isinstance(effect, PutBack):
+            await self.put_back(effect.node, effect.registrations)
+            return
+        node, taken = effect.node, effect.registration
+        if (taken.kind, taken.resource) in node.registrations:  # it has been granted again
+            return
+        try:
+            await self._entries.end(node, taken.kind, taken.resource)
+        except CallFailedError as error:
+            _not_told(node, error)
+
+
+def _not_told(node: Incarnation, error: CallFailedError) -> None:
+    _log.warning("ROSMaster was not told", node=node.name, error=str(error))

@@ -1,0 +1,86 @@
+"""Who may have which topic or service of which node through the relays: plain state, as the registry is.
+
+Grants are kept, because a ROS node never asks twice. A host that has too many, or of all hosts that with most, loses
+its oldest ones that nobody is connected by.
+"""
+
+from collections.abc import Callable, Collection, Iterable
+
+from appliance.master.graph.effects import Effects, EraseGrant, PlaceGrant, RevokeGrant, SaveGrant
+from appliance.shares.pool import Bounds
+from appliance.shares.table import GRANTS
+from appliance.store.state import PermissionRow
+
+_CLEARED_AT_ONCE = 1000
+
+
+class Grants:
+    """Every grant. `used()` are those that somebody is connected by now."""
+
+    def __init__(self, used: Callable[[], Collection[PermissionRow]], bounds: Bounds = GRANTS.bounds) -> None:
+        self._used = used
+        self._bounds = bounds
+        self._of_node: dict[str, set[PermissionRow]] = {}  # by the key of who publishes or serves
+        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
+        self._count = 0
+
+    def restore(self, rows: Iterable[PermissionRow]) -> Effects:
+        """Put back what was kept. Grants of an earlier version, for every name of a host, go: it looks up again."""
+        effects: Effects = []
+        for row in rows:
+            if row.caller_id:
+                self._add(row)
+            else:
+                effects.append(EraseGrant(row))
+        return effects
+
+    def all(self) -> list[PermissionRow]:
+        """Every grant."""
+        return [row for rows in self._of_node.values() for row in rows]
+
+    def of(self, key: str) -> Collection[PermissionRow]:
+        """The grants for what an incarnation publishes or serves."""
+        return self._of_node.get(key, ())
+
+    def give(self, row: PermissionRow) -> Effects:
+        """This subscriber or client may have it; the grant is its host's newest, whenever it was granted first."""
+        effects: Effects = []
+        if row not in self._of_node.get(row.key, ()):
+            effects.append(SaveGrant(row))
+        self._add(row)
+        if effects and len(self._of_host[row.host]) > self._bounds.host:
+            effects += self._clear_unused(row.host, row)
+        elif effects and self._count > self._bounds.whole:
+            effects += self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
+        return [*effects, PlaceGrant(row)]
+
+    def take(self, row: PermissionRow) -> Effects:
+        """Take a grant back, if there is one; its connection is cut."""
+        rows = self._of_node.get(row.key, set())
+        if row not in rows:
+            return []
+        rows.discard(row)
+        return [*self._drop(row), RevokeGrant(row)]
+
+    def forget(self, key: str) -> Effects:
+        """The incarnation is gone for good, and the grants for what it had with it."""
+        return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
+
+    def _add(self, row: PermissionRow) -> None:
+        rows, mine = self._of_node.setdefault(row.key, set()), self._of_host.setdefault(row.host, {})
+        self._count += row not in rows
+        rows.add(row)
+        mine[row] = mine.pop(row, None)
+
+    def _drop(self, row: PermissionRow) -> Effects:
+        mine = self._of_host[row.host]
+        del mine[row]
+        self._count -= 1
+        if not mine:
+            del self._of_host[row.host]
+        return [EraseGrant(row)]
+
+    def _clear_unused(self, host: str, newest: PermissionRow) -> Effects:
+        used = self._used()
+        unused = [row for row in self._of_host[host] if row != newest and row not in used]
+        return [effect for row in unused[:_CLEARED_AT_ONCE] for effect in self.take(row)]

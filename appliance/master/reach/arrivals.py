@@ -1,0 +1,98 @@
+"""How an incarnation comes to be: a call registers under a name, from a host, with an API URI."""
+
+import asyncio
+import time
+
+from appliance.master.caller import ApiUri, Caller
+from appliance.master.graph.enactor import Enactor
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.liveness import Liveness
+from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
+from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.faces import Faces
+from appliance.master.reach.places import NoPortError, Places
+from appliance.policy.model import Address
+
+
+class Arrivals:
+    """Finds the incarnation that calls, or makes it."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        graph: Graph,
+        enactor: Enactor,
+        liveness: Liveness,
+        *,
+        places: Places,
+        faces: Faces,
+        addresses: Addresses,
+    ) -> None:
+        self._registry = registry
+        self._graph = graph
+        self._enactor = enactor
+        self._liveness = liveness
+        self._places = places
+        self._faces = faces
+        self._addresses = addresses
+        self._coming: dict[tuple[str, Address, str], asyncio.Future[Incarnation]] = {}
+
+    def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+        """The incarnation that calls, if it is known."""
+        return self._registry.find(caller.caller_id, caller.peer.host, api.text)
+
+    async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
+        """The incarnation that calls; made, with its ports and durably, when it is new.
+
+        Raises `NoPortError` when the range of ports is exhausted.
+        """
+        identity = (caller.caller_id, caller.peer.host, api.text)
+        incarnation = self._registry.find(*identity)
+        if incarnation is not None and incarnation.life is Life.LIVE:
+            incarnation.touched = time.monotonic()
+            incarnation.told = self._addresses.told_to(caller.peer)
+            return incarnation
+        if incarnation is not None and incarnation.life is Life.SHADOW:
+            if self._registry.holder(incarnation.name) is None:
+                # It was away and adds to what it had, before anybody saw that it is back.
+                await self._liveness.revive(incarnation)
+                return incarnation
+            # Another took its name meanwhile: it begins anew.
+            self._enactor.carry_out(self._graph.forgotten(incarnation))
+        coming = self._coming.get(identity)
+        if coming is None:
+            coming = asyncio.ensure_future(self._make(caller, api))
+            self._coming[identity] = coming
+            coming.add_done_callback(lambda _done: self._coming.pop(identity, None))
+        return await asyncio.shield(coming)
+
+    async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
+        outer_port, relay_port, *more = self._open_ports(caller.peer.host)
+        incarnation = Incarnation(
+            key=new_key(),
+            name=caller.caller_id,
+            host=caller.peer.host,
+            api=api.uri,
+            api_text=api.text,
+            told=self._addresses.told_to(caller.peer),
+            outer_port=outer_port,
+            relay_port=relay_port,
+            more_relay_ports=tuple(more),
+            own=caller.own,
+            changed=time.time(),
+            touched=time.monotonic(),
+        )
+        self._enactor.carry_out(self._registry.add(incarnation))
+        await self._faces.open(incarnation)
+        return incarnation
+
+    def _open_ports(self, host: Address) -> tuple[int, ...]:
+        """Ports for a node of this host; who has no registration makes room at once. Raises `NoPortError`."""
+        while True:
+            try:
+                return self._places.open(host)
+            except NoPortError:
+                spare = self._registry.spare(host)
+                if spare is None:
+                    raise
+                self._enactor.carry_out(self._graph.forgotten(spare))
