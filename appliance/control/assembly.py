@@ -201,6 +201,7 @@ def assemble(base: Foundation) -> Parts:
         delivery=delivery,
         relay=relay,
         faces=faces,
+        places=places,
     )
     # What acts by itself.
     liveness = Liveness(
@@ -329,8 +330,8 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
 
 def _connect(base: Foundation, parts: Parts, revocation: Revocation) -> None:
     """What policy, hosts and specifications call when they change."""
-    relay, graph, enactor = parts.relay, parts.graph, parts.enactor
-    base.monitors.connect(Moving(relay, graph, enactor, parts.reminders))
+    relay, enactor = parts.relay, parts.enactor
+    base.monitors.connect(Moving(relay, parts.graph, enactor, parts.reminders))
     relay.statement, relay.heard, relay.lost = (
         base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
     )  # fmt: skip
@@ -352,8 +353,7 @@ def _connect(base: Foundation, parts: Parts, revocation: Revocation) -> None:
     def policy_changed(policy: Policy) -> int:
         nonlocal in_force
         before, in_force = in_force, policy
-        parts.places.policy_changed(policy.ports)
-        effects = [*revocation.redecide(), *graph.limits_changed(before, policy)]
+        effects = revocation.policy_changed(before, policy)
         enactor.carry_out(effects)
         return revoked(effects)
 

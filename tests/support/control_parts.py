@@ -5,12 +5,15 @@ were told and answer as a test has them answer. Nothing is sent over a network.
 """
 
 import asyncio
+import functools
 import ipaddress
+import itertools
+from collections.abc import Iterable
 from typing import Any, Self, cast
 
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.effects import NodeCall
+from appliance.master.graph.effects import Effect, NodeCall
 from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.entries import Entries
 from appliance.master.graph.grants import Grants
@@ -174,6 +177,7 @@ class Inner:
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
         self.closed: list[str] = []
+        self._ports = itertools.count(20_001)
 
     def close(self, incarnation: Incarnation) -> None:
         """As `Faces`."""
@@ -191,7 +195,11 @@ class Inner:
         """As `Arrivals`."""
         known = self.known(caller, api)
         if known is None:
-            known = Incarnation(new_key(), caller.caller_id, HOST, api.uri, api.text, "10.0.0.1", 1, 2)
+            outer, relay = next(self._ports), next(self._ports)
+            known = Incarnation(
+                new_key(), caller.caller_id, caller.peer.host, api.uri, api.text, "10.0.0.1", outer, relay,
+                own=caller.own,
+            )  # fmt: skip
             self._registry.add(known)
         return known
 
@@ -232,6 +240,10 @@ class Modes:
         """As `Mediation`."""
         return True
 
+    def carries_topic(self, _topic: str) -> bool:
+        """As `Mediation`."""
+        return True
+
     def carries_service(self, _service: str) -> bool:
         """As `Mediation`."""
         return True
@@ -246,6 +258,19 @@ class Addresses:
     def told_to(self, _peer: Peer) -> str:
         """As `Addresses`."""
         return "10.0.0.1"
+
+
+class Noted(Enactor):
+    """Carries effects out, and keeps them."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.noted: list[Effect] = []
+
+    def carry_out(self, effects: Iterable[Effect]) -> None:
+        """As `Enactor`."""
+        self.noted += (effects := list(effects))
+        super().carry_out(effects)
 
 
 class ControlParts:
@@ -275,7 +300,7 @@ class ControlParts:
         self.rosmaster = RosMaster(1, limits=Limits(), hold=1.0)
         self.rosmaster._calls = cast(Any, self.hidden)
         self.entries = Entries(self.rosmaster, self.faces.inner_uri)
-        self.enactor = Enactor(
+        self.enactor = Noted(
             self.graph,
             self.entries,
             store=cast(Any, Nothing()),
@@ -283,6 +308,7 @@ class ControlParts:
             delivery=cast(Any, self.deliveries),
             relay=cast(Any, self.relay),
             faces=cast(Any, self.faces),
+            places=cast(Any, Nothing()),
         )
         self.reconciler = Reconciler(
             self.rosmaster,
@@ -308,7 +334,8 @@ class ControlParts:
             standing=lambda _host: Standing.REGISTERED,
         )
         cast(Any, self.liveness).client = self.clients.client
-        self._serve = serving(
+        self._serving = functools.partial(
+            serving,
             policy=lambda: self.current,
             registry=self.registry,
             graph=self.graph,
@@ -325,6 +352,7 @@ class ControlParts:
             liveness=self.liveness,
             redecide_for=self.redecide_for,
         )
+        self._serve = self._serving()
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
         """What one caller has is decided again; how much was taken back."""
@@ -351,10 +379,18 @@ class ControlParts:
         self.registry.add(node)
         return node
 
-    async def ask(self, method: str, *params: Value) -> Value:
-        """A call that a node on the robot makes of RVMaster, as it is answered."""
-        peer = Peer(HOST, str(HOST), "10.0.0.1")
-        return parse_response(await self._serve(HttpRequest(peer, "/", build_call(method, params), 0)))
+    async def ask(
+        self,
+        method: str,
+        *params: Value,
+        host: str = str(HOST),
+        target: Incarnation | None = None,
+        own: bool = False,
+    ) -> Value:
+        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered."""
+        peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
+        serve = self._serving(own=own, target=target) if own or target is not None else self._serve
+        return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
         """ROSMaster takes a registration, and control writes it down."""
@@ -363,8 +399,8 @@ class ControlParts:
 
     def reload(self, text: str) -> int:
         """This policy comes into force; how much was taken back."""
-        self.current = compile_policy(text, file="policy")
-        effects = self.revocation.redecide()
+        before, self.current = self.current, compile_policy(text, file="policy")
+        effects = self.revocation.policy_changed(before, self.current)
         self.enactor.carry_out(effects)
         return revoked(effects)
 

@@ -3,17 +3,19 @@
 from collections.abc import Callable
 from typing import Any
 
+from appliance.master.calls.call import served
 from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.multicall import Multicall
+from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_search import ParameterSearch
 from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.table import master_table
-from appliance.master.graph.registry import Registry
+from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy import Policy
 from appliance.ros.xmlrpc import Limits
@@ -40,8 +42,10 @@ def serving(
     liveness: Any = None,
     redecide_for: Any = None,
     offload: int = 1 << 20,
+    own: bool = False,
+    target: Incarnation | None = None,
 ) -> Handler:
-    """The handler of RVMaster's listener, where every host has a node."""
+    """The handler of RVMaster's listener, where every host has a node; for our `own`, or of the face of `target`."""
     gate = Gate(policy, registry, HostLimits())
     parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
     execution = Execution(
@@ -66,6 +70,9 @@ def serving(
         bulk=bulk_turns(lambda _host: Standing.REGISTERED),
     )
     monitors: Any = None
+    if target is not None:
+        node_calls = NodeCalls(registry, graph, enactor, relay, mediation, addresses, liveness, gate, 11311)
+        return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(
             RegistrationCalls(
@@ -86,5 +93,6 @@ def serving(
             parameters,
             ParameterSearch(rosmaster, mirror, rights),
             MonitorCalls(monitors, registry, relay, real_port=11312, port=11311),
-        )
+        ),
+        own=own,
     )

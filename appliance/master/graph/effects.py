@@ -136,6 +136,13 @@ class TakeBack:
 
 
 @dataclass(frozen=True, slots=True)
+class UsePorts:
+    """New nodes get ports of this range; hosts may be named otherwise, too."""
+
+    ports: range
+
+
+@dataclass(frozen=True, slots=True)
 class Record:
     """The audit log hears of it; the fields are those of `Recorder.happened`."""
 
@@ -165,6 +172,7 @@ Effect = (
     | RevokeGrant
     | PutBack
     | TakeBack
+    | UsePorts
     | Record
 )
 Effects = list[Effect]

@@ -21,6 +21,7 @@ from appliance.master.graph.effects import (
     SaveGrant,
     TakeBack,
     TellNode,
+    UsePorts,
     Withdraw,
     WithdrawNode,
 )
@@ -36,6 +37,7 @@ from appliance.master.graph.registry import (
     SaveRegistration,
 )
 from appliance.master.reach.faces import Faces
+from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.recorder import Recorder
 from appliance.rpc.client import CallFailedError
@@ -57,6 +59,7 @@ class Enactor:
         delivery: Delivery,
         relay: RelayControl,
         faces: Faces,
+        places: Places,
     ) -> None:
         self._graph = graph
         self._entries = entries
@@ -65,6 +68,7 @@ class Enactor:
         self._delivery = delivery
         self._relay = relay
         self._faces = faces
+        self._places = places
         self._last: asyncio.Task[None] | None = None  # of what ROSMaster is told
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
@@ -78,6 +82,8 @@ class Enactor:
                 case CloseNode(node):
                     self._relay.carried.forgotten(node.key)
                     self._faces.close(node)
+                case UsePorts(ports):
+                    self._places.policy_changed(ports)
                 case PutBack() | TakeBack():
                     self._last = asyncio.get_running_loop().create_task(self._tell_master(effect, self._last))
                 case SaveGrant(row):

@@ -7,7 +7,7 @@ confirmed in time) is put back, because a ROS 1 node never registers twice.
 import ipaddress
 from collections.abc import Callable, Iterable
 
-from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack
+from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack, UsePorts
 from appliance.master.graph.entries import CALLS
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph, revocation
@@ -48,6 +48,10 @@ class Revocation:
             ),
             *(self._granted(row) for row in self._grants.all() if not self._is_own(row)),
         ]
+
+    def policy_changed(self, before: Policy, now: Policy) -> Effects:
+        """All that follows from another policy, which is in force already."""
+        return [UsePorts(now.ports), *self.redecide(), *self._graph.limits_changed(before, now)]
 
     def redecide(self) -> Effects:
         """Take back what the running policy no longer allows, and put back what it grants again."""

@@ -124,6 +124,7 @@ class World:
             delivery=cast(Delivery, NoDelivery()),
             relay=self.relay,
             faces=cast(Any, _UNUSED),
+            places=cast(Places, self.ports),
         )
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
