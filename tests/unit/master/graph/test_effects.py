@@ -1,0 +1,56 @@
+"""What follows from a change is carried out: nobody who changes the graph lets the effects fall."""
+
+import ast
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+
+import appliance
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registry import Registry
+from appliance.master.graph.revocation import Revocation
+
+ROOT = Path(appliance.__file__).parent
+_EFFECTS = {"Effects", "list[Durable]"}
+
+
+def verbs() -> set[tuple[str, str]]:
+    """The name of a part of the core, and a verb of it that returns what is to be carried out."""
+    return {
+        (part.__name__.lower(), node.name)
+        for part in (Graph, Registry, Grants, Revocation)
+        for node in ast.walk(ast.parse(inspect.getsource(part)))
+        if isinstance(node, ast.FunctionDef)
+        and node.returns is not None
+        and ast.unparse(node.returns) in _EFFECTS
+    }
+
+
+def dropped(tree: ast.Module) -> Iterator[str]:
+    """Calls of these verbs whose result nobody takes."""
+    known = verbs()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Expr(value=ast.Call(func=ast.Attribute(value=part, attr=verb))):
+                name = ast.unparse(part).rpartition(".")[2].lstrip("_")
+                if (name, verb) in known:
+                    yield ast.unparse(node)
+
+
+def test_no_effect_falls() -> None:
+    """Nowhere in RVMaster and control."""
+    files = [*(ROOT / "master").rglob("*.py"), *(ROOT / "control").rglob("*.py")]
+    assert [call for file in files for call in dropped(ast.parse(file.read_text(encoding="utf-8")))] == []
+
+
+def test_the_rule_finds_what_it_forbids() -> None:
+    """A verb by itself is found, one whose effects are carried out is not."""
+    assert {
+        ("graph", "registered"),
+        ("registry", "add"),
+        ("grants", "give"),
+        ("revocation", "expel"),
+    } <= verbs()
+    assert list(dropped(ast.parse("self._graph.registered(a)")))
+    assert not list(dropped(ast.parse("self._enactor.carry_out(self._graph.registered(a))")))
