@@ -115,7 +115,9 @@ def _severities(node: ast.Call, called: str) -> frozenset[str]:
         if isinstance(one, ast.Attribute) and getattr(one.value, "id", "") == "Severity" and one.attr in known
     }
     plain = not any(one.arg == "severity" for one in node.keywords)
-    return frozenset(found or ({Severity.INFO.value} if called in ("happened", "_record") and plain else set()))
+    return frozenset(
+        found or ({Severity.INFO.value} if called in ("happened", "_record") and plain else set())
+    )
 
 
 def markdown() -> str:
