@@ -17,24 +17,35 @@ RUN apt-get update -q \
         ca-certificates gcc libc6-dev python3-dev python3-venv python3-wheel
 COPY requirements.lock /build/
 # Two packages come as source: they are built with Debian's setuptools and wheel, so that nothing is fetched unlocked.
+# Nothing in it tells when or where it was built: compiled files name their source by its content.
+ENV PYTHONHASHSEED=0 CFLAGS="-O2 -g0" LDFLAGS=-Wl,--build-id=none
 RUN python3 -m venv /opt/rosrv \
  && PYTHONPATH=/usr/lib/python3/dist-packages /opt/rosrv/bin/pip install --quiet --no-cache-dir --require-hashes \
-        --disable-pip-version-check --no-build-isolation -r /build/requirements.lock \
+        --disable-pip-version-check --no-build-isolation --no-compile -r /build/requirements.lock \
  && /opt/rosrv/bin/pip uninstall --quiet --yes pip setuptools \
  # Of the packages' programs and tests nothing is needed; what debuggers want of their libraries neither.
  && find /opt/rosrv/bin -mindepth 1 ! -name 'python*' -delete \
  && find /opt/rosrv/lib -type d -name tests -prune -exec rm -rf {} + \
- && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} +
+ && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} + \
+ && find /opt/rosrv/lib -name direct_url.json -delete
 COPY appliance /opt/rosrv/lib/python3.11/site-packages/appliance
 RUN printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \
  && chmod 755 /opt/rosrv/bin/rosrv \
- && /opt/rosrv/bin/python -m compileall -q /opt/rosrv/lib/python3.11/site-packages/appliance
+ && find /opt/rosrv/lib -name __pycache__ -prune -exec rm -rf {} + \
+ && cd /opt/rosrv/lib/python3.11/site-packages \
+ && compile="/opt/rosrv/bin/python -m compileall -q --invalidation-mode unchecked-hash" \
+ && $compile appliance \
+ # Some packages carry templates that no interpreter takes; those are imported by nobody.
+ && { $compile . > /dev/null || true; }
 
 
 # --- the appliance ------------------------------------------------------------------------------------------------
 FROM ${BASE} AS appliance
 # iptables is the second back end of the firewall, for kernels without nftables; iproute2 finds out whether the kernel
 # has ESP; tini is the first process: it passes signals on and collects the dead. The rest is in packages.txt.
+# PINS: name=version of all that this brings (distribution/image-packages.lock). `make image` gives them, so that what is
+# released can be built again; who builds for himself gets Debian's newest.
+ARG PINS=""
 RUN apt-get update -q \
  && DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends \
         charon-systemd \
@@ -48,6 +59,7 @@ RUN apt-get update -q \
         rosout \
         strongswan-swanctl \
         tini \
+        ${PINS} \
  && apt-get clean \
  && rm -rf /var/lib/apt/lists/* /var/cache/* /var/log/* /usr/share/doc/*/changelog* /usr/share/man/* /tmp/* \
  # No program gives its caller more rights than he has.
@@ -79,8 +91,13 @@ HEALTHCHECK --interval=5s --timeout=5s --start-period=60s --retries=3 \
     CMD ["python", "-P", "-m", "appliance.cli.healthy"]
 ENTRYPOINT ["tini", "--"]
 CMD ["rosrv", "up"]
+ARG BASE
 ARG VERSION=0.1.0
+ARG REVISION=""
 LABEL org.opencontainers.image.title="ROSRV appliance" \
+      org.opencontainers.image.base.name="${BASE}" \
+      org.opencontainers.image.revision="${REVISION}" \
+      org.opencontainers.image.vendor="The ROSRV maintainers" \
       org.opencontainers.image.description="A network-security appliance for ROS 1 robots" \
       org.opencontainers.image.licenses="Apache-2.0" \
       org.opencontainers.image.version="${VERSION}"

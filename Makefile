@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system wheel package bench clean
+.PHONY: help setup demo check test test-system wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -40,6 +40,17 @@ wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.w
 package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package
 	$(BIN)/python -m distribution.deb amd64 arm64
+
+image: setup ## the container image and the list of its parts: dist/rosrv-image_VERSION_ARCH.tar, .cdx.json
+	$(BIN)/python -m distribution.image $(ARGS)
+
+site: setup ## all that a site without a network needs, in one archive: dist/rosrv-site_VERSION_ARCH.tar
+	$(BIN)/python -m distribution.site $(ARGS)
+
+release: ## everything anew, with provenance and checksums that KEY=FILE signs
+	rm -rf dist
+	$(MAKE) wheel package site
+	$(BIN)/python -m distribution.release "$(KEY)"
 
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done

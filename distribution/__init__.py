@@ -1,1 +1,1 @@
-"""The Debian package: how it is built (`deb`), what of the documentation goes into it as man pages (`man`)."""
+"""What is given to others: Debian packages (`deb`), the image (`image`), an archive (`site`), signed (`release`)."""

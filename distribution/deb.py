@@ -16,7 +16,8 @@ from pathlib import Path
 
 from appliance import __version__
 from appliance.supervisor.users import NUMERIC_IDS
-from distribution.environment import ARCHITECTURES, INTERPRETERS, ROOT, Architecture, make_environment
+from distribution.checkout import ROOT, facts, revision, time_of_commit
+from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment
 from distribution.man import write_pages
 
 HERE = ROOT / "distribution"
@@ -76,6 +77,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     shipped = root / "usr/share/rosrv"
     for folder in ("examples", "monitors", "policies"):
         _copy(ROOT / folder, shipped / folder)
+    (shipped / "build.json").write_text(facts("package", architecture.debian, revision(), moment))
     (shipped / "scripts").mkdir()
     shutil.copy(ROOT / "scripts/build-roscpp", shipped / "scripts")
     # Where the program looks, as in any environment that the wheel was installed to.
@@ -160,14 +162,9 @@ def main(arguments: list[str]) -> int:
     if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
         sys.stderr.write(f"package: version {__version__} is none of a package\n")
         return 1
-    said = subprocess.run(
-        ["git", "-c", f"safe.directory={ROOT}", "log", "-1", "--format=%ct"],
-        cwd=ROOT,
-        capture_output=True,
-        check=True,
-    )
+    moment = time_of_commit()
     for name in arguments:
-        made = build(ARCHITECTURES[name], moment=int(said.stdout))
+        made = build(ARCHITECTURES[name], moment=moment)
         sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
     return 0
 

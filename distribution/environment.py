@@ -16,7 +16,8 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from distribution.checkout import ROOT
+
 UV = ROOT / ".venv/bin/uv"
 PIP = ROOT / ".venv/bin/pip"
 INTERPRETERS = ("3.11", "3.12")  # of Debian 12 and of Ubuntu 24.04

@@ -1,11 +1,13 @@
-"""`rosrv version`: this version, its interpreter and its packages, as a report of a defect needs them."""
+"""`rosrv version`: this version, its build, interpreter and packages, as a report of a defect needs them."""
 
+import json
 import platform
 from importlib.metadata import distributions
 from typing import Any
 
 from appliance import __version__
 from appliance.cli.output import Json, say, say_json
+from appliance.cli.shipped import SHIPPED
 
 
 def version(as_json: Json = False) -> None:
@@ -23,8 +25,11 @@ def version(as_json: Json = False) -> None:
 
 def _facts() -> dict[str, Any]:
     packages = {found.name.lower(): found.version for found in distributions()}
+    build = SHIPPED / "build.json"
     return {
         "version": __version__,
+        # Of a package or an image: from which commit. A checkout and a wheel have none.
+        "build": json.loads(build.read_text()) if build.exists() else None,
         "python": platform.python_version(),
         "system": _system(),
         "kernel": platform.release(),

@@ -284,16 +284,23 @@ class Compose:
 @contextlib.contextmanager
 def images() -> Iterator[None]:
     """Have the images of the appliance and of the demonstration, built from this checkout as it is."""
+    with builder() as engine:
+        engine.build("appliance", APPLIANCE)
+        engine.build("demo", DEMO)
+        engine.docker("image", "prune", "--force", "--filter", "until=24h")
+    yield
+
+
+@contextlib.contextmanager
+def builder() -> Iterator[Engine]:
+    """An engine that only builds, and has the base of the images."""
     archive = base_archive()
     with Engine(builds=True) as engine:
         label = f"base={archive.stem}"
         known = engine.docker("images", "--quiet", "--filter", f"label={label}", BASE).stdout.strip()
         if not known:
             engine.docker("import", "--change", f"LABEL {label}", str(archive), BASE, timeout=300)
-        engine.build("appliance", APPLIANCE)
-        engine.build("demo", DEMO)
-        engine.docker("image", "prune", "--force", "--filter", "until=24h")
-    yield
+        yield engine
 
 
 def project(directory: Path) -> Path:

@@ -1,0 +1,253 @@
+"""`make image`: dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and every tool that reads OCI images.
+
+    python -m distribution.image [OPTIONS OF docker build …]
+
+The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. What it
+made is written anew: no time in it is later than the newest commit, so two builds of one commit are the same, byte by
+byte; and one layer is added, with the list of all that is in the image (`sbom`) and what it was built from.
+
+    python -m distribution.image lock BASE [OPTIONS …]     image-packages.lock anew, from what Debian has now
+"""
+
+import hashlib
+import io
+import json
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any
+
+from appliance import __version__
+from distribution.checkout import ROOT, facts, revision, time_of_commit
+from distribution.sbom import Tree, make_sbom
+
+NAME = f"rosrv/appliance:{__version__}"
+LOCK = ROOT / "distribution/image-packages.lock"
+SHARE = "opt/rosrv/share/rosrv"
+_LAYER = "application/vnd.oci.image.layer.v1.tar"
+_HEAD = (
+    "# The Debian packages of the image beside those of its base: python -m distribution.image lock BASE\n"
+)
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A part of the image, named by its digest; `file` holds it."""
+
+    file: Path
+    digest: str
+    size: int
+
+    def described(self, media_type: str) -> dict[str, Any]:
+        """As manifests refer to it."""
+        return {"mediaType": media_type, "digest": f"sha256:{self.digest}", "size": self.size}
+
+
+def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
+    """Build the image; `moment` (seconds since the epoch) is the latest time in it. The image's and its list's path.
+
+    Raises `subprocess.CalledProcessError`.
+    """
+    pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
+    _docker(
+        "build", "--target", "appliance", "--tag", NAME, "--build-arg", f"PINS={pins}",
+        "--build-arg", f"VERSION={__version__}", "--build-arg", f"REVISION={revision()}",
+        *options, str(ROOT),
+    )  # fmt: skip
+    folder = ROOT / "build"
+    folder.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="rosrv-image-", dir=folder) as work:
+        saved = Path(work) / "saved.tar"
+        _docker("save", "--output", str(saved), NAME)
+        return _write_anew(saved, Path(work), moment)
+
+
+def lock(base: str, build_options: list[str]) -> None:
+    """Write image-packages.lock: what the image has beside its base, which has what its digest says."""
+    options = ["--quiet", "--target", "appliance", str(ROOT)]
+    listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
+    before, after = (
+        set(_docker("run", "--rm", "--entrypoint", "sh", image, "-c", listed).splitlines())
+        for image in (base, _docker("build", *build_options, *options).strip())
+    )
+    LOCK.write_text(_HEAD + "\n".join(sorted(after - before)) + "\n")
+
+
+def _write_anew(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
+    tree = Tree()
+    with tarfile.open(saved) as archive:
+        entry = json.loads(_content(archive, "manifest.json"))[0]
+        config = json.loads(_content(archive, entry["Config"]))
+        layers = []
+        for number, name in enumerate(entry["Layers"]):
+            with archive.extractfile(name) as layer, tarfile.open(fileobj=layer) as members:  # type: ignore[union-attr]
+                layers.append(_layer(work / f"layer{number}", _kept(members, tree, moment)))
+    architecture = config["architecture"]
+    labels = config["config"]["Labels"]
+    commit, base = (labels[f"org.opencontainers.image.{name}"] for name in ("revision", "base.name"))
+    about = facts("image", architecture, commit, moment, base=base)
+    sbom = make_sbom(tree, architecture=architecture, moment=moment)
+    added = {f"{SHARE}/build.json": about, f"{SHARE}/sbom.cdx.json": sbom}
+    layers.append(_layer(work / "added", _files(added, moment)))
+    image = ROOT / "dist" / f"rosrv-image_{__version__}_{architecture}.tar"
+    image.parent.mkdir(exist_ok=True)
+    _write_oci(image, _settled(config, layers, moment), layers, moment)
+    listed = image.with_suffix(".cdx.json")
+    listed.write_text(sbom)
+    return image, listed
+
+
+def _kept(
+    members: tarfile.TarFile, tree: Tree, moment: int
+) -> Iterator[tuple[tarfile.TarInfo, IO[bytes] | None]]:
+    """The entries of a layer without what differs from one build to the next; `tree` is told of each."""
+    for member in members:
+        member.mtime = min(int(member.mtime), moment)
+        member.pax_headers = {
+            key: value for key, value in member.pax_headers.items() if key not in ("mtime", "atime", "ctime")
+        }
+        content = members.extractfile(member) if member.isreg() else None
+        if content is not None and tree.wants(member.name):
+            data = content.read()
+            tree.add(member.name, data)
+            content = io.BytesIO(data)
+        else:
+            tree.add(member.name, b"", link=member.linkname if member.issym() else "")
+        yield member, content
+
+
+def _files(texts: dict[str, str], moment: int) -> Iterator[tuple[tarfile.TarInfo, IO[bytes] | None]]:
+    for folder in sorted(
+        {str(parent) for name in texts for parent in Path(name).parents if parent.parts[2:]}
+    ):
+        entry = tarfile.TarInfo(folder)
+        entry.type, entry.mode, entry.mtime = tarfile.DIRTYPE, 0o755, moment
+        yield entry, None
+    for name, text in texts.items():
+        entry = tarfile.TarInfo(name)
+        entry.size, entry.mode, entry.mtime = len(text.encode()), 0o644, moment
+        yield entry, io.BytesIO(text.encode())
+
+
+def _layer(path: Path, entries: Iterable[tuple[tarfile.TarInfo, IO[bytes] | None]]) -> Blob:
+    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as layer:
+        for entry, content in entries:
+            layer.addfile(entry, content)
+    return _blob(path)
+
+
+def _blob(path: Path) -> Blob:
+    with path.open("rb") as file:
+        return Blob(path, hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
+
+
+def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
+    """The configuration for these layers, without what only the building engine knows."""
+    created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
+    history = [{**step, "created": created} for step in config["history"]]
+    history.append(
+        {"created": created, "created_by": "distribution/image.py: what is in it, what it was built from"}
+    )
+    kept = (
+        "Env",
+        "Entrypoint",
+        "Cmd",
+        "WorkingDir",
+        "Volumes",
+        "ExposedPorts",
+        "StopSignal",
+        "Healthcheck",
+        "Labels",
+    )
+    return {
+        "created": created,
+        "architecture": config["architecture"],
+        "os": config["os"],
+        "config": {key: config["config"][key] for key in kept if config["config"].get(key)},
+        "rootfs": {"type": "layers", "diff_ids": [f"sha256:{layer.digest}" for layer in layers]},
+        "history": history,
+    }
+
+
+def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: int) -> None:
+    """An OCI layout as one archive, with the manifest.json that every `docker load` knows."""
+    folder = layers[0].file.parent
+
+    def document(name: str, content: Any) -> Blob:
+        path = folder / name
+        path.write_text(json.dumps(content, sort_keys=True, separators=(",", ":")))
+        return _blob(path)
+
+    configuration = document("config", config)
+    annotations = config["config"]["Labels"]
+    manifest = document("manifest", {
+        "schemaVersion": 2,
+        "mediaType": "application/vnd.oci.image.manifest.v1+json",
+        "config": configuration.described("application/vnd.oci.image.config.v1+json"),
+        "layers": [layer.described(_LAYER) for layer in layers],
+        "annotations": annotations,
+    })  # fmt: skip
+    entry = manifest.described("application/vnd.oci.image.manifest.v1+json")
+    entry["annotations"] = {
+        "io.containerd.image.name": f"docker.io/{NAME}",
+        "org.opencontainers.image.ref.name": __version__,
+    }
+    index = document("index", {"schemaVersion": 2, "manifests": [entry]})
+    legacy = document("legacy", [{
+        "Config": f"blobs/sha256/{configuration.digest}", "RepoTags": [NAME, "rosrv/appliance:latest"],
+        "Layers": [f"blobs/sha256/{layer.digest}" for layer in layers],
+    }])  # fmt: skip
+    layout = document("layout", {"imageLayoutVersion": "1.0.0"})
+    parts = {f"blobs/sha256/{blob.digest}": blob for blob in (*layers, configuration, manifest)}
+    parts |= {"index.json": index, "manifest.json": legacy, "oci-layout": layout}
+    with tarfile.open(image, "w", format=tarfile.PAX_FORMAT) as archive:
+        for name, blob in sorted(parts.items()):
+            member = tarfile.TarInfo(name)
+            member.size, member.mode, member.mtime = blob.size, 0o644, moment
+            with blob.file.open("rb") as content:
+                archive.addfile(member, content)
+
+
+def _content(archive: tarfile.TarFile, name: str) -> bytes:
+    member = archive.extractfile(name)
+    assert member is not None, name  # noqa: S101  the engine has written it
+    return member.read()
+
+
+def _docker(*arguments: str) -> str:
+    done = subprocess.run(
+        ["docker", *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, check=True
+    )
+    return done.stdout
+
+
+def attempt(options: list[str]) -> tuple[Path, ...]:
+    """`build`, and what came of it in words; nothing when the engine refused."""
+    try:
+        made = build(options, moment=time_of_commit())
+    except FileNotFoundError:
+        sys.stderr.write("image: there is no docker: sudo apt-get install docker.io\n")
+        return ()
+    except subprocess.CalledProcessError as error:
+        sys.stderr.write(f"image: docker {error.cmd[1]} ended with status {error.returncode}\n")
+        return ()
+    for path in made:
+        sys.stdout.write(f"{path.relative_to(ROOT)}\n")
+    return made
+
+
+def main(arguments: list[str]) -> int:
+    """Build the image, or with `lock` the list of its packages anew; the exit status."""
+    if arguments[:1] == ["lock"]:
+        lock(arguments[1], arguments[2:])
+        return 0
+    return 0 if attempt(arguments) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

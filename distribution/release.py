@@ -1,0 +1,90 @@
+"""`make release KEY=FILE`: what dist/ has, with its provenance, checksums and a signature of them.
+
+    provenance.json   what each file was built from (an in-toto statement, SLSA provenance 1)
+    SHA256SUMS        of every file, as `sha256sum --check` reads them
+    SHA256SUMS.sig    ECDSA P-256 over SHA256SUMS, as `cosign verify-blob` and `openssl dgst` check it
+
+The key is the releasing person's (`openssl ecparam -name prime256v1 -genkey -noout`); the public half is given to
+sites on a way of its own. The target builds everything anew before it signs, so that all is of one commit.
+"""
+
+import base64
+import hashlib
+import json
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from appliance import __version__
+from distribution.checkout import ROOT, revision, time_of_commit
+
+_OWN = ("provenance.json", "SHA256SUMS", "SHA256SUMS.sig")
+_MATERIALS = ("requirements.lock", "requirements-dev.lock", "distribution/image-packages.lock", "Dockerfile")
+
+
+def release(folder: Path, key: Path) -> None:
+    """Write the three files to `folder`. Raises `ValueError` where the key is none or there is nothing to sign."""
+    private = load_pem_private_key(key.read_bytes(), password=None)
+    if not isinstance(private, ec.EllipticCurvePrivateKey) or private.curve.name != "secp256r1":
+        raise ValueError(f"{key} is no private key of the curve P-256")
+    files = {
+        path.name: _digest(path)
+        for path in sorted(folder.iterdir())
+        if path.is_file() and path.name not in _OWN
+    }
+    if not files:
+        raise ValueError(f"{folder} has nothing to sign: make package, make wheel, make image")
+    provenance = folder / "provenance.json"
+    provenance.write_text(json.dumps(_provenance(files), indent=2) + "\n")
+    sums = "".join(
+        f"{digest}  {name}\n" for name, digest in (files | {provenance.name: _digest(provenance)}).items()
+    )
+    (folder / "SHA256SUMS").write_text(sums)
+    signature = private.sign(sums.encode(), ec.ECDSA(SHA256()))
+    (folder / "SHA256SUMS.sig").write_text(base64.b64encode(signature).decode() + "\n")
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _provenance(files: dict[str, str]) -> dict[str, object]:
+    moment = datetime.fromtimestamp(time_of_commit(), UTC).isoformat().replace("+00:00", "Z")
+    return {
+        "_type": "https://in-toto.io/Statement/v1",
+        "subject": [{"name": name, "digest": {"sha256": digest}} for name, digest in files.items()],
+        "predicateType": "https://slsa.dev/provenance/v1",
+        "predicate": {
+            "buildDefinition": {
+                "buildType": "urn:rosrv:make-release:1",
+                "externalParameters": {"version": __version__},
+                "resolvedDependencies": [
+                    {"name": "rosrv", "digest": {"gitCommit": revision()}},
+                    *({"name": name, "digest": {"sha256": _digest(ROOT / name)}} for name in _MATERIALS),
+                ],
+            },
+            "runDetails": {"builder": {"id": "distribution/release.py"}, "metadata": {"startedOn": moment}},
+        },
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Sign what is in dist/; exit status 1 with words when that is not possible, 2 without a key."""
+    if len(arguments) != 1 or not arguments[0]:
+        sys.stderr.write("release: give the file of the private key: make release KEY=FILE\n")
+        return 2
+    try:
+        release(ROOT / "dist", Path(arguments[0]))
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"release: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

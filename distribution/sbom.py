@@ -1,0 +1,138 @@
+"""What is in the image, as CycloneDX: Debian's packages, Python's, those of the console, each with its licences.
+
+It is made from the image's files, not from what was asked for: from dpkg's own list, from the metadata of each Python
+package, from the console's manifest.
+"""
+
+import json
+import posixpath
+import re
+import uuid
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from email import message_from_string
+from fnmatch import fnmatchcase
+
+from cyclonedx.factory.license import LicenseFactory
+from cyclonedx.model.bom import Bom, BomMetaData
+from cyclonedx.model.component import Component, ComponentType
+from cyclonedx.model.license import License
+from cyclonedx.output.json import JsonV1Dot6
+from packageurl import PackageURL
+
+from appliance import __version__
+
+SYSTEM = "debian-12"
+_PYTHON = "opt/rosrv/lib/python3*/site-packages/"
+_DPKG = "var/lib/dpkg/status"
+_MANIFEST = f"{_PYTHON}appliance/api/console/vendor/manifest.json"
+_READ = (_DPKG, "usr/share/doc/*/copyright", f"{_PYTHON}*.dist-info/METADATA", _MANIFEST)
+_LICENCE = re.compile(r"^License:[ \t]*(\S[^\n]*)$", re.MULTILINE)
+_COMMON = re.compile(r"/usr/share/common-licenses/([A-Za-z0-9.-]*[A-Za-z0-9])")
+
+
+class Tree:
+    """The files of an image, layer after layer: the text of those that tell what is in it."""
+
+    def __init__(self) -> None:
+        self.texts: dict[str, str] = {}
+        self._links: dict[str, str] = {}
+
+    def wants(self, name: str) -> bool:
+        """Whether the content of this file must be given to `add`."""
+        name = name.removeprefix("./")
+        return any(fnmatchcase(name, pattern) for pattern in _READ)
+
+    def add(self, name: str, data: bytes, *, link: str = "") -> None:
+        """An entry of the next layer; `link` is what a symbolic link points to."""
+        name = name.removeprefix("./")
+        folder, _, last = name.rpartition("/")
+        if last.startswith(".wh."):
+            gone = f"{folder}/{last.removeprefix('.wh.')}"
+            self.texts = {
+                path: text for path, text in self.texts.items() if not f"{path}/".startswith(f"{gone}/")
+            }
+        elif self.wants(name) and data:
+            self.texts[name] = data.decode(errors="replace")
+        elif link:
+            self._links[name] = posixpath.normpath(posixpath.join(folder, link))
+
+    def copyright(self, package: str) -> str:
+        """What Debian says of a package's licences; "" where it says nothing."""
+        folder = f"usr/share/doc/{package}"
+        return self.texts.get(f"{self._links.get(folder, folder)}/copyright", "")
+
+    def matching(self, pattern: str) -> Iterator[str]:
+        """The texts of all files of this name, in the order of their names."""
+        return (self.texts[name] for name in sorted(self.texts) if fnmatchcase(name, pattern))
+
+
+def make_sbom(tree: Tree, *, architecture: str, moment: int) -> str:
+    """The list as JSON, the same for the same tree; `moment` in seconds since the epoch."""
+    itself = Component(
+        name="rosrv/appliance", version=__version__, type=ComponentType.CONTAINER, bom_ref="rosrv/appliance",
+        licenses=_licences(["Apache-2.0"]),
+        purl=PackageURL("oci", None, "appliance", __version__, {"arch": architecture}),
+    )  # fmt: skip
+    parts = [*_debian(tree), *_python(tree), *_console(tree)]
+    bom = Bom(
+        components=parts,
+        serial_number=uuid.uuid5(uuid.NAMESPACE_OID, "\n".join(sorted(str(part.purl) for part in parts))),
+        metadata=BomMetaData(component=itself, timestamp=datetime.fromtimestamp(moment, UTC)),
+    )
+    bom.register_dependency(itself, parts)
+    return JsonV1Dot6(bom).output_as_string(indent=2) + "\n"
+
+
+def _part(
+    purl: PackageURL, licences: Iterable[str], kind: ComponentType = ComponentType.LIBRARY
+) -> Component:
+    name = f"{purl.namespace}/{purl.name}" if purl.type == "npm" and purl.namespace else purl.name
+    return Component(
+        name=name, version=purl.version, type=kind, bom_ref=str(purl), purl=purl, licenses=_licences(licences)
+    )
+
+
+def _licences(names: Iterable[str]) -> list[License]:
+    """As CycloneDX wants them: one expression, or a list of single ones."""
+    factory = LicenseFactory()
+    made = [factory.make_from_string(name) for name in sorted(set(names))]
+    return made if len(made) == 1 else [factory.make_with_name(name) for name in sorted(set(names))]
+
+
+def _debian(tree: Tree) -> Iterator[Component]:
+    for stanza in tree.texts[_DPKG].strip().split("\n\n"):
+        fields = message_from_string(stanza)
+        if fields["Status"] != "install ok installed":
+            continue
+        qualifiers = {"arch": fields["Architecture"], "distro": SYSTEM}
+        purl = PackageURL("deb", "debian", fields["Package"], fields["Version"], qualifiers)
+        text = tree.copyright(fields["Package"])
+        # In Debian's own format, or in words that name the common ones.
+        found = _LICENCE.findall(text) if "Format:" in text else _COMMON.findall(text)
+        yield _part(purl, found or [f"see /usr/share/doc/{fields['Package']}/copyright"])
+
+
+def _python(tree: Tree) -> Iterator[Component]:
+    for text in tree.matching(f"{_PYTHON}*.dist-info/METADATA"):
+        fields = message_from_string(text)
+        classified = [
+            one.rpartition(" :: ")[2]
+            for one in fields.get_all("Classifier", [])
+            if one.startswith("License ::")
+        ]
+        said = fields["License-Expression"] or fields["License"] or ""
+        licences = [said] if said and "\n" not in said else classified
+        purl = PackageURL("pypi", None, re.sub(r"[-_.]+", "-", fields["Name"]).lower(), fields["Version"])
+        yield _part(purl, licences)
+    yield _part(PackageURL("generic", None, "rosrv", __version__), ["Apache-2.0"], ComponentType.APPLICATION)
+
+
+def _console(tree: Tree) -> Iterator[Component]:
+    for text in tree.matching(_MANIFEST):
+        packages = [package for file in json.loads(text)["files"].values() for package in file["packages"]]
+        for name, version, licence in sorted(
+            {(one["name"], one["version"], one["licence"]) for one in packages}
+        ):
+            namespace, _, last = name.rpartition("/")
+            yield _part(PackageURL("npm", namespace or None, last, version), [licence])

@@ -1,0 +1,154 @@
+"""`make site`: the image as it is released, its list of parts, and the archive for a site without a network."""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+
+from appliance import __version__
+from distribution.checkout import ROOT
+from tests.support.docker import BASE, Engine, builder
+
+pytestmark = pytest.mark.timeout(1800)  # the image is built
+NAME = f"rosrv/appliance:{__version__}"
+OPTIONS = ("--network", "host", "--build-arg", f"BASE={BASE}")
+INSIDE = """\
+from importlib.metadata import distributions
+import re
+for found in distributions():
+    print(re.sub(r"[-_.]+", "-", found.name).lower(), found.version)
+"""
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    """One that has the base."""
+    with builder() as engine:
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def unpacked(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The archive, built by the one command, and unpacked; its image is in the engine, loaded from there."""
+    command = [sys.executable, "-m", "distribution.site", *OPTIONS]
+    environment = os.environ | {"DOCKER_HOST": engine.address}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    folder = tmp_path_factory.mktemp("site")
+    subprocess.run(
+        ["tar", "--extract", "--file", str(ROOT / done.stdout.split()[-1])], cwd=folder, check=True
+    )
+    engine.docker("rmi", "--force", NAME)
+    engine.docker("load", "--input", str(next(folder.glob("*/rosrv-image_*.tar"))), timeout=300)
+    return folder / f"rosrv-{__version__}"
+
+
+@pytest.fixture(scope="module")
+def parts(unpacked: Path) -> list[dict[str, Any]]:
+    """The components of the list."""
+    components: list[dict[str, Any]] = json.loads(next(unpacked.glob("*.cdx.json")).read_text())["components"]
+    return components
+
+
+def run(engine: Engine, *command: str, text: str = "") -> str:
+    """What a program of the image says; without a network."""
+    options = ("run", "--rm", "--interactive", "--network", "none", "--entrypoint", command[0], NAME)
+    return engine.docker(*options, *command[1:], text=text).stdout
+
+
+def of(parts: list[dict[str, Any]], kind: str) -> set[tuple[str, str]]:
+    """Names and versions of the components of a kind."""
+    return {(one["name"], one["version"]) for one in parts if one["purl"].startswith(f"pkg:{kind}/")}
+
+
+def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[dict[str, Any]]) -> None:
+    """What dpkg and Python say in the running image is what the list has, no more and no less."""
+    listed = run(engine, "dpkg-query", "--show", "--showformat", "${Package} ${Version}\\n")
+    assert {tuple(line.split()) for line in listed.splitlines()} == of(parts, "deb")
+    installed = run(engine, "/opt/rosrv/bin/python", "-P", "-", text=INSIDE)
+    assert {tuple(line.split()) for line in installed.splitlines()} == of(parts, "pypi")
+    manifest = json.loads((ROOT / "appliance/api/console/vendor/manifest.json").read_text())
+    bundled = {
+        (one["name"], one["version"]) for file in manifest["files"].values() for one in file["packages"]
+    }
+    assert of(parts, "npm") == bundled
+
+
+def test_every_part_has_a_licence(parts: list[dict[str, Any]]) -> None:
+    """As an identifier, an expression, a name, or the file in the image that says it."""
+    assert [one["name"] for one in parts if not one.get("licenses")] == []
+    unread = [one["name"] for one in parts if "see /usr/share/doc" in json.dumps(one["licenses"])]
+    assert len(unread) < 10, unread
+
+
+def test_the_list_is_what_its_format_says(unpacked: Path) -> None:
+    """By the schema of CycloneDX 1.6."""
+    folder = files("cyclonedx.schema._res")
+    names = [f"{name}.SNAPSHOT.schema.json" for name in ("bom-1.6", "spdx", "jsf-0.82")]
+    schemas = {name: json.loads((folder / name).read_text()) for name in names}
+    registry = jsonschema_rs.Registry(
+        [(f"http://cyclonedx.org/schema/{name}", one) for name, one in schemas.items()]
+    )
+    validator = jsonschema_rs.Draft7Validator(schemas[names[0]], registry=registry)
+    found = json.loads(next(unpacked.glob("*.cdx.json")).read_text())
+    assert [str(error.message) for error in validator.iter_errors(found)] == []
+
+
+def test_it_says_what_it_is(engine: Engine, unpacked: Path) -> None:
+    """Its annotations and `rosrv version --json` name version and commit; the list is in the image, too."""
+    labels = engine.inspect(NAME)["Config"]["Labels"]
+    build = json.loads(run(engine, "rosrv", "version", "--json"))["build"]
+    assert build["kind"] == "image"
+    assert (build["version"], build["commit"]) == (__version__, labels["org.opencontainers.image.revision"])
+    assert labels["org.opencontainers.image.version"] == __version__
+    inside = run(engine, "cat", "/opt/rosrv/share/rosrv/sbom.cdx.json")
+    assert inside == next(unpacked.glob("*.cdx.json")).read_text()
+
+
+def test_the_packages_are_those_of_the_lock(parts: list[dict[str, Any]]) -> None:
+    """Each package that was pinned is in the image with its version."""
+    lock = (ROOT / "distribution/image-packages.lock").read_text().splitlines()
+    pinned = {tuple(line.split("=", 1)) for line in lock if not line.startswith("#")}
+    assert len(pinned) > 50
+    assert pinned <= of(parts, "deb")
+
+
+def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
+    """Its checksums hold; compose files, policies, monitors and pages are in it."""
+    done = subprocess.run(
+        ["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=unpacked, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, b"")
+    named = {line.split("  ")[1] for line in (unpacked / "SHA256SUMS").read_text().splitlines()}
+    assert named == {str(path.relative_to(unpacked)) for path in unpacked.rglob("*") if path.is_file()} - {
+        "SHA256SUMS"
+    }
+    assert named >= {
+        "compose.yaml",
+        "compose.host.yaml",
+        "policies/containers.ini",
+        "docs/air-gapped.md",
+        "LICENSE",
+    }
+
+
+def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
+    """Who builds the same commit, with nothing of the first build, gets the same image, byte by byte."""
+    first = shutil.copy(next(unpacked.glob("rosrv-image_*.tar")), tmp_path)
+    command = [sys.executable, "-m", "distribution.image", "--no-cache", *OPTIONS]
+    environment = os.environ | {"DOCKER_HOST": engine.address}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    digests = {
+        hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in (first, ROOT / done.stdout.split()[0])
+    }
+    assert len(digests) == 1
