@@ -53,9 +53,10 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
     Raises `subprocess.CalledProcessError`.
     """
+    # Nothing is taken from an earlier build: what was made before the commit would keep its own times.
     pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
     _docker(
-        "build", "--target", "appliance", "--tag", NAME, "--build-arg", f"PINS={pins}",
+        "build", "--no-cache", "--target", "appliance", "--tag", NAME, "--build-arg", f"PINS={pins}",
         "--build-arg", f"VERSION={__version__}", "--build-arg", f"REVISION={revision()}",
         *options, str(ROOT),
     )  # fmt: skip

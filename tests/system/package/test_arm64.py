@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from distribution.environment import ARCHITECTURES, INTERPRETERS, ROOT, make_environment
+from distribution.checkout import ROOT
+from distribution.environment import ARCHITECTURES, INTERPRETERS, make_environment
 from tests.support.requirements import need_program
 
 pytestmark = pytest.mark.timeout(900)

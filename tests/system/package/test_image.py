@@ -144,7 +144,7 @@ def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
     """Who builds the same commit, with nothing of the first build, gets the same image, byte by byte."""
     first = shutil.copy(next(unpacked.glob("rosrv-image_*.tar")), tmp_path)
-    command = [sys.executable, "-m", "distribution.image", "--no-cache", *OPTIONS]
+    command = [sys.executable, "-m", "distribution.image", *OPTIONS]
     environment = os.environ | {"DOCKER_HOST": engine.address}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
