@@ -33,7 +33,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
     home = tmp_path_factory.mktemp("master")
     with (
         Lab("rosrv-test") as lab,
-        Stage(lab, ROOT / "examples") as stage,
+        Stage(lab, ROOT) as stage,
         PlainMaster(home, stage.appliance_host) as master,
     ):
         assert master.master_uri == MASTER_URI
