@@ -102,14 +102,17 @@ class _Connection(Front):
         self.allow(self.limits.head_seconds if begun else self.limits.idle_seconds)
         self.visitors.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
-    def reject(self, status: bytes, _what: str) -> None:
-        """Say no more than the status; who sends a head without end is cut off."""
-        if not status.startswith(b"400"):
-            self.abort()
-            return
+    def reject(self, _status: bytes, what: str) -> None:
+        """Say what was wrong, and read nothing more. Closed at once, the answer would be lost with what is unread."""
         self.closing = True
-        self.transport.write(b"HTTP/1.1 %b\r\nContent-Length: 0\r\nConnection: close\r\n\r\n" % status)
-        self.transport.close()
+        self.transport.pause_reading()
+        said = f"The peer {what}.\n".encode()
+        head = "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"
+        self.transport.write(
+            f"{head}Content-Length: {len(said)}\r\nConnection: close\r\n\r\n".encode() + said
+        )
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
         self.allow(self.limits.linger_seconds)
 
 
