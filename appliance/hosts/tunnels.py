@@ -64,7 +64,9 @@ class Tunnels:
         # Of the last statement: greater than any of an earlier life, which charon's process may still report.
         self._number = time.time_ns()
         self._wake = asyncio.Event()
-        self._taken_number = 0
+        self._changes = 0  # that charon is to be told
+        self._stated: dict[int, int] = {}  # statements on their way, by number: which change they have last
+        self._taken_changes = 0
         self._tasks: set[asyncio.Task[None]] = set()
 
     # --- the supervisor ---
@@ -124,6 +126,7 @@ class Tunnels:
 
     def state_anew(self) -> None:
         """Tell charon what it is to have, soon."""
+        self._changes += 1
         self._dirty.set()
 
     async def run(self) -> None:
@@ -146,10 +149,10 @@ class Tunnels:
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
-        """Wait until charon has what is stated after now; False when it does not come in time."""
-        wanted = self._number + 1
+        """Wait until charon has what `state_anew` was called for; False when it does not come in time."""
+        wanted = self._changes
         deadline = time.monotonic() + _TAKEN_SECONDS
-        while self._taken_number < wanted:
+        while self._taken_changes < wanted:
             self._wake.clear()
             try:
                 await asyncio.wait_for(self._wake.wait(), deadline - time.monotonic())
@@ -170,6 +173,7 @@ class Tunnels:
             if row.expires > now
         ]
         self._number += 1
+        self._stated[self._number] = self._changes
         message = messages.TunnelsStated(
             self._number, esp, self._table.own_address, authority, certificate, revocations, hosts
         )
@@ -201,7 +205,8 @@ class Tunnels:
                 )
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                self._taken_number = taken
+                for number in [one for one in self._stated if one <= taken]:
+                    self._taken_changes = self._stated.pop(number)
                 self._wake.set()
 
     def _spawn(self, request: bytes) -> None:
