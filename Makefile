@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system wheel package image site release bench clean
+.PHONY: help setup demo check test test-system test-package wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -33,6 +33,11 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
 	$(PYTEST) tests/system --quiet --durations=15
+
+test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
+	@scripts/setup --system
+	@scripts/setup --package
+	$(PYTEST) tests/package --quiet --durations=15
 
 wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl
 	$(BIN)/python -m hatchling build --target wheel

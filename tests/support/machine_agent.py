@@ -38,7 +38,7 @@ def _run(argv: list[str], seconds: float, root: str) -> tuple[int, str]:
         "HOME": "/root",
         "LANG": "C.UTF-8",
         "CI": "true",
-        "ROSRV_TEST_PATIENCE": "4",
+        "TESTS_PATIENCE": "4",
     }
     process = subprocess.Popen(
         argv,

@@ -16,7 +16,7 @@ from typing import Any, Protocol, Self
 
 Event = dict[str, Any]
 # Seconds; generous, the machine may be busy. A machine that is known to be slow (an emulated one) asks for more.
-LIMIT = 30.0 * float(os.environ.get("ROSRV_TEST_PATIENCE", "1"))
+LIMIT = 30.0 * float(os.environ.get("TESTS_PATIENCE", "1"))
 
 
 class Host(Protocol):

@@ -13,7 +13,8 @@ TESTS = Path(__file__).parents[1]
 def test_every_test_that_is_named_exists(page: str) -> None:
     """Each test in the tables is a function of that name in that file."""
     named = re.findall(
-        r"`((?:unit|integration|system)/[\w/]+\.py)(?:::(\w+))?`", (TESTS.parent / "docs" / page).read_text()
+        r"`((?:unit|integration|system|package)/[\w/]+\.py)(?:::(\w+))?`",
+        (TESTS.parent / "docs" / page).read_text(),
     )
     assert len(named) > 40
     missing = [f"{path}::{name}" for path, name in named if not _has(TESTS / path, name)]

@@ -1,4 +1,4 @@
-"""Tests of what the wheel says of itself: bounds, version, what it brings (installed: tests/system/package)."""
+"""Tests of what the wheel says of itself: bounds, version, what it brings (installed: tests/package)."""
 
 import re
 import subprocess

@@ -25,9 +25,9 @@ class Site:
         return self.engine.story()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def site() -> Iterator[Site]:
-    """The engine, with the images built from this checkout."""
+    """The engine, with the images built from this checkout; its data is for one, so it ends with the module."""
     need_root()
     with images(), Lab("rosrv-engine") as lab:
         machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")

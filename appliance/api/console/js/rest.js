@@ -41,7 +41,7 @@ export async function send(method, path, { query, json, text, match, token, head
   }
   if (response.ok) return response;
   const problem = await problemOf(response);
-  if (problem.status === 401 && !token && holder === session.get().current?.token) end(problem.message);
+  if (problem.status === 401 && !token && holder && holder === session.get().current?.token) end(problem.message);
   throw problem;
 }
 

@@ -14,7 +14,7 @@ import pytest
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 pytestmark = pytest.mark.timeout(600)
 

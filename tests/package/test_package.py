@@ -56,7 +56,7 @@ def newer(package: Path, tmp_path: Path) -> Path:
     control.write_text(control.read_text().replace("Version: 0.1.0", "Version: 0.1.1"))
     made = tmp_path / "rosrv_0.1.1_amd64.deb"
     # As the package itself is compressed: xz takes minutes, which are missing to the machine.
-    build = ["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", str(tree), str(made)]
+    build = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-z1", "--build", str(tree), str(made)]
     subprocess.run(build, check=True, capture_output=True)
     return made
 
