@@ -3,8 +3,8 @@
     python -m distribution.image [OPTIONS OF docker build …]
 
 The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. What it
-made is written anew: no time in it is later than the newest commit, so two builds of one commit are the same, byte by
-byte; and one layer is added, with the list of all that is in the image (`sbom`) and what it was built from.
+made is written anew: no time in it is later than the newest commit, so that two builds of one commit can be equal,
+and one layer is added, with the list of all that is in the image (`sbom`) and what it was built from.
 
     python -m distribution.image lock BASE [OPTIONS …]     image-packages.lock anew, from what Debian has now
 """
