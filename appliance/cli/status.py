@@ -162,5 +162,6 @@ def _isolation(body: Status) -> str:
     if body.isolation == "none":
         return "none: NO FIREWALL, every user of this machine reaches the ROS Master"
     back_end = body.firewall.backend or "no back end reported"
-    walled = ", processes walled in" if lacking_walls(body.processes) is None else ""
+    told = all(row.walls for row in body.processes if row.role != "supervisor")
+    walled = ", processes walled in" if told and lacking_walls(body.processes) is None else ""
     return f"{body.isolation}, firewall {back_end}, probe {body.probe or 'not run yet'}{walled}"

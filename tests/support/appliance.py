@@ -153,6 +153,17 @@ class Appliance:
             assert certificate.read_text() == served
         return Rest(url, token or self.ready["token"], certificate)
 
+    def processes(self) -> dict[str, dict[str, Any]]:
+        """The row of each role in `rosrv status`, once every process has said what walls it is in."""
+
+        def told() -> dict[str, dict[str, Any]] | None:
+            rows = self.status()["processes"]
+            if any(not row["walls"] and row["role"] != "supervisor" for row in rows):
+                return None
+            return {row["role"]: row for row in rows}
+
+        return eventually(told, self.story)
+
     def pids(self, role: str) -> list[int]:
         """The process ids of a role, by `rosrv status`."""
         return [row["pid"] for row in self.status()["processes"] if row["role"] == role]

@@ -70,8 +70,8 @@ def test_there_is_something_to_find(appliance: Appliance) -> None:
 def test_who_is_ended_first_when_memory_ends(appliance: Appliance) -> None:
     """What strangers can flood and the others can do without goes first; the supervisor and the signer last."""
     scores = {
-        row["role"]: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
-        for row in appliance.status()["processes"]
+        role: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
+        for role, row in appliance.processes().items()
     }
     own = scores["supervisor"]
     assert scores["api"] > scores["relay"] > scores["control"] > own

@@ -207,7 +207,7 @@ def test_status_shows_the_walls() -> None:
     need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
-        rows = {row["role"]: row for row in running.status()["processes"]}
+        rows = running.processes()
         rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
     abi = landlock.version()
     for name in ("signer", "relay", "control", "api"):

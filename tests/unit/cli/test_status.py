@@ -5,6 +5,7 @@ import io
 import time
 from typing import Any
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -129,6 +130,9 @@ def test_what_a_kernel_lacks_of_the_walls_is_shown(
     """Where all stand that is said in two words; else the first that is lacking is named, and how many more."""
     shown = body()
     assert any("processes walled in" in line for line in screen(monkeypatch, capsys, 80, shown))
+    starting = body()
+    starting.processes[-1] = msgspec.structs.replace(starting.processes[-1], walls="")
+    assert "walled in" not in "\n".join(screen(monkeypatch, capsys, 100, starting)), "one has not said it yet"
     for row in shown.processes[2:4]:
         row.lacks.append("no Landlock")
     lines = "\n".join(screen(monkeypatch, capsys, 100, shown))
