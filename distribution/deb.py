@@ -15,6 +15,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from appliance import __version__
+from appliance.inventory import RUNS
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.checkout import ROOT, facts, revision, time_of_commit
 from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment
@@ -23,11 +24,6 @@ from distribution.man import write_pages
 HERE = ROOT / "distribution"
 LIBRARY = "usr/lib/rosrv"
 _TOOLS = {"dh_installsystemd": "debhelper", "dpkg-buildpackage": "dpkg-dev", "lintian": "lintian"}
-# Of packages.txt: what runs on the robot's machine.
-RUNS = (
-    "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",
-    "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
-)  # fmt: skip
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
 import os

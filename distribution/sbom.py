@@ -21,14 +21,13 @@ from cyclonedx.output.json import JsonV1Dot6
 from packageurl import PackageURL
 
 from appliance import __version__
+from appliance.inventory import debian_licences, debian_packages, python_licences
 
 SYSTEM = "debian-12"
 _PYTHON = "opt/rosrv/lib/python3*/site-packages/"
 _DPKG = "var/lib/dpkg/status"
 _MANIFEST = f"{_PYTHON}appliance/api/console/vendor/manifest.json"
 _READ = (_DPKG, "usr/share/doc/*/copyright", f"{_PYTHON}*.dist-info/METADATA", _MANIFEST)
-_LICENCE = re.compile(r"^License:[ \t]*(\S[^\n]*)$", re.MULTILINE)
-_COMMON = re.compile(r"/usr/share/common-licenses/([A-Za-z0-9.-]*[A-Za-z0-9])")
 
 
 class Tree:
@@ -101,30 +100,18 @@ def _licences(names: Iterable[str]) -> list[License]:
 
 
 def _debian(tree: Tree) -> Iterator[Component]:
-    for stanza in tree.texts[_DPKG].strip().split("\n\n"):
-        fields = message_from_string(stanza)
-        if fields["Status"] != "install ok installed":
-            continue
+    for fields in debian_packages(tree.texts[_DPKG]):
+        name = fields["Package"]
         qualifiers = {"arch": fields["Architecture"], "distro": SYSTEM}
-        purl = PackageURL("deb", "debian", fields["Package"], fields["Version"], qualifiers)
-        text = tree.copyright(fields["Package"])
-        # In Debian's own format, or in words that name the common ones.
-        found = _LICENCE.findall(text) if "Format:" in text else _COMMON.findall(text)
-        yield _part(purl, found or [f"see /usr/share/doc/{fields['Package']}/copyright"])
+        licences = debian_licences(tree.copyright(name)) or [f"see /usr/share/doc/{name}/copyright"]
+        yield _part(PackageURL("deb", "debian", name, fields["Version"], qualifiers), licences)
 
 
 def _python(tree: Tree) -> Iterator[Component]:
     for text in tree.matching(f"{_PYTHON}*.dist-info/METADATA"):
         fields = message_from_string(text)
-        classified = [
-            one.rpartition(" :: ")[2]
-            for one in fields.get_all("Classifier", [])
-            if one.startswith("License ::")
-        ]
-        said = fields["License-Expression"] or fields["License"] or ""
-        licences = [said] if said and "\n" not in said else classified
         purl = PackageURL("pypi", None, re.sub(r"[-_.]+", "-", fields["Name"]).lower(), fields["Version"])
-        yield _part(purl, licences)
+        yield _part(purl, python_licences(fields))
     yield _part(PackageURL("generic", None, "rosrv", __version__), ["Apache-2.0"], ComponentType.APPLICATION)
 
 

@@ -1,4 +1,4 @@
-"""`/healthz`, `/readyz`, `/v1/status`: is the process alive, are nodes served, how does it stand.
+"""`/healthz`, `/readyz`, `/v1/status`, `/v1/inventory`: is it alive, are nodes served, how does it stand, what is it.
 
 The probes ask control nothing: whether nodes are served was seen at most `history.IDLE_SECONDS` ago, and is looked at
 anew when they were not, at most so often however many ask.
@@ -12,7 +12,8 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Viewer, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
-from appliance.channel.admin import StatusWanted
+from appliance.channel.admin import InventoryWanted, StatusWanted
+from appliance.channel.answers.inventory import Inventory
 from appliance.channel.answers.status import Status
 from appliance.channel.serving import unserved
 
@@ -53,5 +54,10 @@ def routes(services: Services) -> Routes:
     async def status(bearer: Viewer) -> Status:
         """The running appliance: processes, isolation, policy, graph, audit log."""
         return await ask(services.control, StatusWanted(), bearer)
+
+    @router.get("/v1/inventory", operation_id="inventory")
+    async def inventory(bearer: Viewer) -> Inventory:
+        """What runs: version, build, parts with their licences, what is used of the kernel."""
+        return await ask(services.control, InventoryWanted(), bearer)
 
     return router

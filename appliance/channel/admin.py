@@ -13,7 +13,7 @@ from typing import Any, Generic, Literal, TypeVar, cast, get_args
 
 import msgspec
 
-from appliance.channel.answers import graph, hosts, measures, monitors, policy, status, tokens
+from appliance.channel.answers import graph, hosts, inventory, measures, monitors, policy, status, tokens
 from appliance.channel.answers.tokens import TokenRole
 
 A = TypeVar("A")
@@ -30,6 +30,10 @@ def verb_of(request: AdminRequest[Any]) -> str:
 
 class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
     """Processes, policy, registry, relay, firewall: what `rosrv status` shows."""
+
+
+class InventoryWanted(AdminRequest[inventory.Inventory], frozen=True, tag="inventory"):
+    """What runs: version, build, parts with their licences, what is used of the kernel."""
 
 
 class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"):
@@ -289,7 +293,8 @@ HostRequest = (
     | HostPorts | HostsReload | RevocationsWanted | AuthorityWanted | HostEndpoint
 )  # fmt: skip
 _Common = (
-    StatusWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted | PolicyRevisions
+    StatusWanted | InventoryWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted
+    | PolicyRevisions
     | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange | TokenList | TokenRevoke
     | HostRequest
 )  # fmt: skip

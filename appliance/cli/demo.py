@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.shipped import SHIPPED
+from appliance.shipped import SHIPPED
 
 
 def demo(

@@ -1,12 +1,16 @@
 """How the appliance stands: its status, its graph, what is live, what is measured. Nothing is changed by a look."""
 
+import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import msgspec
+
 import appliance
 from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations
+from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import AuditState, PolicyState, Status
 from appliance.control.assembly import Parts
@@ -15,6 +19,7 @@ from appliance.control.monitor_orders import monitors_status
 from appliance.control.overview import graph_of
 from appliance.control.surroundings import Surroundings
 from appliance.hosts.hosts import Hosts
+from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.policies import Policies
 from appliance.policy import Live
@@ -39,6 +44,18 @@ class Looks:
     async def status(self, _request: admin.StatusWanted) -> Status:
         """Processes, policy, registry, relay, firewall."""
         return self._status()
+
+    async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
+        """What runs, and what it uses of the kernel."""
+        found = await asyncio.to_thread(inventory)
+        around = self.surroundings
+        used = InUse(
+            firewall=around.firewall.report.backend,
+            esp=self.hosts.status().esp,
+            walls={process.role: process.walls for process in around.processes if process.walls},
+            lacks=sorted({lack for process in around.processes for lack in process.lacks}),
+        )
+        return msgspec.structs.replace(found, in_use=used)
 
     async def graph(self, _request: admin.GraphWanted) -> Graph:
         """Nodes, topics and services, and what flows."""

@@ -12,8 +12,8 @@ _OPERATORS = (
     admin.MonitorResume, admin.HostKit, admin.HostPorts, admin.HostsReload,
 )  # fmt: skip
 _VIEWERS = (
-    admin.StatusWanted, admin.PolicyWanted, admin.PolicyRevisions, admin.RegistrationsWanted, admin.GraphWanted,
-    admin.MonitorsWanted, admin.HostList, admin.HostEndpoint, admin.ChallengeWanted,
+    admin.StatusWanted, admin.InventoryWanted, admin.PolicyWanted, admin.PolicyRevisions, admin.RegistrationsWanted,
+    admin.GraphWanted, admin.MonitorsWanted, admin.HostList, admin.HostEndpoint, admin.ChallengeWanted,
 )  # fmt: skip
 # What the api counts by itself; what a host asks with its one-time token or its key; what is public.
 _NOBODYS = (

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from appliance.inventory import DPKG
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import first_free
 from appliance.supervisor.walls.folders import around, runnable
@@ -130,7 +131,8 @@ def roles_of(
             ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog"),
             readable_by="rosrv-api",
             walls=lambda facts: Walls(
-                listed=True, families=ROUTES, reads=around(*facts.control_reads), binds=None, reaches=None
+                listed=True, families=ROUTES, reads=(*around(*facts.control_reads), str(DPKG)), binds=None,
+                reaches=None,
             ),
         ),
         Role(

@@ -25,8 +25,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from appliance.cli.shipped import IS_CHECKOUT
 from appliance.network.lab import Host, Lab
+from appliance.shipped import IS_CHECKOUT
 from examples.landshark.doorway import Doorway
 
 NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for

@@ -57,7 +57,11 @@ def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
     facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
     locked = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
     del locked["python-iptables"]  # an extra, which is compiled
-    installed = {re.sub(r"[-_.]+", "-", name): version for name, version in facts["packages"].items()}
+    installed = {
+        re.sub(r"[-_.]+", "-", part["name"]): part["version"]
+        for part in facts["parts"]
+        if part["kind"] == "python"
+    }
     assert installed == locked | {"rosrv-appliance": facts["version"]}
     assert "simulated robot" in run(rosrv, "demo", "--help", folder=tmp_path).stdout
 

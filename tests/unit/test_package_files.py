@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 from appliance.config_sources import resolve
+from appliance.inventory import RUNS
 from appliance.supervisor.privileges import SUPERVISORS
-from distribution.deb import RUNS
 from distribution.environment import INTERPRETERS
 
 ROOT = Path(__file__).parents[2]

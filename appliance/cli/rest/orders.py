@@ -49,6 +49,8 @@ def _call_of(request: AdminRequest[Any], url: str) -> _Call:  # noqa: PLR0911, P
     match request:
         case admin.StatusWanted():
             return _Call("GET", "/v1/status")
+        case admin.InventoryWanted():
+            return _Call("GET", "/v1/inventory")
         case admin.GraphWanted():
             return _Call("GET", _GRAPH)
         case admin.PolicyRevisions():

@@ -13,11 +13,11 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
-from appliance.cli.shipped import SHIPPED
 from appliance.config import Settings
 from appliance.hosts.declared import DeclaredHostsError, read_declared
 from appliance.policy import PolicyError, compile_policy, run_cases
 from appliance.policy.policy import Policy
+from appliance.shipped import SHIPPED
 from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.state import foreign
 

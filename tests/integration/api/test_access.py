@@ -17,9 +17,9 @@ from tests.support.waiting import eventually
 
 WRITES = ("/v1/policy", "/v1/policy/rollback", "/v1/policy/reload", "/v1/policy/confirm")
 READS = (
-    "/v1/status", "/v1/policy", "/v1/policy/revisions", "/v1/graph", "/v1/audit", "/v1/audit/1", "/v1/audit/export",
-    "/v1/audit/stream", "/v1/monitors", "/v1/monitors/any", "/v1/tokens", "/v1/hosts", "/v1/whoami", "/metrics",
-    "/v1/metrics", "/v1/nothing/here",
+    "/v1/status", "/v1/inventory", "/v1/policy", "/v1/policy/revisions", "/v1/graph", "/v1/audit", "/v1/audit/1",
+    "/v1/audit/export", "/v1/audit/stream", "/v1/monitors", "/v1/monitors/any", "/v1/tokens", "/v1/hosts", "/v1/whoami",
+    "/metrics", "/v1/metrics", "/v1/nothing/here",
 )  # fmt: skip
 
 

@@ -57,6 +57,7 @@ def run(appliance: Appliance, way: str, *arguments: str, env: dict[str, str] | N
 LOOKING = [
     ("status",), ("policy", "revisions"), ("policy", "revisions", "--json"), ("monitor", "list"),
     ("monitor", "list", "--json"), ("token", "list"), ("token", "list", "--json"),
+    ("version",), ("version", "--json"),
     ("audit", "search", "--deny", "--category", "publish"), ("audit", "search", "--deny", "--json", "--limit", "2"),
     ("audit", "search", "--event", "policy loaded", "--oldest-first"), ("audit", "search", "--topic", "/nowhere"),
     ("audit", "search", "--since", "never"), ("audit", "search", "--cursor", "nonsense"),

@@ -81,7 +81,9 @@ def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     status, text = said_by(monkeypatch, capsys, "version", "--json")
     facts = json.loads(text)
     assert (status, facts["version"]) == (0, __version__)
-    assert facts["packages"]["fastapi"]
+    versions = {part["name"]: part["version"] for part in facts["parts"] if part["kind"] == "python"}
+    assert versions["fastapi"]
+    assert facts["in_use"] is None
 
 
 @pytest.mark.parametrize("words", [("policy", "reload", "-h"), ("help", "policy", "reload")])

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-_CHECKOUT = Path(__file__).resolve().parents[2]
+_CHECKOUT = Path(__file__).resolve().parents[1]
 # In a checkout its top folder, else where the wheel and the Debian package put them.
 IS_CHECKOUT = (_CHECKOUT / "pyproject.toml").exists()
 SHIPPED = _CHECKOUT if IS_CHECKOUT else Path(sys.prefix) / "share" / "rosrv"
