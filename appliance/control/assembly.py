@@ -242,7 +242,6 @@ def assemble(base: Foundation) -> Parts:
         registry,
         graph,
         enactor,
-        faces,
         relay,
         mediation,
         addresses,

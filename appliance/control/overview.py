@@ -11,8 +11,6 @@ from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reach.relays import RelayControl
 from appliance.specifications.allocation import SERVICE, TOPIC
 
-_ANY_TYPE = "*"
-
 
 def graph_of(parts: Parts) -> Graph:
     """The graph now."""
@@ -39,7 +37,7 @@ def _node(incarnation: Incarnation) -> Node:
 
 
 def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Topic]:
-    relay, types = parts.relay, dict[str, str]()
+    relay = parts.relay
     publishers: dict[str, list[Publisher]] = {}
     subscribers: dict[str, list[str]] = {}
     for one in live:
@@ -50,14 +48,10 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
                 publishers.setdefault(topic, []).append(publisher)
             elif registration.kind is Kind.SUBSCRIPTION:
                 subscribers.setdefault(topic, []).append(one.name)
-            else:
-                continue
-            if registration.detail != _ANY_TYPE:
-                types[topic] = registration.detail
     return [
         Topic(
             name,
-            types.get(name, _ANY_TYPE),
+            parts.registry.type_of(name),
             mediated=parts.mediation.carries_topic(name),
             publishers=publishers.get(name, []),
             subscribers=subscribers.get(name, []),

@@ -83,7 +83,6 @@ def serving(
                 registry,
                 graph,
                 enactor,
-                faces,
                 relay,
                 mediation,
                 addresses,

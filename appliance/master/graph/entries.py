@@ -89,8 +89,3 @@ class Entries:
 def stand_in(node: Incarnation) -> str:
     """The service URI that ROSMaster has for every service of an incarnation; nobody is ever told it."""
     return service_uri(node.key, node.relay_port)
-
-
-def key_of_stand_in(uri: str) -> str:
-    """The key of the incarnation behind a stand-in."""
-    return uri.removeprefix("rosrpc://").partition(":")[0]

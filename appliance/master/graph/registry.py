@@ -25,6 +25,9 @@ from appliance.channel import own_node
 from appliance.policy.model import Address
 from appliance.ros.uris import NodeUri, node_uri
 
+ANY_TYPE = "*"
+"""The type of a topic for who takes any."""
+
 PUBLISHER_PATH = "/publisher/"
 """The path of the API of the appliance's own publisher, on the listener of the inner faces."""
 
@@ -36,6 +39,9 @@ class Kind(enum.StrEnum):
     SUBSCRIPTION = "subscription"
     SERVICE = "service"
     PARAMETER = "parameter"
+
+
+_OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
 class Life(enum.StrEnum):
@@ -175,6 +181,7 @@ class Registry:
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
+        self._types: dict[str, str] = {}  # of topics that somebody has, as ROSMaster has them
         self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
         self._nodes_of: Counter[Address] = Counter()
         self._registrations_of: Counter[Address] = Counter()
@@ -212,6 +219,14 @@ class Registry:
     def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
         """Live incarnations that registered this resource, in the order of registration."""
         return self._topics.get((kind, resource), {}).values()
+
+    def resources(self) -> Iterator[tuple[Kind, str, Iterable[Incarnation]]]:
+        """All that live incarnations registered, with who did."""
+        return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
+
+    def type_of(self, topic: str) -> str:
+        """The type of a topic that somebody has: what the last publisher said, else the first subscriber."""
+        return self._types[topic]
 
     def subscribed_below(self, key: str) -> list[str]:
         """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
@@ -373,6 +388,14 @@ class Registry:
         if not holders and registration.kind is Kind.PARAMETER:
             insort(self._subscribed_keys, registration.resource)
         holders[incarnation.key] = incarnation
+        self._note_type(registration)
+
+    def _note_type(self, registration: Registration) -> None:
+        """Take a topic's type as ROSMaster does: `*` and a subscriber's count where there is none yet."""
+        kind, topic, told = registration.kind, registration.resource, registration.detail
+        known = self._types.get(topic, ANY_TYPE)
+        if (kind is Kind.PUBLICATION and told != ANY_TYPE) or (kind in _OF_TOPICS and known == ANY_TYPE):
+            self._types[topic] = told
 
     def _unindex(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         holders = self._topics.get((kind, resource))
@@ -380,6 +403,8 @@ class Registry:
             holders.pop(incarnation.key, None)
             if not holders:
                 del self._topics[kind, resource]
+                if not any((other, resource) in self._topics for other in _OF_TOPICS):
+                    self._types.pop(resource, None)
                 if kind is Kind.PARAMETER:
                     del self._subscribed_keys[bisect_left(self._subscribed_keys, resource)]
 

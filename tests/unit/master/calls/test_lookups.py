@@ -1,8 +1,6 @@
-"""A look-up of a service while the service gets another provider: whatever overtakes what, a provider is told."""
+"""Look-ups are answered from the registry: what is there is told, whatever ROSMaster is doing."""
 
-import asyncio
 import ipaddress
-import itertools
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,107 +8,117 @@ import pytest
 
 from appliance.master.caller import Caller
 from appliance.master.calls.lookups import LookupCalls
-from appliance.master.graph.entries import stand_in
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.ros.uris import parse_node_uri
 
 HOST = ipaddress.ip_address("10.0.0.5")
-SERVICE = "/serve"
-ORDERS = [
-    order
-    for order in itertools.permutations("TRAL")
-    if order.index("T") < order.index("R") and order.index("A") < order.index("L")
-]
+CALLER = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))
 
 pytestmark = pytest.mark.anyio
 
 
-class Race:
-    """ROSMaster and registry while `/server` is started anew and offers its service again.
+class Site:
+    """A registry, and the look-ups that it answers; ROSMaster is not there at all."""
 
-    Steps: (T) ROSMaster takes the registration, (R) control has its answer; (A) ROSMaster answers the look-up,
-    (L) control has that answer.
-    """
-
-    def __init__(self) -> None:
+    def __init__(self, unseen: str | None = None) -> None:
         self.registry = Registry()
-        self.old, self.new = (self._incarnation(key, port) for key, port in (("old", 4000), ("new", 4001)))
-        self.registry.register(self.old, Kind.SERVICE, SERVICE, "5000")
-        self.provider = self.old
-        self.gates = {step: asyncio.Event() for step in "AL"}
-        self.asked = 0
         self.granted: list[Incarnation] = []
-
-    def _incarnation(self, key: str, port: int) -> Incarnation:
-        uri = f"http://10.0.0.5:{port}/"
-        one = Incarnation(key, "/server", HOST, parse_node_uri(uri), uri, "10.0.0.1", port, port + 100)
-        self.registry.add(one)
-        return one
-
-    async def call(self, _method: str, _caller_id: str, _service: str) -> list[Any]:
-        """As ROSMaster; only the first answer is late."""
-        self.asked += 1
-        first = self.asked == 1
-        if first:
-            await self.gates["A"].wait()
-        answer = [1, "", stand_in(self.provider)]
-        if first:
-            await self.gates["L"].wait()
-        return answer
-
-    def step(self, name: str) -> None:
-        """Let one of the four happen."""
-        if name == "T":
-            self.provider = self.new
-        elif name == "R":
-            self.registry.replace(self.old, 0.0)
-            self.registry.register(self.new, Kind.SERVICE, SERVICE, "5001")
-        else:
-            self.gates[name].set()
-
-    def service_granted(self, incarnation: Incarnation, *_given: object) -> None:
-        """As `Graph`."""
-        self.granted.append(incarnation)
-
-    def calls(self) -> LookupCalls:
-        """The look-ups of this site."""
         parts: dict[str, Any] = {
-            "rosmaster": self,
+            "rosmaster": None,
             "registry": self.registry,
-            "faces": None,
-            "mediation": SimpleNamespace(carries_service=lambda _name: True),
+            "mediation": SimpleNamespace(carries_service=lambda _name: True, stand_ins=True),
             "graph": self,
             "enactor": SimpleNamespace(carry_out=lambda _effects: None),
             "relay": SimpleNamespace(port=lambda one, _kind, _name: one.relay_port),
             "addresses": SimpleNamespace(told_to=lambda _peer: "10.0.0.1"),
         }
-        return LookupCalls(**parts, port=11311, stop=lambda _reason: None)
+        self.calls = LookupCalls(**parts, port=11311, stop=lambda _reason: None, unseen=unseen)
+
+    def node(self, name: str, port: int) -> Incarnation:
+        """A node that is known and has nothing yet."""
+        uri = f"http://10.0.0.5:{port}/"
+        one = Incarnation(f"{name}{port}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", port, port + 100)
+        self.registry.add(one)
+        return one
+
+    def service_granted(self, incarnation: Incarnation, *_given: object) -> None:
+        """As `Graph`."""
+        self.granted.append(incarnation)
+
+    async def types(self, subgraph: str = "") -> object:
+        """What `getPublishedTopics` tells."""
+        return (await self.calls.get_published_topics(CALLER, subgraph))[2]
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="".join)
-async def test_a_provider_is_told_whatever_overtakes_what(order: tuple[str, ...]) -> None:
-    """The one that is registered when the answer is given: never that there is none."""
-    race = Race()
-    caller = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))
-    looking = asyncio.ensure_future(race.calls().lookup_service(caller, SERVICE))
-    for name in order:
-        race.step(name)
-        for _ in range(5):
-            await asyncio.sleep(0)
-    answer = await asyncio.wait_for(looking, 5)
-    old = order.index("A") < order.index("T") and order.index("L") < order.index("R")
-    provider = race.old if old else race.new
-    uri = f"rosrpc://10.0.0.1:{provider.relay_port}"
-    assert answer == [1, f"rosrpc URI: [{uri}]", uri]
-    assert race.granted == [provider]
+async def test_a_service_is_the_last_providers() -> None:
+    """The provider that the registry has when the answer is given is told and granted; nobody is no provider."""
+    site = Site()
+    assert await site.calls.lookup_service(CALLER, "/serve") == [-1, "no provider", ""]
+    old, new = site.node("/server", 4000), site.node("/server", 4001)
+    site.registry.register(old, Kind.SERVICE, "/serve", "5000")
+    assert (await site.calls.lookup_service(CALLER, "/serve"))[2] == "rosrpc://10.0.0.1:4100"
+    site.registry.replace(old, 0.0)
+    site.registry.register(new, Kind.SERVICE, "/serve", "5001")
+    told = "rosrpc://10.0.0.1:4101"
+    assert await site.calls.lookup_service(CALLER, "/serve") == [1, f"rosrpc URI: [{told}]", told]
+    assert site.granted == [old, new]
 
 
-async def test_a_provider_that_the_registry_never_has_is_none() -> None:
-    """What ROSMaster alone says is a claim; it is not asked for ever."""
-    race = Race()
-    race.step("T")
-    race.step("A")
-    race.step("L")
-    caller = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))
-    assert await race.calls().lookup_service(caller, SERVICE) == [-1, "no provider", ""]
-    assert (race.granted, race.asked) == ([], 6)
+async def test_a_node_is_known_while_it_has_something() -> None:
+    """As on a plain master: a node is what registered, at the port that stands for it."""
+    site = Site()
+    one = site.node("/talker", 4000)
+    assert await site.calls.lookup_node(CALLER, "/talker") == [-1, "unknown node [/talker]", ""]
+    site.registry.register(one, Kind.PUBLICATION, "/chatter", "std_msgs/String")
+    assert await site.calls.lookup_node(CALLER, "/talker") == [1, "node api", "http://10.0.0.1:4000/"]
+    site.registry.overshadow(one, 0.0)
+    assert (await site.calls.lookup_node(CALLER, "/talker"))[0] == -1
+
+
+async def test_the_state_has_what_counts() -> None:
+    """Publishers, subscribers and services, in the order of registration; a publisher that is not shown is left out."""
+    site = Site(unseen="/rosrv")
+    talker, own = site.node("/talker", 4000), site.node("/rosrv", 4001)
+    for node, kind, name in (
+        (own, Kind.PUBLICATION, "/chatter"),
+        (talker, Kind.PUBLICATION, "/chatter"),
+        (own, Kind.PUBLICATION, "/alarms"),
+        (talker, Kind.SUBSCRIPTION, "/b"),
+        (own, Kind.SUBSCRIPTION, "/a"),
+        (talker, Kind.SERVICE, "/serve"),
+        (talker, Kind.PARAMETER, "/limit"),
+    ):
+        site.registry.register(node, kind, name, "std_msgs/String")
+    assert await site.calls.get_system_state(CALLER) == [
+        1,
+        "current system state",
+        [[["/chatter", ["/talker"]]], [["/b", ["/talker"]], ["/a", ["/rosrv"]]], [["/serve", ["/talker"]]]],
+    ]
+
+
+async def test_a_type_is_taken_as_rosmaster_does() -> None:
+    """The last publisher's; a subscriber's and `*` count only where there is none yet."""
+    site = Site()
+    one, two, three = (site.node(name, port) for name, port in (("/a", 4000), ("/b", 4001), ("/c", 4002)))
+    site.registry.register(one, Kind.SUBSCRIPTION, "/x", "p/First")
+    site.registry.register(two, Kind.PUBLICATION, "/x", "*")
+    assert await site.types() == [["/x", "p/First"]]
+    site.registry.register(three, Kind.PUBLICATION, "/x", "p/Last")
+    site.registry.register(one, Kind.SUBSCRIPTION, "/x", "p/Other")
+    assert await site.types() == [["/x", "p/Last"]]
+    site.registry.unregister(three, Kind.PUBLICATION, "/x")
+    assert await site.types() == [["/x", "p/Last"]]
+    for node, kind in ((one, Kind.SUBSCRIPTION), (two, Kind.PUBLICATION)):
+        site.registry.unregister(node, kind, "/x")
+    site.registry.register(one, Kind.PUBLICATION, "/x", "*")
+    assert await site.types() == [["/x", "*"]], "nobody had it: nothing is kept"
+
+
+async def test_only_what_is_below() -> None:
+    """A subgraph ends at a `/`: `/arm` is no part of `/ar`."""
+    site = Site()
+    one = site.node("/a", 4000)
+    for topic in ("/arm/x", "/ar/y", "/ar"):
+        site.registry.register(one, Kind.PUBLICATION, topic, "p/T")
+    assert await site.types("/ar") == [["/ar/y", "p/T"]]
+    assert await site.types("/") == [["/arm/x", "p/T"], ["/ar/y", "p/T"], ["/ar", "p/T"]]
