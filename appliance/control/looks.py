@@ -24,6 +24,8 @@ from appliance.master.graph.registry import Kind, Life
 from appliance.master.policies import Policies
 from appliance.policy import Live
 
+_TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
+
 
 @dataclass(frozen=True)
 class Looks:
@@ -71,7 +73,9 @@ class Looks:
 
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.registry, self.parts.relay
-        lives = [one.life for one in registry.all()]
+        # The appliance's own nodes are not of the robot, here as in the graph.
+        lives = [one.life for one in registry.all() if not one.own]
+        named = {(one.kind, one.resource) for node, one in registry.in_order() if not node.own}
         return Status(
             version=appliance.__version__,
             since=self.started,
@@ -89,8 +93,8 @@ class Looks:
             relay=relay.presence,
             nodes=lives.count(Life.LIVE),
             shadows=lives.count(Life.SHADOW),
-            topics=len({one.resource for _node, one in registry.in_order() if one.kind is Kind.PUBLICATION}),
-            services=len({one.resource for _node, one in registry.in_order() if one.kind is Kind.SERVICE}),
+            topics=len({name for kind, name in named if kind in _TOPIC}),
+            services=sum(kind is Kind.SERVICE for kind, _name in named),
             connections=len(relay.connections),
             messages=relay.carried.total.messages,
             dropped=relay.carried.total.dropped,

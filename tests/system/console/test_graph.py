@@ -73,7 +73,7 @@ def test_a_thousand_topics(opened: Callable[..., Reader], attempt: Callable[...,
     drawn = page.locator(".drawing")
     expect(drawn).to_be_visible()
     assert 2 <= int(drawn.get_attribute("data-items") or 0) <= 150
-    page.locator(".box.topic.many").first.focus()
+    page.locator(".box.many").first.focus()
     page.keyboard.press("Enter")
     page.get_by_role("button", name="Open the group").click()
     expect(page.get_by_role("button", name="Close groups")).to_be_visible()

@@ -27,6 +27,6 @@ function Row(/** @type {{record: any, chosen: boolean, filter: Record<string, st
     <td data-label="Node" class=${record.caller_id ? "" : "bare"}><${Given} value=${record.caller_id} most=${40} mono /></td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>
-    <td class="wide-only">${record.rule ? html`<code>[<${Given} value=${record.rule.section} most=${20} />] <${Given} value=${record.rule.key} most=${40} /></code>` : html`<span class="muted">–</span>`}</td>
+    <td class="wide-only">${record.rule ? html`<code>[<${Given} value=${record.rule.section} most=${20} mono />]</code> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
     <td class="wide-only reason"><${Given} value=${record.reason} most=${110} /></td></tr>`;
 }

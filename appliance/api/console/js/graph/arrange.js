@@ -8,10 +8,12 @@ import { Graph, layout } from "/console/static/vendor/dagre.js";
 /** @typedef {{x: number, y: number, w: number, h: number}} Spot the middle and the size */
 
 export const SIZES = {
-  node: [158, 42], topic: [206, 38], service: [206, 38], party: [158, 42], missing: [206, 38], master: [120, 42],
+  node: [158, 46], topic: [206, 44], service: [206, 44], party: [158, 46], missing: [206, 44], master: [120, 46],
 };
 const GAP = 16;
 const COLUMN = 52;
+const GROUP = [206, 50];
+const TALLEST = 12; // parts of an opened group in one column
 const LITTLE = 0.25; // of what is shown may be new before all is arranged afresh
 
 /**
@@ -19,10 +21,55 @@ const LITTLE = 0.25; // of what is shown may be new before all is arranged afres
  * @returns {Map<string, Spot>}
  */
 export function arrange(items, lines, before) {
+  before = unfolded(items, before);
   const fresh = [...items.keys()].filter((key) => !before.has(key));
   if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, lines, before, fresh);
   if (before.size && !fresh.length) return new Map([...items.keys()].map((key) => [key, /** @type {Spot} */ (before.get(key))]));
   return afresh(items, lines);
+}
+
+/**
+ * Where a group was that is open now stand its parts, in columns: nodes, then topics. What stood right of it or below
+ * makes room, and nothing else moves.
+ */
+function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, Spot>} */ before) {
+  let spots = before;
+  for (const group of before.keys()) {
+    if (items.has(group)) continue;
+    const space = group.replace(/^g[a-z]+/, "");
+    const parts = [...items.values()].filter((one) => !spots.has(one.key) && one.within?.some((/** @type {string} */ key) => key.replace(/^g[a-z]+/, "") === space));
+    if (!parts.length) continue;
+    const here = /** @type {Spot} */ (spots.get(group)); // moved, perhaps, by another group
+    const [left, top] = [here.x - here.w / 2, here.y - here.h / 2];
+    const placed = inColumns(parts, left, top);
+    const room = extent(placed.values());
+    const [right, down] = [Math.max(0, room.w - here.w), Math.max(0, room.h - here.h)];
+    spots = new Map([...spots].map(([key, spot]) => [key, { ...spot, x: spot.x + (spot.x > here.x ? right : 0), y: spot.y + (spot.y > here.y ? down : 0) }]));
+    for (const [key, spot] of placed) spots.set(key, spot);
+  }
+  return spots;
+}
+
+/** Columns of one kind each, from a corner on. @param {any[]} parts @param {number} left @param {number} top */
+function inColumns(parts, left, top) {
+  /** @type {Map<string, Spot>} */
+  const spots = new Map();
+  let x = left;
+  for (const kind of new Set(parts.map((one) => one.kind))) {
+    const column = parts.filter((one) => one.kind === kind);
+    for (let first = 0; first < column.length; first += TALLEST) {
+      let y = top;
+      let widest = 0;
+      for (const one of column.slice(first, first + TALLEST)) {
+        const [w, h] = sizeOf(one);
+        spots.set(one.key, { x: x + w / 2, y: y + h / 2, w, h });
+        y += h + GAP;
+        widest = Math.max(widest, w);
+      }
+      x += widest + COLUMN;
+    }
+  }
+  return spots;
 }
 
 /** All of it anew. @param {Map<string, any>} items @param {Map<string, any>} lines */
@@ -38,7 +85,9 @@ export function afresh(items, lines) {
     const line = lines.get(key);
     if (line.from !== line.to) graph.setEdge(line.from, line.to, { weight: line.kind === "denied" ? 1 : 3 });
   }
+  const began = performance.now();
   layout(graph);
+  performance.measure("layout of the graph", { start: began });
   /** @type {Map<string, Spot>} */
   const spots = new Map();
   for (const key of items.keys()) {
@@ -81,6 +130,7 @@ function free(/** @type {Spot} */ wanted, /** @type {Spot[]} */ taken) {
 }
 
 function sizeOf(/** @type {any} */ item) {
+  if (item.members) return GROUP;
   return SIZES[/** @type {keyof typeof SIZES} */ (item.kind)];
 }
 

@@ -1,32 +1,39 @@
 /**
  * Makes a large graph small enough to read: items of one namespace are drawn as one group until it is opened.
  *
- * The names of each kind form a tree; what is shown is a cut through it. The cut begins at the namespaces of the first
- * level and opens the smallest groups first, as long as not more than `most` things of the kind are shown. What the
- * reader opened is open. A level with very many names is divided into ranges, so that no step shows too much at once.
- * The result depends on the names alone: rates and the order of an answer move nothing.
+ * The names of each kind form a tree, by host with the hosts as its first level; what is shown is a cut through it: the
+ * groups of the first level, and the parts of those that the reader opened. A level with very many names is divided into
+ * ranges, so that no step shows too much at once. The result depends on the names alone: rates and the order of an
+ * answer move nothing. The nodes and the topics of a namespace are one group while it is closed.
  */
+
+import { counted } from "../numbers.js";
 
 const RANGE = 40;
 
-/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[]}} Shown */
+/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[], within?: string[]}} Shown `within`: the opened groups around it */
 /** @typedef {{key: string, label: string, items: import("./model.js").Item[], parts: Branch[]}} Branch */
 
 /**
  * @param {import("./model.js").Model} model @param {Set<string>} opened keys of groups
- * @param {number} most things of each kind
+ * @param {"namespace" | "host"} by what a group has in common @param {number} most things of a kind that are drawn without groups
  * @returns {{items: Map<string, Shown>, lines: Map<string, any>}}
  */
-export function collapse(model, opened, most) {
+export function collapse(model, opened, by, most) {
   /** @type {Map<string, Shown>} */
   const items = new Map();
   const place = new Map();
+  const path = (/** @type {import("./model.js").Item} */ one) => (by === "host" ? `/${one.host ?? "no host"}${one.name}` : one.name);
   for (const kind of ["node", "topic", "service", "missing"]) {
     const all = [...model.items.values()].filter((one) => one.kind === kind);
-    for (const branch of cut(all, kind, opened, most)) {
-      const shown = branch.items.length === 1 && !branch.parts.length ? branch.items[0] : groupOf(branch, kind);
-      items.set(shown.key, shown);
-      for (const one of branch.items) place.set(one.key, shown.key);
+    const whole = by === "namespace" && all.length <= most;
+    const root = whole ? { key: "", label: "", items: all, parts: all.map(leaf) } : grow(all.map((one) => ({ one, path: path(one) })), `g${kind}`, "", 1);
+    for (const { branch, within } of cut(root, opened)) {
+      const group = branch.parts.length ? groupOf(branch, kind, by === "host" ? branch.label.slice(1) : branch.label) : null;
+      const twin = group && items.get(group.key.replace(/^g[a-z]+/, "gnode"));
+      const item = twin ? together(twin, group) : group ?? branch.items[0];
+      items.set(item.key, { ...item, within });
+      for (const one of branch.items) place.set(one.key, item.key);
     }
   }
   for (const one of model.items.values()) {
@@ -38,12 +45,17 @@ export function collapse(model, opened, most) {
   return { items, lines: joined(model, place) };
 }
 
-function groupOf(/** @type {Branch} */ branch, /** @type {string} */ kind) {
-  const word = kind === "node" ? "node" : kind === "topic" ? "topic" : kind === "service" ? "service" : "thing";
+function groupOf(/** @type {Branch} */ branch, /** @type {string} */ kind, /** @type {string} */ name) {
+  const rate = branch.items.reduce((sum, one) => sum + (one.rate ?? 0), 0);
   return /** @type {Shown} */ ({
-    key: branch.key, kind, name: branch.label, sub: `${branch.items.length} ${word}s`, members: branch.items,
+    key: branch.key, kind, name, sub: counted(branch.items.length, kind === "missing" ? "thing" : kind), members: branch.items, rate,
     mediated: branch.items.every((one) => one.mediated), lost: branch.items.every((one) => one.lost),
   });
+}
+
+/** Nodes with the topics of the same namespace or host: what stays among them is not drawn. @param {Shown} nodes @param {Shown} more */
+function together(nodes, more) {
+  return { ...nodes, sub: `${nodes.sub}, ${more.sub}`, members: [...(nodes.members ?? []), ...(more.members ?? [])], rate: (nodes.rate ?? 0) + (more.rate ?? 0), mediated: more.mediated };
 }
 
 /** Lines between what is shown; those between the same two things are one. */
@@ -52,6 +64,7 @@ function joined(/** @type {import("./model.js").Model} */ model, /** @type {Map<
   for (const line of model.lines.values()) {
     const from = place.get(line.from);
     const to = place.get(line.to);
+    if (from === to && line.from !== line.to && line.kind === "flow") continue;
     const key = line.kind === "denied" ? `!${from}>${to}` : `${from}>${to}`;
     const known = lines.get(key);
     if (!known) lines.set(key, { ...line, key, from, to });
@@ -65,43 +78,43 @@ function joined(/** @type {import("./model.js").Model} */ model, /** @type {Map<
   return lines;
 }
 
-/** The branches that are shown for one kind. */
-function cut(/** @type {import("./model.js").Item[]} */ all, /** @type {string} */ kind, /** @type {Set<string>} */ opened, /** @type {number} */ most) {
-  if (all.length <= most) return all.map((one) => ({ key: one.key, label: one.name, items: [one], parts: [] }));
-  const root = grow(all, `g${kind}`, "", 1);
-  let frontier = root.parts;
-  for (;;) {
-    const wanted = frontier.filter((one) => one.parts.length && opened.has(one.key));
-    const room = most - frontier.length;
-    const next = wanted[0] ?? frontier.filter((one) => one.parts.length && one.parts.length - 1 <= room).sort(bySize)[0];
-    if (!next) return frontier;
-    frontier = frontier.flatMap((one) => (one === next ? one.parts : [one]));
+/** The branches that are shown: the largest that the reader did not open, with the opened ones around each, the outermost first. */
+function cut(/** @type {Branch} */ branch, /** @type {Set<string>} */ opened, /** @type {string[]} */ within = []) {
+  /** @type {{branch: Branch, within: string[]}[]} */
+  const found = [];
+  for (const one of branch.parts) {
+    if (one.parts.length && opened.has(one.key)) found.push(...cut(one, opened, [...within, one.key]));
+    else found.push({ branch: one, within });
   }
+  return found;
 }
 
-function bySize(/** @type {Branch} */ a, /** @type {Branch} */ b) {
-  return a.parts.length - b.parts.length || (a.key < b.key ? -1 : 1);
+/** @returns {Branch} */
+function leaf(/** @type {import("./model.js").Item} */ item) {
+  return { key: item.key, label: item.name, items: [item], parts: [] };
 }
 
-/** The tree of names below a namespace. @returns {Branch} */
-function grow(/** @type {import("./model.js").Item[]} */ items, /** @type {string} */ kind, /** @type {string} */ prefix, /** @type {number} */ depth) {
+/** @typedef {{one: import("./model.js").Item, path: string}} Placed */
+
+/** The tree of paths below a prefix. @returns {Branch} */
+function grow(/** @type {Placed[]} */ items, /** @type {string} */ kind, /** @type {string} */ prefix, /** @type {number} */ depth) {
+  /** @type {Map<string, Placed[]>} */
   const families = new Map();
   for (const one of items) {
-    const words = one.name.split("/");
-    const leaf = words.length <= depth + 1;
-    const name = leaf ? one.name : `${words.slice(0, depth + 1).join("/")}/*`;
-    if (!families.has(name)) families.set(name, []);
-    families.get(name).push(one);
+    const words = one.path.split("/");
+    const name = words.length <= depth + 1 ? one.path : `${words.slice(0, depth + 1).join("/")}/*`;
+    families.set(name, [...(families.get(name) ?? []), one]);
   }
-  const names = [...families.keys()].sort();
-  const parts = names.map((name) => {
-    const members = families.get(name);
-    if (members.length === 1) return { key: members[0].key, label: members[0].name, items: members, parts: [] };
-    return name.endsWith("/*") ? grow(members, kind, name, depth + 1) : { key: `${kind}:${name}`, label: name, items: members, parts: [] };
+  const parts = [...families.keys()].sort().map((name) => {
+    const members = /** @type {Placed[]} */ (families.get(name));
+    if (members.length === 1) return leaf(members[0].one);
+    const deeper = members.some((one) => one.path.split("/").length > depth + 1);
+    return deeper ? grow(members, kind, name, depth + 1) : { key: `${kind}:${name}`, label: name, items: members.map(({ one }) => one), parts: members.map(({ one }) => leaf(one)) };
   });
   // A namespace whose only child is a namespace is that child.
   if (parts.length === 1 && parts[0].parts.length) return parts[0];
-  return { key: `${kind}:${prefix}`, label: prefix, items, parts: parts.length > RANGE ? ranges(parts, `${kind}:${prefix}`) : parts };
+  const key = `${kind}:${prefix}`;
+  return { key, label: prefix.replace(/\/\*$/, ""), items: items.map(({ one }) => one), parts: parts.length > RANGE ? ranges(parts, key) : parts };
 }
 
 /** So many neighbours in the alphabet as one. @returns {Branch[]} */
@@ -110,12 +123,8 @@ function ranges(/** @type {Branch[]} */ parts, /** @type {string} */ key) {
   const found = [];
   for (let at = 0; at < parts.length; at += size) {
     const some = parts.slice(at, at + size);
-    const label = `${some[0].label} … ${tail(some[some.length - 1].label)}`;
+    const label = `${some[0].label} … ${some[some.length - 1].label.replace(/^.*\//, "")}`;
     found.push({ key: `${key}#${some[0].label}`, label, items: some.flatMap((one) => one.items), parts: some });
   }
   return found;
-}
-
-function tail(/** @type {string} */ name) {
-  return name.slice(name.replace(/\/\*$/, "").lastIndexOf("/") + 1);
 }

@@ -11,12 +11,12 @@ import { Link } from "../router.js";
 
 const MOST = 60;
 
-/** @param {{item: any, line: any, denials: any[], choose: (key: string | null) => void, open: (key: string) => void}} given */
-export function Details({ item, line, denials, choose, open }) {
+/** @param {{item: any, line: any, denials: any[], shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string | null) => void, open: (key: string) => void}} given `shown`: all that is drawn */
+export function Details({ item, line, denials, shown, choose, open }) {
   const title = line ? "Refused" : item.members ? "Group" : { node: "Node", topic: "Topic", service: "Service", party: "Refused party", missing: "Refused, not in the graph", master: "RVMaster" }[/** @type {string} */ (item.kind)];
   return html`<section class="panel details" aria-labelledby="details"><div class="panel-head"><h2 id="details">${title}</h2>
       <span class="end"><button class="button plain small" onClick=${() => choose(null)} aria-label="Close the details"><${Icon} name="close" size=${16} /></button></span></div>
-    <div class="panel-body stack">${line ? html`<${Attempt} records=${line.denials} />` : item.members ? html`<${Group} item=${item} open=${open} />`
+    <div class="panel-body stack">${line ? html`<${Attempt} records=${line.denials} />` : item.members ? html`<${Group} item=${item} shown=${shown} choose=${choose} open=${open} />`
       : html`<h3><${Given} value=${item.name} most=${300} mono /></h3>${part(item, choose)}<${Refusals} item=${item} denials=${denials} />`}</div></section>`;
 }
 
@@ -30,7 +30,7 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
   if (item.kind === "service")
     return html`<dl class="facts"><dt>Offered by</dt><dd><${Given} value=${row.node} mono /></dd>${path}<dt>Messages</dt><dd>${count(row.messages)}</dd><dt>Clients now</dt><dd>${row.connections.length}</dd></dl>`;
   return html`<dl class="facts"><dt>Type</dt><dd><${Given} value=${row.type} mono /></dd>${path}</dl>
-    <div><h3>${counted(row.publishers.length, "publisher")}</h3><ul class="plain-list">${row.publishers.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.node}><button class="link" onClick=${() => choose(`n${one.node}`)}><${Given} value=${one.node} mono /></button>
+    <div><h3>${counted(row.publishers.length, "publisher")}</h3><ul class="plain-list">${row.publishers.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.node}><button class="link" onClick=${() => choose(`n${one.node}`)}><${Given} value=${one.node} mono /></button>${" "}
       <span class="muted small">${rate(one.messages_per_second)} messages/s, ${bytes(one.bytes_per_second)}/s, ${count(one.messages)} in all${one.dropped ? `, ${count(one.dropped)} dropped` : ""}</span></li>`)}</ul></div>
     <${Names} title="Subscribers" names=${row.subscribers} letter="n" choose=${choose} />`;
 }
@@ -41,9 +41,20 @@ function Names(/** @type {{title: string, names: string[], letter: string, choos
     ${names.length > MOST && html`<li class="muted">and ${names.length - MOST} more</li>`}</ul></div>`;
 }
 
-function Group(/** @type {{item: any, open: (key: string) => void}} */ { item, open }) {
+function Group(/** @type {{item: any, shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string) => void, open: (key: string) => void}} */ { item, shown, choose, open }) {
+  const lines = [...shown.lines.values()];
+  const ends = (/** @type {"from" | "to"} */ own, /** @type {"from" | "to"} */ other, /** @type {string} */ kind) => lines.filter((one) => one.kind === kind && one[own] === item.key && one[other] !== item.key).map((one) => ({ line: one, end: shown.items.get(one[other]) })).filter(({ end }) => end);
   return html`<h3><${Given} value=${item.name} mono /></h3><p class="muted">${item.sub}, drawn as one.</p><button class="button" onClick=${() => open(item.key)}>Open the group</button>
+    <${Ends} title="Gets messages from" ends=${ends("to", "from", "flow")} choose=${choose} /><${Ends} title="Sends messages to" ends=${ends("from", "to", "flow")} choose=${choose} />
+    <${Ends} title="Others who were refused here" ends=${ends("to", "from", "denied")} choose=${choose} /><${Ends} title="Was refused at" ends=${ends("from", "to", "denied")} choose=${choose} />
+    <h3>In it</h3>
     <ul class="plain-list">${item.members.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.key}><${Given} value=${one.name} mono /></li>`)}${item.members.length > MOST && html`<li class="muted">and ${item.members.length - MOST} more</li>`}</ul>`;
+}
+
+function Ends(/** @type {{title: string, ends: {line: any, end: any}[], choose: (key: string) => void}} */ { title, ends, choose }) {
+  if (!ends.length) return null;
+  return html`<div><h3>${title}</h3><ul class="plain-list">${ends.map(({ line, end }) => html`<li key=${line.key}><button class="link" onClick=${() => choose(line.kind === "denied" ? line.key : end.key)}><${Given} value=${end.name} mono /></button>
+    ${line.kind === "denied" ? html` <${Badge} word=${line.would ? "would deny" : "deny"} />` : html` <span class="muted small">${rate(line.rate)} messages/s</span>`}</li>`)}</ul></div>`;
 }
 
 function Attempt(/** @type {{records: any[]}} */ { records }) {

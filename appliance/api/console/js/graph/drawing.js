@@ -8,6 +8,10 @@ import { extent } from "./arrange.js";
 
 const MARGIN = 24;
 const CLOSEST = 2.5;
+const FARTHEST = 0.27; // a box is then as high as its name, which is never drawn smaller than it is read
+const BOW = 46;
+const NAME = 11.5; // size of a name on the screen, as in graph.css
+const GLYPH = 0.61; // width of a letter of the name's typeface, of its size
 
 /** @typedef {{x: number, y: number, zoom: number}} Look the corner of what is seen, and how large it is drawn */
 
@@ -15,7 +19,7 @@ const CLOSEST = 2.5;
 export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
-  const all = extent(spots.values());
+  const all = withBows(extent(spots.values()));
   const own = useRef(false); // whether the reader chose what is seen; until then all is
   const fit = () => {
     own.current = false;
@@ -59,7 +63,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
       <defs><${Tip} id="tip-flow" /><${Tip} id="tip-mediated" /><${Tip} id="tip-denied" /><${Tip} id="tip-would" /></defs>
       <g transform=${`scale(${look.zoom}) translate(${-look.x} ${-look.y})`}>
         ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} />`)}
-        ${[...items.values()].map((item) => html`<${Box} key=${item.key} item=${item} spot=${spots.get(item.key)} chosen=${chosen === item.key} faint=${near !== null && !near.has(item.key)} choose=${choose} />`)}
+        ${[...items.values()].map((item) => html`<${Box} key=${item.key} item=${item} spot=${spots.get(item.key)} chosen=${chosen === item.key} faint=${near !== null && !near.has(item.key)} zoom=${look.zoom} choose=${choose} />`)}
       </g></svg>
     <div class="drawing-tools">
       <button class="button small" onClick=${() => middle(1.25)} aria-label="Closer"><${Icon} name="plus" size=${16} /></button>
@@ -72,13 +76,17 @@ function Tip(/** @type {{id: string}} */ { id }) {
   return html`<marker id=${id} class=${id} viewBox="0 0 8 8" refX="7" refY="4" markerUnits="userSpaceOnUse" markerWidth="10" markerHeight="10" orient="auto"><path d="M0 0.500L8 4L0 7.500z" /></marker>`;
 }
 
-function Box(/** @type {any} */ { item, spot, chosen, faint, choose }) {
+function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
   if (!spot) return null;
   const { x, y, w, h } = spot;
-  const words = item.kind === "topic" || item.kind === "service" || item.kind === "missing" ? 25 : 19;
-  const name = shortened(item.name, words);
+  // From afar a name keeps its size on the screen and loses its middle; what stands below it goes first.
+  const size = NAME * Math.max(1, 1 / zoom);
+  const left = item.mediated ? 25 : 14;
+  const name = shortened(item.name, Math.floor((w - left - 8) / (size * GLYPH)));
+  const two = zoom > 0.85;
+  const sub = `${shortened(item.sub, item.rate ? 20 : 28)}${item.rate ? ` · ${rate(item.rate)}/s` : ""}`;
   const state = [item.kind, item.members ? "many" : "", item.mediated ? "mediated" : "", item.lost ? "lost" : "", chosen ? "chosen" : "", faint ? "faint" : ""].filter(Boolean).join(" ");
-  const said = `${item.members ? "group " : ""}${item.kind} ${plain(item.name, 120)}, ${plain(item.sub, 60)}${item.mediated ? ", mediated" : ""}${item.lost ? ", lost" : ""}`;
+  const said = `${item.members ? "group " : ""}${item.kind} ${plain(item.name, 120)}, ${plain(item.sub, 60)}${item.mediated ? ", mediated" : ""}${item.rate ? `, ${rate(item.rate)} messages/s` : ""}${item.lost ? ", lost" : ""}`;
   const pick = (/** @type {any} */ event) => {
     if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
     event.preventDefault();
@@ -90,8 +98,8 @@ function Box(/** @type {any} */ { item, spot, chosen, faint, choose }) {
     ${item.members && html`<rect class="behind" x="4" y="4" width=${w} height=${h} rx=${round} />`}
     <rect class="shape" width=${w} height=${h} rx=${round} />
     ${item.mediated && html`<circle class="mark" cx=${14} cy=${h / 2} r="3.500" />`}
-    <text class="box-name" x=${item.mediated ? 25 : 14} y=${h / 2 - 2}>${name}</text>
-    <text class="box-sub" x=${item.mediated ? 25 : 14} y=${h / 2 + 12}>${shortened(item.sub, 28)}</text>
+    <text class="box-name" x=${left} y=${two ? h / 2 - 2 : h / 2 + size * 0.35} font-size=${size}>${name}</text>
+    ${two && html`<text class="box-sub" x=${left} y=${h / 2 + 12}>${sub}</text>`}
     <title>${said}</title></g>`;
 }
 
@@ -103,7 +111,7 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose }) {
   const own = chosen === line.key;
   const touched = near === null || own || line.from === chosen || line.to === chosen;
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
-  const shape = html`<path class=${`line ${kind}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
+  const shape = html`<path class=${`line ${kind}${line.kind === "flow" && line.rate > 0 ? " flowing" : ""}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
   if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
   const said = `refused: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
   const pick = (/** @type {any} */ event) => {
@@ -132,7 +140,8 @@ function shortened(/** @type {string} */ text, /** @type {number} */ most) {
   const said = plain(text, 400);
   const points = [...said];
   if (points.length <= most) return said;
-  return `${points.slice(0, 5).join("")}…${points.slice(-(most - 6)).join("")}`;
+  const head = most > 14 ? 5 : 0; // of a short one the end says more
+  return `${points.slice(0, head).join("")}…${points.slice(-(most - head - 1)).join("")}`;
 }
 
 function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} */ lines) {
@@ -146,16 +155,20 @@ function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} *
   return near;
 }
 
+/** The same with room for the lines that go back, around the outermost boxes. */
+function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { x, y, w, h }) {
+  return { x: x - BOW, y, w: w + 2 * BOW, h: h + BOW };
+}
+
 function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {
   const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
-  // Never so small that nothing can be read: then only a part is seen, and the rest by moving.
-  const readable = Math.max(zoom, box.clientWidth < 700 ? 0.5 : 0.42);
+  const readable = Math.max(zoom, FARTHEST); // what has no room is seen by moving
   const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
   return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
 }
 
 function zoomed(/** @type {Look} */ now, /** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) {
-  const zoom = Math.min(CLOSEST, Math.max(0.08, now.zoom * factor));
+  const zoom = Math.min(CLOSEST, Math.max(FARTHEST, now.zoom * factor));
   return { zoom, x: now.x + px / now.zoom - px / zoom, y: now.y + py / now.zoom - py / zoom };
 }
 

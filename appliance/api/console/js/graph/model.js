@@ -7,7 +7,7 @@
 
 /**
  * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
- *   mediated?: boolean, lost?: boolean, row?: any}} Item
+ *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any}} Item
  * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
  *   denials?: any[], would?: boolean}} Line
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
@@ -21,7 +21,7 @@ const ATTEMPTS = 60;
 export function modelOf(graph, denials, wanted) {
   /** @type {Model} */
   const model = { items: new Map(), lines: new Map() };
-  for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: node.host, lost: node.state === "lost", row: node });
+  for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: node.host, host: node.host, lost: node.state === "lost", row: node });
   for (const topic of graph.topics) if (!(wanted.quiet && QUIET.has(topic.name))) topicOf(model, topic);
   if (wanted.services) for (const service of graph.services) if (!(wanted.quiet && /\/(get_loggers|set_logger_level)$/.test(service.name))) serviceOf(model, service);
   if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt);
@@ -49,24 +49,30 @@ function isLateWithdrawal(/** @type {any} */ record) {
 
 function topicOf(/** @type {Model} */ model, /** @type {any} */ topic) {
   const key = `t${topic.name}`;
-  put(model, { key, kind: "topic", name: topic.name, sub: topic.type, mediated: topic.mediated, row: topic });
-  let rate = 0;
+  const item = { key, kind: /** @type {const} */ ("topic"), name: topic.name, sub: topic.type, host: hostOf(model, topic.publishers.map((/** @type {any} */ one) => one.node)), rate: 0, mediated: topic.mediated, row: topic };
+  put(model, item);
   for (const one of topic.publishers) {
-    rate += one.messages_per_second;
+    item.rate += one.messages_per_second;
     flow(model, `n${one.node}`, key, topic.mediated, one.messages_per_second);
   }
-  for (const name of topic.subscribers) flow(model, key, `n${name}`, topic.mediated, rate);
+  for (const name of topic.subscribers) flow(model, key, `n${name}`, topic.mediated, item.rate);
+}
+
+/** The host of those who publish a topic, if they have one in common. */
+function hostOf(/** @type {Model} */ model, /** @type {string[]} */ names) {
+  const hosts = [...new Set(names.map((name) => model.items.get(`n${name}`)?.host ?? ""))];
+  return hosts.length === 1 ? hosts[0] : hosts.length ? "several hosts" : "no host";
 }
 
 function serviceOf(/** @type {Model} */ model, /** @type {any} */ service) {
   const key = `s${service.name}`;
-  put(model, { key, kind: "service", name: service.name, sub: "service", mediated: service.mediated, row: service });
+  put(model, { key, kind: "service", name: service.name, sub: "service", host: hostOf(model, [service.node]), rate: service.messages_per_second, mediated: service.mediated, row: service });
   flow(model, key, `n${service.node}`, service.mediated, service.messages_per_second);
   for (const one of service.connections) flow(model, `n${one.to}`, key, service.mediated, service.messages_per_second);
 }
 
 function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt) {
-  const { host, caller_id: caller, category, resource } = attempt.records[0];
+  const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
   const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
   const to = attempt.command ? MASTER : `${category === "offer" || category === "call" ? "s" : category === "node" ? "n" : "t"}${resource}`;
@@ -75,7 +81,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
-    put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `refused ${category}` });
+    put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `refused ${category ?? event}` });
   }
   const key = `!${attempt.key}`;
   const line = { key, from, to }; // to what was wanted, whichever way messages would have gone

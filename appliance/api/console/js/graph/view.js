@@ -23,13 +23,14 @@ export function GraphView() {
   const [search, setSearch] = useState("");
   const [wanted, setWanted] = useState({ services: false, quiet: true, denied: true });
   const [opened, setOpened] = useState(/** @type {Set<string>} */ (new Set()));
+  const [by, setBy] = useState(/** @type {"namespace" | "host"} */ ("namespace"));
   const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
   const [form, setForm] = useState("drawing");
   const [round, setRound] = useState(0);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
-  const shown = useMemo(() => (model ? collapse(model, opened, MOST) : null), [model, opened]);
-  const { spots, arranged } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${opened.size}`);
+  const shown = useMemo(() => (model ? collapse(model, opened, by, MOST) : null), [model, opened, by]);
+  const { spots, arranged } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`);
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(graph.nodes.length, "node")}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
@@ -38,24 +39,33 @@ export function GraphView() {
   const item = chosen ? shown.items.get(chosen) ?? model.items.get(chosen) : null;
   const line = chosen ? shown.lines.get(chosen) : null;
   const open = (/** @type {string} */ key) => {
-    setOpened(new Set([...opened, key]));
+    // With the nodes of a namespace its topics, too: each is read beside the other.
+    const kinds = ["gnode", "gtopic", "gservice"].map((kind) => key.replace(/^g[a-z]+/, kind));
+    setOpened(new Set([...opened, key, ...kinds]));
     setChosen(null);
+  };
+  const fold = (/** @type {"namespace" | "host"} */ next) => {
+    setOpened(new Set());
+    setChosen(null);
+    setBy(next);
   };
   const topics = graph.topics.filter((/** @type {any} */ one) => matches(search, [one.name, one.type, ...one.publishers.map((/** @type {any} */ each) => each.node), ...one.subscribers]));
   return html`${head}
     <div class=${`graph-grid${item || line ? " with-details" : ""}`}>
       <section class="panel graph-panel" aria-label="Graph">
-        <div class="panel-head"><input class="input graph-search" type="search" data-search placeholder="Search nodes, topics, types, hosts" aria-label="Search the graph" value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} />
+        <div class="panel-head"><input class="input graph-search" type="search" data-search placeholder="Search nodes, topics, types, hosts" aria-label="Search the graph" value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} onKeyDown=${(/** @type {any} */ event) => event.key === "Enter" && choose(found(model, search))} />
           <${Check} label="Refused" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
           <${Check} label="Services" on=${wanted.services} set=${(services) => setWanted({ ...wanted, services })} />
           <${Check} label="Without logging" on=${wanted.quiet} set=${(quiet) => setWanted({ ...wanted, quiet })} />
+          <select class="input graph-fold" aria-label="Groups" value=${by} onInput=${(/** @type {any} */ event) => fold(event.target.value)}>
+            <option value="namespace" selected=${by === "namespace"}>Groups by namespace</option><option value="host" selected=${by === "host"}>Groups by host</option></select>
           <span class="end">${opened.size > 0 && html`<button class="button small" onClick=${() => setOpened(new Set())}>Close groups</button>`}
             ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Place everything anew">Arrange</button>`}</span></div>
-        ${form === "list" ? html`<${TopicList} topics=${topics} choose=${choose} chosen=${chosen} />`
+        ${form === "list" ? html`<${TopicList} topics=${topics} denials=${recent} choose=${choose} chosen=${chosen} />`
           : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
           : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} /><${Legend} />`}
       </section>
-      ${(item || line) && html`<${Details} key=${chosen} item=${item} line=${line} denials=${recent} choose=${choose} open=${open} />`}
+      ${(item || line) && html`<${Details} key=${chosen} item=${item} line=${line} shown=${shown} denials=${recent} choose=${choose} open=${open} />`}
     </div>`;
 }
 
@@ -97,6 +107,12 @@ function narrowed(/** @type {import("./model.js").Model} */ model, /** @type {st
   const lines = new Map([...model.lines].filter(([, line]) => hit.has(line.from) || hit.has(line.to)));
   for (const line of lines.values()) near.add(line.from).add(line.to);
   return { items: new Map([...model.items].filter(([key]) => near.has(key))), lines };
+}
+
+/** The thing of this name, else the one with the shortest name that has it in it: what Enter in the search opens. */
+function found(/** @type {import("./model.js").Model} */ model, /** @type {string} */ search) {
+  const named = [...model.items.values()].filter((one) => search.trim() && matches(search, [one.name]));
+  return named.sort((a, b) => a.name.length - b.name.length)[0]?.key ?? null;
 }
 
 function matches(/** @type {string} */ search, /** @type {string[]} */ words) {

@@ -3,11 +3,18 @@
 import { html } from "../html.js";
 import { pieces, plain } from "../words.js";
 
+const WORD = 24;
+
 /** @param {{value: unknown, most?: number, mono?: boolean, none?: string}} given */
 export function Given({ value, most = 160, mono = false, none = "–" }) {
   if (value === null || value === undefined || value === "") return html`<span class="muted">${none}</span>`;
   const shown = pieces(value, most);
   const cut = String(value).length > most;
   return html`<bdi class=${`given${mono ? " given-mono" : ""}`} title=${cut ? plain(value, 1000) : undefined}>
-    ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : one.text))}</bdi>`;
+    ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : mono ? words(one.text) : one.text))}</bdi>`;
+}
+
+/** A name breaks after its slashes and underscores; a word too long for a line breaks where it must. */
+function words(/** @type {string} */ text) {
+  return (text.match(/[/_]*[^/_]+[/_]*/g) ?? [text]).map((one) => html`${one.length > WORD ? html`<span class="long">${one}</span>` : one}<wbr />`);
 }

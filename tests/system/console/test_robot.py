@@ -1,0 +1,137 @@
+"""A robot of a hundred nodes and two hundred topics: read at a glance, opened where it stands, found by name."""
+
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from tests.support.appliance import Appliance
+from tests.support.robot import Robot
+from tests.system.console.reader import Reader
+
+WIDE, NARROW = (1280, 800), (390, 844)
+SMALLEST_NAME = 11  # pixels on the screen
+
+
+@pytest.fixture(scope="module")
+def robot(appliance: Appliance) -> Iterator[Robot]:
+    """The robot; a node of another machine has tried to command its arm."""
+    with Robot(appliance.master_uri) as robot:
+        refused = robot.call(
+            "/operator/bridge",
+            "registerPublisher",
+            "/guarded",
+            "std_msgs/Float64",
+            robot.api("/operator/bridge"),
+        )
+        assert refused[0] != 1
+        yield robot
+
+
+@pytest.mark.usefixtures("robot")
+@pytest.mark.parametrize("size", [WIDE, NARROW])
+def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[int, int]) -> None:
+    """Ten namespaces, none cut off, none over another, every name as large as one reads."""
+    page = opened(width=size[0], height=size[1]).go("graph")
+    expect(page.locator(".box.many")).to_have_count(10)
+    expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
+    frame = page.locator(".drawing").bounding_box()
+    boxes = [_place(one) for one in page.locator(".box .shape").all()]
+    assert frame is not None
+    for left, top, right, bottom in boxes:
+        assert frame["x"] <= left < right <= frame["x"] + frame["width"]
+        assert frame["y"] <= top < bottom <= frame["y"] + frame["height"]
+    assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
+    assert _smallest_name(page) >= SMALLEST_NAME
+    for _step in range(6):
+        page.get_by_role("button", name="Farther").click()
+    assert _smallest_name(page) >= SMALLEST_NAME
+
+
+@pytest.mark.usefixtures("robot")
+def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
+    """The parts of /arm stand in its place, nothing over another; what stood above it has not moved."""
+    page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
+    group = page.locator('[data-key="gnode:/arm/*"]')
+    at = _corner(group)
+    before = {key: spot for key, spot in _corners(page).items() if spot[0] <= at[0] and spot[1] < at[1]}
+    assert before
+    group.focus()
+    page.keyboard.press("Enter")
+    page.get_by_role("button", name="Open the group").click()
+    expect(page.locator('[data-key="n/arm/planner"]')).to_be_visible()
+    after = _corners(page)
+    assert {key: after[key] for key in before} == before
+    assert at in after.values()
+    boxes = [_place(one) for one in page.locator(".box .shape").all()]
+    assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
+    page.get_by_role("button", name="Close groups").click()
+    expect(page.locator(".box.many")).to_have_count(10)
+
+
+@pytest.mark.usefixtures("robot")
+def test_groups_by_host(opened: Callable[..., Reader]) -> None:
+    """The machines of the robot, and who talks to whom among them."""
+    page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
+    page.get_by_label("Groups", exact=True).select_option("host")
+    expect(page.locator(".box.many")).to_have_count(4)
+    expect(page.locator(".box.many").first).to_contain_text("127.0.0.1")
+
+
+@pytest.mark.usefixtures("robot")
+def test_who_talks_to_the_arm(opened: Callable[..., Reader]) -> None:
+    """Its name and Enter: publishers, subscribers; in the table who was refused, too."""
+    page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
+    search = page.get_by_label("Search the graph")
+    search.fill("/arm/command")
+    search.press("Enter")
+    details = page.get_by_role("region", name="Topic")
+    for node in ("/arm/planner", "/arm/controller", "/safety/watchdog"):
+        expect(details.get_by_role("button", name=node)).to_be_visible()
+    search.fill("/guarded")
+    expect(page.locator('[data-key="n/operator/bridge"]')).to_be_visible()
+    expect(page.locator("g.attempt")).to_have_count(1)
+
+
+@pytest.mark.usefixtures("robot")
+def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> None:
+    """Graph, Now and `rosrv status` count the same nodes and topics: the robot's, not the appliance's own."""
+    reader = opened()
+    expect(reader.go("graph").locator(".head-sub")).to_have_text("100 nodes, 200 topics, 0 services")
+    card = reader.go("now").get_by_role("link", name="Nodes 1")
+    expect(card).to_contain_text("100")
+    expect(card).to_contain_text("200 topics, 0 services")
+    status: dict[str, Any] = appliance.status()
+    assert (status["nodes"], status["topics"], status["services"]) == (100, 200, 0)
+
+
+def _corners(page: Page) -> dict[str, tuple[float, float]]:
+    """The upper left corner of each box in the drawing, however it is looked at."""
+    return {str(one.get_attribute("data-key")): _corner(one) for one in page.locator(".box").all()}
+
+
+def _corner(box: Locator) -> tuple[float, float]:
+    words = str(box.get_attribute("transform")).removeprefix("translate(").removesuffix(")").split()
+    return float(words[0]), float(words[1])
+
+
+def _place(shape: Locator) -> tuple[float, float, float, float]:
+    found = shape.bounding_box()
+    assert found is not None
+    return found["x"], found["y"], found["x"] + found["width"], found["y"] + found["height"]
+
+
+def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _smallest_name(page: Page) -> float:
+    """The size of the smallest name, in pixels on the screen."""
+    return float(
+        page.evaluate(
+            "Math.min(...[...document.querySelectorAll('.box-name')].map((one) =>"
+            " one.getAttribute('font-size') * one.getScreenCTM().a))"
+        )
+    )
