@@ -3,6 +3,7 @@
 import { html } from "../html.js";
 import { pieces, plain } from "../words.js";
 
+const SHORT = 14;
 const WORD = 24;
 
 /** @param {{value: unknown, most?: number, mono?: boolean, none?: string}} given */
@@ -14,7 +15,8 @@ export function Given({ value, most = 160, mono = false, none = "–" }) {
     ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : mono ? words(one.text) : one.text))}</bdi>`;
 }
 
-/** A name breaks after its slashes and underscores; a word too long for a line breaks where it must. */
+/** A short name does not break, a longer one after its slashes and underscores; a word too long for a line where it must. */
 function words(/** @type {string} */ text) {
-  return (text.match(/[/_]*[^/_]+[/_]*/g) ?? [text]).map((one) => html`${one.length > WORD ? html`<span class="long">${one}</span>` : one}<wbr />`);
+  if (text.length <= SHORT) return text;
+  return (text.match(/[/_]*[^/_]+[/_]*/g) ?? [text]).map((one, at) => [at > 0 && html`<wbr />`, one.length > WORD ? html`<span class="long">${one}</span>` : one]);
 }
