@@ -47,9 +47,8 @@ class RelayProcess:
             "connections": self._limits.connections,
             "descriptors": self._descriptors,
         }
-        level = logging.INFO if detail["congestion"] == "cubic" else logging.WARNING
         said = ", ".join(f"{name} {value}" for name, value in detail.items() if name != "index")
-        logging.getLogger(__name__).log(level, "relay %s serves: %s", self._index, said)
+        logging.getLogger(__name__).info("relay %s serves: %s", self._index, said)
         self._lifeline.send(Ready(detail))
         self._loop.run()
         self._engine.close()

@@ -67,6 +67,7 @@ class Life:
         self.started = time.monotonic()
         self.answered: float | None = None
         self.walls: Walled | None = None
+        self.congestion = ""  # of a relay's sockets
         self._asked = 0
         self._reports = reports
         self._loop = asyncio.get_running_loop()

@@ -330,6 +330,9 @@ class Supervisor:
     def _child_ready(self, life: Life, detail: dict[str, Any]) -> None:
         life.ready = True
         life.heard()
+        if life.role == "relay":
+            life.congestion = _printable(str(detail.get("congestion", "")))[:16]
+            self._tell_processes()
         if life.role != "control":
             return
         try:
@@ -460,7 +463,9 @@ class Supervisor:
 
     def _tell_processes(self) -> None:
         rows = [
-            messages.ProcessInfo(post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed)
+            messages.ProcessInfo(
+                post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed, life.congestion
+            )
             for post in self._posts
             if (life := post.life) is not None
         ]

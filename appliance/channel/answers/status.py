@@ -22,6 +22,7 @@ class ProcessInfo(msgspec.Struct, frozen=True):
         ),
     ] = ""
     lacks: Annotated[list[str], told("what this machine's kernel lacks of them")] = []
+    congestion: Annotated[str, told("the TCP congestion control of a relay's connections")] = ""
 
 
 class FirewallRule(msgspec.Struct, frozen=True):

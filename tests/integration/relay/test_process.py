@@ -29,9 +29,9 @@ def refuses(port: int) -> bool:
 
 
 def test_it_says_that_it_is_ready_and_how_it_sends(relay: RelayProcess) -> None:
-    """The status shows which congestion control it got and how many connections it may have."""
+    """Which congestion control its sockets get, and how many connections it may have."""
     assert relay.ready.detail["index"] == 0
-    assert relay.ready.detail["congestion"].startswith(("cubic", "bbr", "reno"))
+    assert relay.ready.detail["congestion"] in {"cubic", "reno"}
     assert (
         relay.ready.detail["connections"] == fitted(Limits(), relay.ready.detail["descriptors"]).connections
     )

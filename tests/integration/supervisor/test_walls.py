@@ -27,6 +27,7 @@ from appliance.supervisor.walls import landlock
 from tests.integration.supervisor import trying
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root, needs
+from tests.support.waiting import eventually
 
 ROOT = Path(trying.__file__).parents[3]
 CHILD = "appliance.supervisor.child"
@@ -216,3 +217,16 @@ def test_status_shows_the_walls() -> None:
     for name in ("rosmaster", "rosout"):
         assert (rows[name]["walls"], rows[name]["lacks"]) == (f"usual calls, Landlock {abi}", [])
     assert rows["supervisor"]["walls"] == ""
+
+
+def test_status_shows_how_the_relay_sends() -> None:
+    """As its own user it gets cubic where the kernel lets everybody have it, else reno."""
+    need_root()
+    with Appliance() as running:
+
+        def congestion() -> str:
+            said: str = running.processes()["relay"]["congestion"]
+            return said
+
+        allowed = Path("/proc/sys/net/ipv4/tcp_allowed_congestion_control").read_text().split()
+        assert eventually(congestion, running.story) == ("cubic" if "cubic" in allowed else "reno")
