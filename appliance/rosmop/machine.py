@@ -6,36 +6,40 @@ Theory of operation:
   a byte that is copied), the same on every machine. Memory is bounded by a limit. What goes beyond is a `MachineTrap`.
 - The addresses of the whole limit are reserved at the start and the memory grows in place: a view of it is never
   wrong, an older one is only shorter. A view keeps the memory when the machine is closed.
-- wasmtime's own call in Python costs 20 µs. Its C function is called directly (0.5 µs), under Python's lock, so that no
-  other thread is ever within a machine. That stands on how this version lays out arguments: `calls_directly`
-  tries it once, and where it is another, the slow call is taken, and the log says so.
+- The library of the package `wasmtime` is called by its C functions (0.6 µs a call, 20 by its Python) under Python's
+  lock: no other thread is ever within a machine. Its Python could not be loaded in the relay: it has functions that
+  C calls, for which libffi wants memory that is writable and executable at once. So a module has no imports, either.
 - Traps come without signals: a handler of SIGSEGV (`faulthandler`) is not in the way.
 """
 
 import ctypes
+import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
+from itertools import count
+from pathlib import Path
 from typing import Any
-
-import structlog
-import wasmtime
-from wasmtime import _ffi, _func
 
 PAGE = 1 << 16
 """Memory grows by so many bytes."""
 
 VERSION = "50."
-"""How the versions of wasmtime begin whose layout of arguments is known."""
+"""How the versions of wasmtime begin whose functions and layouts these are."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
-_RESULTS: tuple[list[str], ...] = ([], ["i32"], ["i64"])
-_OFF = ("threads", "shared_memory", "multi_memory", "memory64", "relaxed_simd", "simd", "tail_call", "gc",
-        "function_references", "exceptions", "component_model", "custom_page_sizes",
-        "stack_switching", "wide_arithmetic")  # fmt: skip
-_log = structlog.get_logger()
+_FUNCTION, _MEMORY = 0, 3  # kinds of exports
+_KINDS = {0: "i", 1: "q"}  # of values: integers of 32 and 64 bits
+_REASONS = ("stack overflow", "memory out of bounds", "misaligned access", "table out of bounds",
+            "indirect call to null", "bad signature", "integer overflow", "integer division by zero",
+            "bad conversion to integer", "unreachable", "interrupt", "out of fuel")  # fmt: skip
+_OFF = ("component_model", "custom_page_sizes", "exceptions", "function_references", "gc", "memory64", "multi_memory",
+        "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
+
+_Call = Callable[[tuple[int, ...], int], int | None]
 
 
 class MachineError(Exception):
@@ -55,61 +59,63 @@ class MachineTrap(Exception):  # noqa: N818  its name in WebAssembly
 
 
 class Machine:
-    """A module and the memory that it exports as `memory`.
+    """A module, which has no imports, and the memory that it exports as `memory`.
 
-    `limit` is how large the memory may become, in bytes. `imports` are functions of integers that the module calls, by
-    name: slow, not to call the machine in turn; what they raise goes through `call`. Raises `MachineError`, and
-    `MachineTrap` for what the module does at its start.
+    `limit` is how large the memory may become, in bytes. Raises `MachineError`, and `MachineTrap` for what the module
+    does at its start.
     """
 
-    def __init__(
-        self, code: bytes, limit: int, imports: Mapping[str, Callable[..., int | None]] | None = None
-    ) -> None:
-        if not code.startswith(b"\0asm"):
-            raise MachineError("not a WebAssembly module")
+    def __init__(self, code: bytes, limit: int) -> None:
+        c = load()
         engine = _engine(max(limit - 1, PAGE - 1).bit_length())
-        store = wasmtime.Store(engine)
-        store.set_limits(limit, _TABLE_ELEMENTS, instances=1, tables=1, memories=1)
-        store.set_fuel(_FUEL_AT_START)
-        try:
-            module = wasmtime.Module(engine, code)
-            given = []
-            for needed in module.imports:
-                function = (imports or {}).get(needed.name or "")
-                if function is None or not isinstance(needed.type, wasmtime.FuncType):
-                    raise MachineError(f"the module needs {needed.name}")
-                given.append(wasmtime.Func(store, needed.type, function))
-            exports = wasmtime.Instance(store, module, given).exports(store)
-        except wasmtime.Trap as trap:
-            raise _trapped(trap) from None
-        except wasmtime.WasmtimeError as error:
-            raise MachineError(str(error)) from None
-        memory = exports.get("memory")
-        if not isinstance(memory, wasmtime.Memory):
-            raise MachineError("the module exports no memory")
-        self._memory = memory
-        self._store: wasmtime.Store | None = store
-        self._functions = _functions(store, exports, _raw if calls_directly() else _public)
+        store = _Store(engine, limit)
+        self._store: _Store | None = store
+        self._functions: dict[str | int, _Call] = {}
+        self._memory: _Export | None = None
         self._view = memoryview(b"")
+        module, instance, trap = ctypes.c_void_p(), (ctypes.c_uint64 * 2)(), ctypes.c_void_p()
+        _check(c.wasmtime_module_new(engine, code, len(code), ctypes.byref(module)))
+        try:
+            _check(c.wasmtime_context_set_fuel(store.context, _FUEL_AT_START))
+            _check(c.wasmtime_instance_new(store.context, module, None, 0, instance, ctypes.byref(trap)))
+        finally:
+            c.wasmtime_module_delete(module)
+        if trap:
+            raise _trapped(trap)
+        name, length, export = ctypes.c_void_p(), ctypes.c_size_t(), _Export()
+        for number in count():
+            out = (ctypes.byref(one) for one in (name, length, export))
+            if not c.wasmtime_instance_export_nth(store.context, instance, number, *out):
+                break
+            text = ctypes.string_at(name.value or 0, length.value).decode()
+            if export.kind == _FUNCTION:
+                call = _bound(store, export)
+                if call is not None:
+                    self._functions[len(self._functions) // 2] = self._functions[text] = call
+            elif export.kind == _MEMORY and text == "memory":
+                self._memory = _Export.from_buffer_copy(export)
+        if self._memory is None:
+            raise MachineError("the module exports no memory")
 
     @property
     def memory(self) -> memoryview:
         """All of the memory, to read and write; ask again when it has grown. Raises `MachineError` when closed."""
-        store = self._open()
-        if self._memory.data_len(store) != len(self._view):
-            found = self._memory.get_buffer_ptr(store)
-            found.keeps = store  # type: ignore[attr-defined]  # as long as there is a view
+        asked = self._asked()
+        size = load().wasmtime_memory_data_size(*asked)
+        if size != len(self._view):
+            found = (ctypes.c_ubyte * size).from_address(load().wasmtime_memory_data(*asked))
+            found.keeps = self._store  # as long as there is a view
             self._view = memoryview(found).cast("B")
         return self._view
 
     def reserve(self, size: int) -> None:
         """Let the memory grow to `size` bytes or more. Raises `MachineError` beyond the limit."""
-        store = self._open()
-        missing = size - self._memory.data_len(store)
-        try:
-            self._memory.grow(store, max(-(-missing // PAGE), 0))
-        except wasmtime.WasmtimeError:
-            raise MachineError(f"{size} bytes are beyond the memory's limit") from None
+        missing = size - len(self.memory)
+        _check(
+            load().wasmtime_memory_grow(
+                *self._asked(), max(-(-missing // PAGE), 0), ctypes.byref(ctypes.c_uint64())
+            )
+        )
 
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
         """The result of an exported function of integers (signed), by its name or its number among them.
@@ -121,7 +127,7 @@ class Machine:
         try:
             function = self._functions[name]
         except KeyError:
-            self._open()
+            self._asked()
             raise MachineError(f"the module has no function {name!r} of integers") from None
         return function(arguments, fuel)
 
@@ -129,128 +135,153 @@ class Machine:
         """Give the module back, and the memory when the last view of it is gone."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
-    def _open(self) -> wasmtime.Store:
-        if self._store is None:
+    def _asked(self) -> tuple[int, Any]:
+        """How the memory is named to C."""
+        if self._store is None or self._memory is None:
             raise MachineError("the machine is closed")
-        return self._store
+        return self._store.context, ctypes.byref(self._memory, _Export.of.offset)
 
 
-_Call = Callable[[tuple[int, ...], int], int | None]
+class _Export(ctypes.Structure):
+    _fields_ = (("kind", ctypes.c_uint8), ("of", ctypes.c_uint64 * 3))
+
+
+class _Vector(ctypes.Structure):
+    _fields_ = (("size", ctypes.c_size_t), ("data", ctypes.POINTER(ctypes.c_void_p)))
+
+
+class _Store:
+    """What a machine has of wasmtime; freed when nobody has it any more."""
+
+    def __init__(self, engine: int, limit: int) -> None:
+        self._library = load()
+        self._address = self._library.wasmtime_store_new(engine, None, None)
+        self.context: int = self._library.wasmtime_store_context(self._address)
+        self._library.wasmtime_store_limiter(self._address, limit, _TABLE_ELEMENTS, 1, 1, 1)
+
+    def __del__(self) -> None:
+        self._library.wasmtime_store_delete(self._address)
+
+
+_P, _SIZE = ctypes.c_void_p, ctypes.c_size_t
+_C: dict[str, tuple[Any, ...]] = {  # what each function gives, and what it takes
+    "wasm_byte_vec_delete": (None, _P),
+    "wasm_config_new": (_P,),
+    "wasm_engine_new_with_config": (_P, _P),
+    "wasm_functype_delete": (None, _P),
+    "wasm_functype_params": (ctypes.POINTER(_Vector), _P),
+    "wasm_functype_results": (ctypes.POINTER(_Vector), _P),
+    "wasm_trap_delete": (None, _P),
+    "wasm_valtype_kind": (ctypes.c_uint8, _P),
+    "wasmtime_context_set_fuel": (_P, _P, ctypes.c_uint64),
+    "wasmtime_error_delete": (None, _P),
+    "wasmtime_error_message": (None, _P, _P),
+    "wasmtime_func_type": (_P, _P, _P),
+    "wasmtime_instance_export_nth": (ctypes.c_bool, _P, _P, _SIZE, _P, _P, _P),
+    "wasmtime_instance_new": (_P, _P, _P, _P, _SIZE, _P, _P),
+    "wasmtime_memory_data": (_P, _P, _P),
+    "wasmtime_memory_data_size": (_SIZE, _P, _P),
+    "wasmtime_memory_grow": (_P, _P, _P, ctypes.c_uint64, _P),
+    "wasmtime_module_delete": (None, _P),
+    "wasmtime_module_new": (_P, _P, _P, _SIZE, _P),
+    "wasmtime_store_context": (_P, _P),
+    "wasmtime_store_delete": (None, _P),
+    "wasmtime_store_limiter": (None, _P, *[ctypes.c_int64] * 5),
+    "wasmtime_store_new": (_P, _P, _P, _P),
+    "wasmtime_trap_code": (ctypes.c_bool, _P, _P),
+}
 
 
 @cache
-def _engine(bits: int) -> wasmtime.Engine:
+def load() -> ctypes.PyDLL:
+    """wasmtime's functions of C. Raises `MachineError` where it is another version."""
+    package, found = find_spec("wasmtime"), version("wasmtime")
+    if package is None or package.origin is None or not found.startswith(VERSION):
+        raise MachineError(f"wasmtime {VERSION}x is needed, and {found} is here")
+    folder = f"linux-{os.uname().machine}"
+    library = ctypes.PyDLL(str(Path(package.origin).with_name(folder) / "_libwasmtime.so"))
+    for name, (result, *given) in _C.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, given
+    return library
+
+
+@cache
+def _engine(bits: int) -> int:
     """What compiles the modules of all machines with a limit of up to 2**bits bytes."""
-    config = wasmtime.Config()
-    for feature in _OFF:
-        setattr(config, feature if feature == "shared_memory" else f"wasm_{feature}", False)
-    config.consume_fuel = True
-    config.cranelift_nan_canonicalization = True  # a NaN in a message has the same bits on every machine
-    config.memory_guard_size = 0
-    config.memory_may_move = False
-    config.memory_reservation = 1 << bits
-    config.parallel_compilation = False  # no threads
-    config.signals_based_traps = False
-    return wasmtime.Engine(config)
+    settings = {
+        **dict.fromkeys((f"wasm_{feature}" for feature in _OFF), 0),
+        "shared_memory": 0,
+        "consume_fuel": 1,
+        "cranelift_nan_canonicalization": 1,  # a NaN in a message has the same bits on every machine
+        "memory_guard_size": 0,
+        "memory_may_move": 0,
+        "memory_reservation": 1 << bits,
+        "parallel_compilation": 0,  # no threads
+        "signals_based_traps": 0,
+    }
+    config = load().wasm_config_new()
+    for name, value in settings.items():
+        load()[f"wasmtime_config_{name}_set"](ctypes.c_void_p(config), ctypes.c_uint64(value))
+    engine: int = load().wasm_engine_new_with_config(config)
+    return engine
 
 
-def _functions(
-    store: wasmtime.Store, exports: Mapping[str, object],
-    bind: Callable[[wasmtime.Store, wasmtime.Func, int, list[str]], _Call],
-) -> dict[str | int, _Call]:  # fmt: skip
-    found: dict[str | int, _Call] = {}
-    for name, export in exports.items():
-        if isinstance(export, wasmtime.Func):
-            kind = export.type(store)
-            results = [str(one) for one in kind.results]
-            if results in _RESULTS and {str(one) for one in kind.params} <= {"i32", "i64"}:
-                found[len(found) // 2] = found[name] = bind(store, export, len(kind.params), results)
-    return found
+def _bound(store: _Store, export: _Export) -> _Call | None:
+    """A function as it is called from Python; None if it has others than integers.
 
-
-def _raw(store: wasmtime.Store, function: wasmtime.Func, arity: int, results: list[str]) -> _Call:
-    """Calls through C: arguments and result stand in slots of 16 bytes; what comes back is ours to free."""
-    library = ctypes.PyDLL(str(_ffi.filename))
-    invoke, refuel = library.wasmtime_func_call_unchecked, library.wasmtime_context_set_fuel
+    Arguments and result stand in slots of 16 bytes; a trap or error that comes back is ours to free.
+    """
+    c = load()
+    native = _Export.from_buffer_copy(export)
+    function = ctypes.byref(native, _Export.of.offset)
+    kind = c.wasmtime_func_type(store.context, function)
+    takes, gives = (_kinds(one(kind)) for one in (c.wasm_functype_params, c.wasm_functype_results))
+    c.wasm_functype_delete(kind)
+    if len(gives) > 1 or None in (*takes, *gives):
+        return None
+    # Without the types of their arguments, which would be looked at in each call.
+    invoke, refuel = c["wasmtime_func_call_unchecked"], c["wasmtime_context_set_fuel"]
     invoke.restype = refuel.restype = ctypes.c_void_p
-    slots = (ctypes.c_uint64 * (2 * max(arity, 1)))()
-    fill = struct.Struct("<" + "q8x" * arity).pack_into
-    plain = memoryview(slots).cast("B")
-    read = (plain.cast("i") if results == ["i32"] else plain.cast("q")) if results else (None,)
-    native, trap, tank = function._func, ctypes.c_void_p(), ctypes.c_uint64()
-    slots.keeps = store  # type: ignore[attr-defined]  # until the call is over, whoever closes the machine
-    context = ctypes.cast(store._context(), ctypes.c_void_p)
-    given = (context, ctypes.byref(native), slots, ctypes.c_size_t(len(slots) // 2), ctypes.byref(trap))
+    slots = (ctypes.c_uint64 * (2 * max(len(takes), 1)))()
+    slots.keeps = store, native  # type: ignore[attr-defined]  # until the call is over, whoever closes the machine
+    fill = struct.Struct("<" + "q8x" * len(takes)).pack_into
+    read = memoryview(slots).cast("B").cast(gives[0]) if gives else (None,)
+    trap, tank, context = ctypes.c_void_p(), ctypes.c_uint64(), ctypes.c_void_p(store.context)
+    given = (context, function, slots, ctypes.c_size_t(len(slots) // 2), ctypes.byref(trap))
 
     def call(arguments: tuple[int, ...], fuel: int) -> int | None:
         fill(slots, 0, *arguments)
         tank.value = fuel
         refuel(context, tank)
-        error = invoke(*given)
-        if error is None and not trap:
-            return read[0]
-        if error is not None:
-            stopped = MachineTrap(str(_owned(wasmtime.WasmtimeError, _ffi.wasmtime_error_t, error)))
-        else:
-            stopped = _trapped(_owned(wasmtime.Trap, _ffi.wasm_trap_t, trap.value))
-            trap.value = None
-        _func.maybe_raise_last_exn()  # of an imported function
-        raise stopped
+        _check(invoke(*given))
+        if trap:
+            raise _trapped(trap)
+        return read[0]
 
     return call
 
 
-def _owned(kind: Any, structure: Any, address: int | None) -> Any:
-    """The object that frees what stands there."""
-    return kind._from_ptr(ctypes.cast(ctypes.c_void_p(address), ctypes.POINTER(structure)))
+def _kinds(vector: Any) -> list[Any]:
+    """Of values; None for one that is no integer."""
+    found = vector.contents
+    return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 
 
-def _public(store: wasmtime.Store, function: wasmtime.Func, arity: int, results: list[str]) -> _Call:
-    """Calls as wasmtime offers them."""
-    del results
-    check = struct.Struct(f"<{arity}q").pack
-
-    def call(arguments: tuple[int, ...], fuel: int) -> int | None:
-        check(*arguments)
-        store.set_fuel(fuel)
-        try:
-            found: int | None = function(store, *arguments)
-        except wasmtime.Trap as trap:
-            raise _trapped(trap) from None
-        except wasmtime.WasmtimeError as error:
-            raise MachineTrap(str(error)) from None
-        return found
-
-    return call
+def _check(error: int | None) -> None:
+    if error is not None:
+        c, text = load(), _Vector()
+        c.wasmtime_error_message(error, ctypes.byref(text))
+        message = ctypes.string_at(text.data, text.size).decode()
+        c.wasm_byte_vec_delete(ctypes.byref(text))
+        c.wasmtime_error_delete(error)
+        raise MachineError(message)
 
 
-def _trapped(trap: wasmtime.Trap) -> MachineTrap:
-    code = trap.trap_code
-    return MachineTrap(str(trap) if code is None else code.name.lower().replace("_", " "))
-
-
-_TRIED = """(module
-    (func (export "sum") (param i32 i64 i32) (result i64)
-        (i64.add (i64.extend_i32_s (local.get 0)) (i64.sub (local.get 1) (i64.extend_i32_s (local.get 2)))))
-    (func (export "narrow") (param i64) (result i32) (i32.wrap_i64 (local.get 0)))
-    (func (export "endless") (loop (br 0))))"""
-
-
-@cache
-def calls_directly() -> bool:
-    """Whether wasmtime's C function does in this version what `_raw` expects of it; the log says if it does not."""
-    found = version("wasmtime")
-    if found.startswith(VERSION):
-        store = wasmtime.Store(_engine(PAGE.bit_length()))
-        module = wasmtime.Module(store.engine, _TRIED)
-        calls = _functions(store, wasmtime.Instance(store, module, []).exports(store), _raw)
-        results = calls["sum"]((-1, 1 << 40, 7), 100), calls["narrow"]((-5,), 100)
-        try:
-            calls["endless"]((), 100)
-        except MachineTrap as trap:
-            if results == ((1 << 40) - 8, -5) and trap.out_of_fuel:
-                return True
-    _log.warning(
-        "modules run slowly: this wasmtime lays arguments out in an unknown way", found=found, known=VERSION
-    )
-    return False
+def _trapped(trap: ctypes.c_void_p) -> MachineTrap:
+    """What a trap says; it is freed."""
+    c, code = load(), ctypes.c_uint8()
+    c.wasmtime_trap_code(trap, ctypes.byref(code))
+    c.wasm_trap_delete(trap)
+    trap.value = None
+    return MachineTrap(_REASONS[code.value])

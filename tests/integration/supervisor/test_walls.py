@@ -107,7 +107,7 @@ class Place:
                 "/etc/hostname",
                 str(self.state.config),
                 str(self.theirs / "file"),
-                "/var/lib/dpkg/status",
+                "/var/cache/debconf/templates.dat",
             ],
             "writes": [str(part / "mine"), str(self.theirs / "new"), str(self.theirs / "file"), "/dev/null"],
             "pid": pid,
@@ -116,8 +116,8 @@ class Place:
         (part / "trial").chmod(0o644)
         return wanted
 
-    def inside(self, role: Role) -> tuple[dict[str, Any], Walled]:
-        """What comes of it in the role's walls, and what the process says of them."""
+    def inside(self, role: Role, entry: str = "main") -> tuple[dict[str, Any], Walled]:
+        """What this function of `trying` tells from the role's walls, and what the process says of them."""
         here, there = socket.socketpair()
         facts = Facts(
             self.state.path, self.state.config, self.ports[0], "http://127.0.0.1:1", syslog_port=self.ports[0]
@@ -125,7 +125,7 @@ class Place:
         plan = Post(role, 0).plan(facts, there.fileno())
         walls = replace(plan.walls, reads=(*plan.walls.reads, str(ROOT)))
         plan = msgspec.structs.replace(
-            plan, walls=walls, argv=(), entry=f"{trying.__name__}:main", secret=None
+            plan, walls=walls, argv=(), entry=f"{trying.__name__}:{entry}", secret=None
         )
         with here, there:
             done = subprocess.run(
@@ -201,6 +201,16 @@ def test_what_is_forbidden_is_refused_from_inside(place: Place, name: str) -> No
     assert found["signal"] == "EPERM"
     for what in ("read", "write"):
         assert set(outside[what].values()) == {"done"}, "its user may, without the walls"
+
+
+def test_a_relay_runs_modules_within_its_walls(place: Place) -> None:
+    """Also one that comes later: their code is memory that may be executed and not written, and starts no thread."""
+    found, said = place.inside(place.roles["relay"], "run_modules")
+    assert said == Walled("listed", landlock.version(), [])
+    assert (found["results"], found["traps"]) == ([7, 7], ["integer division by zero"] * 2)
+    assert len(found["executable"]) >= found["before"] + 2
+    assert {protection[:3] for protection in found["executable"]} == {"r-x"}
+    assert found["threads"] == 1
 
 
 def test_status_shows_the_walls() -> None:
