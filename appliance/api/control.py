@@ -18,8 +18,9 @@ import structlog
 
 from appliance.api.access import Bearer
 from appliance.channel import messages
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, RestChange, decode
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.operations import CHANGES
 
 _log = structlog.get_logger()
 _MOST_OPEN = 48
@@ -33,7 +34,7 @@ class ControlAwayError(Exception):
 
 def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> messages.RequestMade:
     shown = bearer.shown if bearer is not None else ""
-    asked = bearer.asked if bearer is not None and isinstance(request, RestChange) else None
+    asked = bearer.asked if bearer is not None and type(request) in CHANGES else None
     return messages.RequestMade(number, request, shown, asked)  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
 
 

@@ -201,9 +201,12 @@ async def _placed(services: Services, wishes: Wishes, bearer: Bearer) -> Wishes:
 async def _token(
     services: Services, name: str, asked: TokenWishes, expected: int | None, bearer: Bearer
 ) -> EnrolmentToken:
+    _wishes(asked)  # refuses what makes no sense
     order = HostToken(
         name,
-        _wishes(asked).kept(),
+        asked.endpoint,
+        asked.ports,
+        asked.open,
         asked.token_seconds,
         asked.days,
         asked.address,

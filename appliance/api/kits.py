@@ -21,10 +21,6 @@ class Wishes:
         parse_ports(self.ports)
         parse_services(self.opened)
 
-    def kept(self) -> dict[str, str]:
-        """As it is kept with a one-time token."""
-        return {"endpoint": self.endpoint, "ports": self.ports, "open": ",".join(self.opened)}
-
     @classmethod
     def of(cls, kept: Mapping[str, str]) -> "Wishes":
         """What was kept."""

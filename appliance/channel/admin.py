@@ -2,8 +2,8 @@
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make tokens, and gets the same document back. Of these, control makes a
-`RestChange` only with the proof that the holder of a token asked for just that (`appliance/control/rest_proof.py`).
+passes on `RestRequest`, which cannot make tokens, and gets the same document back; which HTTP request asks what is in
+`operations.py`.
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
@@ -182,17 +182,18 @@ class HostAdd(AdminRequest[hosts.KitParts], frozen=True, tag="host add"):
 
 
 class HostToken(AdminRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
-    """Make a token by which a host enrols itself once within `seconds`; an earlier one of the name ends.
+    """Make a token by which a host enrols itself once within `token_seconds`; an earlier one of the name ends.
 
-    The `endpoint` of `kit` is found by the appliance where it is empty.
-
-    Its text is in the answer and nowhere else. `kit` is kept with it for whoever makes the host's kit. With `new`
-    it is refused for a host that is enrolled; else such a host may come with another key.
+    Its text is in the answer and nowhere else. `endpoint` (None: the appliance finds it), `ports` and `open` are kept
+    with it for whoever makes the host's kit. With `new` it is refused for a host that is enrolled; else such a host
+    may come with another key.
     """
 
     name: str
-    kit: dict[str, str]
-    seconds: float = 3600
+    endpoint: str | None = None
+    ports: str = "32768-60999"
+    open: list[str] = []
+    token_seconds: float = 3600
     days: float = 90
     address: str | None = None
     expected: int | None = None
@@ -265,7 +266,7 @@ class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
 
     name: str
     state: Literal["closed", "open", "unknown"]
-    open: list[int]
+    open: list[int] = []
     checked: float | None = None
     expected: int | None = None
 
@@ -299,10 +300,6 @@ _Common = (
     | HostRequest
 )  # fmt: skip
 RestRequest = _Common | ChallengeWanted
-RestChange = (
-    PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | MonitorChange | TokenRevoke | HostAdd | HostToken
-    | HostRenew | HostRevoke | HostPorts | HostsReload
-)  # fmt: skip
 AnyRequest = _Common | TokenAdd
 
 

@@ -40,8 +40,12 @@ class HostOrders:
         """A one-time token for a host."""
         return await self._hosts.token(
             request.name,
-            kit=request.kit,
-            seconds=request.seconds,
+            kit={
+                "endpoint": request.endpoint or "",
+                "ports": request.ports,
+                "open": ",".join(request.open),
+            },
+            seconds=request.token_seconds,
             days=request.days,
             address=request.address,
             new=request.new,

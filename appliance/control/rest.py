@@ -28,11 +28,11 @@ from appliance.channel.admin import (
     HostRenewed,
     HostRenewItself,
     HostToken,
-    RestChange,
     encode,
     verb_of,
 )
 from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.operations import CHANGES
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
 from appliance.control.tokens import Tokens
@@ -43,7 +43,7 @@ _MOST_WAITING = 64
 _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
-_CHANGES = RestChange | HostEnrol | HostRenewItself | HostRenewed
+_CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
 _SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself
 _MOST_SLOW = 16
 
@@ -128,7 +128,7 @@ class RestLink:
             self._send_answer(made.number, answer)
 
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer[Any]:
-        if isinstance(made.request, _CHANGES) and self._recorder.obstacle is not None:
+        if type(made.request) in _CHANGES and self._recorder.obstacle is not None:
             return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
         try:
             who = await self._askers.asker(made)

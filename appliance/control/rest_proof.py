@@ -20,9 +20,9 @@ from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.tokens import Challenge
 from appliance.channel.messages import Asked, RequestMade
+from appliance.channel.operations import CHANGES, operation_of
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant
-from appliance.control.rest_rights import RANKS, role_for
 from appliance.control.tokens import Tokens
 from appliance.order_proof import (
     HEADER,
@@ -37,6 +37,7 @@ from appliance.order_proof import (
 from appliance.store.tokens import TokenRow, is_secret, parse_token
 
 _ITSELF = "the host itself"
+_RANKS = {"viewer": 1, "operator": 2, "admin": 3}
 
 
 class UnprovenError(Exception):
@@ -65,13 +66,13 @@ class Askers:
 
     async def asker(self, made: RequestMade) -> str:
         """The name of the token in whose name this is asked. Raises `UnprovenError`."""
-        role = role_for(made.request)
+        role = _role_for(made.request)
         if role is None:
             return _ITSELF if isinstance(made.request, admin.HostRequest) else ""
         row = await self._holder(made.shown)
-        if RANKS[row.role] < RANKS[role]:
+        if _RANKS[row.role] < _RANKS[role]:
             raise UnprovenError(f"this is for {role}s; the token {row.name} is a {row.role}'s", row.name)
-        if isinstance(made.request, admin.RestChange):
+        if type(made.request) in CHANGES:
             self._require_order(made, row)
         return row.name
 
@@ -138,3 +139,11 @@ class Askers:
             self._challenges.take(challenge, time.monotonic())
         except (BadProofError, ChallengeRefusedError) as error:
             raise UnprovenError(str(error), row.name) from None
+
+
+def _role_for(request: admin.RestRequest) -> str | None:
+    """The least role of a token that may ask this; None where no token is needed."""
+    if isinstance(request, admin.MonitorReload) and request.prune:
+        return "admin"  # removes what an admin loaded
+    operation = operation_of(request)
+    return operation.role if operation is not None else "admin"

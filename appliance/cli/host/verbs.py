@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec.structs import replace
 
+from appliance.api.kits import Wishes
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.channel.answers.hosts import Host, PortsSeen
 from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
@@ -73,10 +75,8 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             raise usage_error(
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
-        seconds = _seconds(within)
-        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
-            order = HostToken(name, wishes.kept(), seconds, days, address, new=True)
-            write_script(output, running.ask_or_exit(order, as_json=as_json), as_json=as_json)
+        order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
+        _write_script(running, order, wishes, out, as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
         writer = KitWriter(output, csr=csr)
@@ -108,10 +108,8 @@ def kit(  # noqa: PLR0917  as above
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
-        seconds = _seconds(within)
-        with new_output(out, f"rosrv-{name}-join.sh", as_json=as_json) as output:
-            order = HostToken(name, wishes.kept(), seconds, days)
-            write_script(output, running.ask_or_exit(order, as_json=as_json), as_json=as_json)
+        order = HostToken(name, token_seconds=_seconds(within), days=days)
+        _write_script(running, order, wishes, out, as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
         writer = KitWriter(output, csr=csr)
@@ -181,6 +179,14 @@ def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
         say(f"{body.name} is awaited no longer: its one-time token opens nothing")
     else:
         say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
+
+
+def _write_script(
+    running: Appliance, order: HostToken, wishes: Wishes, out: Path | None, *, as_json: bool
+) -> None:
+    asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=[*wishes.opened])
+    with new_output(out, f"rosrv-{order.name}-join.sh", as_json=as_json) as output:
+        write_script(output, running.ask_or_exit(asked, as_json=as_json), as_json=as_json)
 
 
 def _words(row: Host) -> list[str]:

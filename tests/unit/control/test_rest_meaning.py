@@ -2,12 +2,14 @@
 
 import asyncio
 import functools
+import re
 import time
-from typing import Any, get_args
+from typing import Any
 
 import httpx
 import msgspec
 import pytest
+from fastapi import FastAPI
 
 from appliance.api.access import Bearer, Doorkeeper
 from appliance.api.app import build_app
@@ -23,6 +25,7 @@ from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.policy import PolicyKnown
 from appliance.channel.messages import Asked
+from appliance.channel.operations import CHANGES, OPERATIONS
 from appliance.config import Settings
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.store.tokens import make_token
@@ -83,7 +86,7 @@ class Listening(ControlLink):
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = 1.0
     ) -> AdminAnswer[A]:  # fmt: skip
         """What control answers."""
-        if isinstance(request, admin.RestChange):
+        if type(request) in CHANGES:
             self.orders.append(_made(0, request, bearer))
             return AdminAnswer(False, error="noted", trouble="busy")
         return AdminAnswer(True, LOOKS[type(request)])
@@ -95,15 +98,20 @@ def api() -> tuple[Gate, Listening, str]:
     row, token = make_token("alice", "admin", now=time.time(), seconds=6000)
     door, control, journal = Doorkeeper(10), Listening(), Journal(lambda _call: None)
     door.state([messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)])
-    settings = Settings()
+    limits = Settings().api_limits.model_copy(update={"burst": 100_000})
+    gate = Gate(
+        application(control, door, journal), limits=limits, doorkeeper=door, journal=journal, names=["api"]
+    )
+    return gate, control, token
+
+
+def application(control: ControlLink, door: Doorkeeper, journal: Journal) -> FastAPI:
+    """The routes of the api."""
 
     async def nothing() -> Measures:
         return example(Measures)
 
-    services = Services(settings, control, door, journal, asyncio.Event(), History(nothing))
-    limits = settings.api_limits.model_copy(update={"burst": 100_000})
-    gate = Gate(build_app(services), limits=limits, doorkeeper=door, journal=journal, names=["api"])
-    return gate, control, token
+    return build_app(Services(Settings(), control, door, journal, asyncio.Event(), History(nothing)))
 
 
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[messages.RequestMade]:
@@ -134,12 +142,24 @@ def test_the_api_and_control_understand_the_same(method: str, target: str, body:
     assert meant(made.asked, made.request) == made.request
 
 
+def test_every_operation_is_a_route_of_the_api() -> None:
+    """What the command line calls, and what control understands, is there."""
+    paths = application(Listening(), Doorkeeper(10), Journal(lambda _call: None)).openapi()["paths"]
+    routes = {(method.upper(), _unnamed(path)) for path, methods in paths.items() for method in methods}
+    for one in OPERATIONS:
+        assert not one.path or (one.method, _unnamed(one.path)) in routes, one
+
+
+def _unnamed(path: str) -> str:
+    return re.sub(r"{\w+}", "{}", path)
+
+
 def test_every_order_has_its_way() -> None:
     """No order that the api may give is missing above."""
     found = {
         type(ordered(method, target, body)[0].request) for method, target, body in REQUESTS
     }  # fmt: skip
-    assert found == set(get_args(admin.RestChange))
+    assert found == CHANGES
 
 
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)

@@ -32,7 +32,6 @@ PRIVATE = {
     "unit/cli/selftest/test_running.py": "one check of the self-test, without the others",
     "unit/cli/test_status.py": "the screen, without an appliance to ask",
     "unit/control/test_lifeline.py": "the end of control, which ends with its process",
-    "unit/control/test_rest_rights.py": "the table of rights itself: every request has a row",
     "unit/master/graph/test_liveness.py": _TURN,
     "unit/master/graph/test_reconcile.py": _TURN,
     "unit/master/graph/test_reminders.py": _TURN,

@@ -36,7 +36,7 @@ OVERVIEW = example(
 
 def token(request: HostToken) -> EnrolmentToken:
     """What the appliance makes of it; it finds its own address where none is given."""
-    endpoint, reason = (request.kit["endpoint"], "") if request.kit["endpoint"] else FOUND
+    endpoint, reason = (request.endpoint, "") if request.endpoint else FOUND
     return example(
         EnrolmentToken, name="laptop", address="10.113.11.2", token="rosrv-enrol_x", expires=1795164925.0,  # noqa: S106
         endpoint=endpoint, endpoint_reason=reason, script="#!/bin/sh\n# join",
@@ -119,7 +119,7 @@ def test_a_token_and_its_script(asked: list[AdminRequest[Any]], tmp_path: Path) 
     assert out.read_text() == "#!/bin/sh\n# join"
     (order,) = asked
     assert isinstance(order, HostToken)
-    assert (order.seconds, order.new, order.kit["open"]) == (7200, True, "tcp/22")
+    assert (order.token_seconds, order.new, order.open) == (7200, True, ["tcp/22"])
     again = run(*flags)
     assert again.exit_code == 2
     assert "is there already" in again.stderr

@@ -1,0 +1,25 @@
+"""Tests of `appliance.channel.operations`: every request that can come over REST has its way and its role."""
+
+from typing import get_args
+
+from appliance.channel import admin
+from appliance.channel.operations import CHANGES, OPERATIONS, operation_of
+
+
+def test_no_request_was_forgotten() -> None:
+    """A request that is added is given to one role, or stands in the table as one that needs no token."""
+    assert {one.request for one in OPERATIONS} == set(get_args(admin.RestRequest))
+
+
+def test_what_changes_something_is_for_operators_and_admins() -> None:
+    """Each change is for one of both; what both may do and changes nothing is the list of tokens, and a kit."""
+    listed = {one.request for one in OPERATIONS if one.role in ("operator", "admin")}
+    assert listed - CHANGES == {admin.TokenList, admin.HostKit}
+    assert listed >= CHANGES
+
+
+def test_requests_of_one_kind_can_be_asked_differently() -> None:
+    """A token for a host that comes for the first time, and for one that is enrolled."""
+    found = [operation_of(admin.HostToken("laptop", new=new)) for new in (True, False)]
+    assert [one.path for one in found if one] == ["/v1/hosts", "/v1/hosts/{name}/token"]
+    assert operation_of(admin.TokenAdd("ci", "viewer", 60)) is None
