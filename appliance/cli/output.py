@@ -33,6 +33,12 @@ def moment(seconds: float) -> str:
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
+def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
+    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    typer.echo(f"{verb}: {text}", err=True)
+    return typer.Exit(2)
+
+
 def say(line: str, style: str = "") -> None:
     """Write one line to standard output."""
     shown = printable(line)

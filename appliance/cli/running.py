@@ -18,6 +18,7 @@ import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.output import say_json, usage_error
 
 if TYPE_CHECKING:
     from appliance.cli.audit.source import AuditSource
@@ -94,8 +95,15 @@ class Appliance:
         try:
             return body_or_exit(self.way.ask(request), as_json=as_json)
         except NotRunningError as error:
-            typer.echo(f"rosrv: {error}", err=True)
-            raise typer.Exit(2) from None
+            raise usage_error(str(error)) from None
+
+    def answer_or_exit(self, request: AdminRequest[A], *, as_json: bool) -> A:
+        """The same for a person to read: with --json the answer is written here as it is, and the verb ends."""
+        body = self.ask_or_exit(request, as_json=as_json)
+        if as_json:
+            say_json(body)  # type: ignore[arg-type]  # each answer is a struct
+            raise typer.Exit
+        return body
 
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
@@ -144,12 +152,6 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
         raise usage_error(str(error)) from None
 
 
-def usage_error(text: str) -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"rosrv: {text}", err=True)
-    return typer.Exit(2)
-
-
 def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
     """The answer's body; a refusal is shown whole and ends the program with status 1."""
     if answer.ok:
@@ -161,13 +163,3 @@ def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
             typer.echo(finding, err=True)
         typer.echo(f"rosrv: {answer.error}", err=True)
     raise typer.Exit(1)
-
-
-def ask(state: Path, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """Ask the appliance of a state directory one thing. Raises `NotRunningError`."""
-    return AdminSocket(state).ask(request)
-
-
-def ask_or_exit(state: Path, request: AdminRequest[A], *, as_json: bool) -> A:
-    """The same over the socket alone."""
-    return Appliance(AdminSocket(state)).ask_or_exit(request, as_json=as_json)

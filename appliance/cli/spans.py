@@ -2,6 +2,8 @@
 
 import re
 
+from appliance.cli.output import usage_error
+
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _SPAN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
 
@@ -12,3 +14,14 @@ def seconds_of(text: str, units: str) -> float | None:
     if found is None or found[2] not in units or float(found[1]) <= 0:
         return None
     return float(found[1]) * _SECONDS[found[2]]
+
+
+def span_given(option: str, text: str, spans: str, verb: str = "rosrv") -> float:
+    """The seconds of what was given for an option; `spans` are examples, one of each unit that it takes.
+
+    Ends the program with 2 when the text is none of them.
+    """
+    seconds = seconds_of(text, "".join(filter(str.isalpha, spans.replace(" or ", ""))))
+    if seconds is None:
+        raise usage_error(f"{option} {text!r} is not a time: write {spans}", verb)
+    return seconds

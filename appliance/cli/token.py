@@ -8,8 +8,8 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.tokens import TokenRole
 from appliance.cli.output import Json, moment, say, say_json
-from appliance.cli.running import Appliance, speaks, usage_error
-from appliance.cli.spans import seconds_of
+from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import span_given
 
 app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
 
@@ -32,10 +32,8 @@ def add(
 
     Example: rosrv token add alice --role operator --expires 30d
     """
-    body = appliance.ask_or_exit(TokenAdd(name, role, _seconds(expires)), as_json=as_json)
-    if as_json:
-        say_json(body)
-        return
+    seconds = span_given("--expires", expires, "30m, 12h, 90d or 52w")
+    body = appliance.answer_or_exit(TokenAdd(name, role, seconds), as_json=as_json)
     say(body.token)
     typer.echo(
         f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. This is the only time it is shown.",
@@ -73,15 +71,5 @@ def revoke(
 
     Example: rosrv token revoke alice
     """
-    body = appliance.ask_or_exit(TokenRevoke(name), as_json=as_json)
-    if as_json:
-        say_json(body)
-    else:
-        say(f"token {body.name} ({body.role}) is revoked")
-
-
-def _seconds(text: str) -> float:
-    seconds = seconds_of(text, "mhdw")
-    if seconds is None:
-        raise usage_error(f"--expires {text!r} is not a time: write 30m, 12h, 90d or 52w")
-    return seconds
+    body = appliance.answer_or_exit(TokenRevoke(name), as_json=as_json)
+    say(f"token {body.name} ({body.role}) is revoked")

@@ -5,6 +5,7 @@ file is made, and has room, before anything is asked; when nothing comes of the 
 """
 
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import Iterator
@@ -13,16 +14,12 @@ from typing import BinaryIO
 
 import typer
 
+from appliance.cli import output
 from appliance.cli.output import printable, say
 
 STANDARD_OUTPUT = Path("-")
+usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _ROOM = 64 << 10  # bytes; a kit has ten thousand or so
-
-
-def usage_error(text: str) -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"rosrv host: {text}", err=True)
-    return typer.Exit(2)
 
 
 class Output:

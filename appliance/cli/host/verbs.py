@@ -13,7 +13,7 @@ from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.spans import seconds_of
+from appliance.cli.spans import span_given
 
 app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
 
@@ -75,7 +75,13 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             raise usage_error(
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
-        order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
+        order = HostToken(
+            name,
+            token_seconds=span_given("--within", within, "30m, 1h or 7d", "rosrv host"),
+            days=days,
+            address=address,
+            new=True,
+        )
         _write_script(running, order, wishes, out, as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
@@ -108,7 +114,9 @@ def kit(  # noqa: PLR0917  as above
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
-        order = HostToken(name, token_seconds=_seconds(within), days=days)
+        order = HostToken(
+            name, token_seconds=span_given("--within", within, "30m, 1h or 7d", "rosrv host"), days=days
+        )
         _write_script(running, order, wishes, out, as_json=as_json)
         return
     with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
@@ -153,10 +161,7 @@ def reload(running: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv host reload
     """
-    body = running.ask_or_exit(HostsReload(), as_json=as_json)
-    if as_json:
-        say_json(body)
-        return
+    body = running.answer_or_exit(HostsReload(), as_json=as_json)
     say(f"{len(body.declared)} hosts are declared")
     for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
         if names:
@@ -172,10 +177,8 @@ def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
 
     Example: rosrv host revoke ocu-1
     """
-    body = running.ask_or_exit(HostRevoke(name), as_json=as_json)
-    if as_json:
-        say_json(body)
-    elif not body.serial:
+    body = running.answer_or_exit(HostRevoke(name), as_json=as_json)
+    if not body.serial:
         say(f"{body.name} is awaited no longer: its one-time token opens nothing")
     else:
         say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
@@ -212,10 +215,3 @@ def _ports_words(ports: PortsSeen) -> str:
     if ports.checked is None:
         return "ports never checked"
     return f"ports {ports.state} ({moment(ports.checked)})"
-
-
-def _seconds(text: str) -> float:
-    seconds = seconds_of(text, "mhd")
-    if seconds is None:
-        raise usage_error(f"--within {text!r} is no time such as 30m, 1h or 7d")
-    return seconds

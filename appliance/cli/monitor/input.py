@@ -1,28 +1,23 @@
 """What the monitor verbs read: specifications, and folders of message definitions."""
 
+import functools
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import typer
-
+from appliance.cli import output
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
 
+usage_error = functools.partial(output.usage_error, verb="rosrv monitor")
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")
 _SAVE_AS_UTF_8 = "these bytes are no UTF-8; save the file as UTF-8"
 _STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line
 BESIDE = "msg"
 """The folder of definitions that is looked into beside every specification."""
-
-
-def usage_error(text: str) -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"rosrv monitor: {text}", err=True)
-    return typer.Exit(2)
 
 
 def read_specifications(files: Sequence[Path]) -> dict[str, str]:

@@ -105,11 +105,8 @@ def load(
             AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
         )
         return
-    _say_replaced(
-        appliance.ask_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json), as_json=as_json
-    )
-    if not as_json:
-        _say_disabled(appliance, texts)
+    _say_replaced(appliance.answer_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json))
+    _say_disabled(appliance, texts)
 
 
 @speaks
@@ -118,7 +115,7 @@ def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
     Example: rosrv monitor remove safeTrigger
     """
-    _say_replaced(appliance.ask_or_exit(MonitorRemove(names), as_json=as_json), as_json=as_json)
+    _say_replaced(appliance.answer_or_exit(MonitorRemove(names), as_json=as_json))
 
 
 @speaks
@@ -133,15 +130,11 @@ def reload(
 
     Example: rosrv monitor reload
     """
-    body = appliance.ask_or_exit(MonitorReload(prune=prune), as_json=as_json)
-    _say_replaced(body, as_json=as_json)
-    if body.kept and not as_json:
-        say(
-            f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)",
-            "yellow",
-        )
-    if not as_json:
-        _say_disabled(appliance, [*body.added, *body.changed])
+    body = appliance.answer_or_exit(MonitorReload(prune=prune), as_json=as_json)
+    _say_replaced(body)
+    if body.kept:
+        say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
+    _say_disabled(appliance, [*body.added, *body.changed])
 
 
 @speaks
@@ -150,11 +143,8 @@ def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
     Example: rosrv monitor resume safeTrigger
     """
-    body = appliance.ask_or_exit(MonitorResume(names), as_json=as_json)
-    if as_json:
-        say_json(body)
-    else:
-        say(f"resumed: {', '.join(body.names) or 'none was held'}")
+    body = appliance.answer_or_exit(MonitorResume(names), as_json=as_json)
+    say(f"resumed: {', '.join(body.names) or 'none was held'}")
 
 
 @speaks
@@ -187,10 +177,7 @@ def _state(row: MonitorState) -> str:
     return "enabled" if row.enabled else "disabled"
 
 
-def _say_replaced(body: Replaced, *, as_json: bool) -> None:
-    if as_json:
-        say_json(body)
-        return
+def _say_replaced(body: Replaced) -> None:
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [

@@ -1,5 +1,6 @@
 """What the policy verbs read: policies, who is who, and requests out of files or the audit log."""
 
+import functools
 import ipaddress
 import json
 from collections.abc import Iterator
@@ -13,12 +14,14 @@ from msgspec.structs import asdict
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import RegistrationsWanted
+from appliance.cli import output
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.running import Appliance
 from appliance.policy import Address, Category, Known, Live, Policy, Request
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
 
+usage_error = functools.partial(output.usage_error, verb="rosrv policy")
 Robot = Annotated[
     list[str] | None, typer.Option("--robot", metavar="ADDRESS", help="What the group robot is (repeatable)")
 ]
@@ -26,12 +29,6 @@ Enrolled = Annotated[
     list[str] | None,
     typer.Option("--enrolled", metavar="NAME=ADDRESS", help="An enrolled host, for host:NAME (repeatable)"),
 ]
-
-
-def usage_error(text: str) -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"rosrv policy: {text}", err=True)
-    return typer.Exit(2)
 
 
 def read_text(file: Path) -> str:

@@ -8,9 +8,8 @@ import typer
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.channel.answers.policy import Loaded
 from appliance.cli.output import Json, counted, say, say_json
-from appliance.cli.policy.input import usage_error
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.spans import seconds_of
+from appliance.cli.spans import span_given
 
 
 @speaks
@@ -30,9 +29,12 @@ def reload(
 
     Example: rosrv policy reload --confirm-within 5m
     """
-    seconds = _seconds(confirm_within) if confirm_within is not None else None
-    body = appliance.ask_or_exit(PolicyReload(seconds), as_json=as_json)
-    _say_loaded(body, as_json=as_json)
+    seconds = (
+        span_given("--confirm-within", confirm_within, "30s, 5m or 1h", "rosrv policy")
+        if confirm_within is not None
+        else None
+    )
+    _say_loaded(appliance.answer_or_exit(PolicyReload(seconds), as_json=as_json))
 
 
 @speaks
@@ -47,7 +49,7 @@ def rollback(
 
     Example: rosrv policy rollback 7
     """
-    _say_loaded(appliance.ask_or_exit(PolicyRollback(revision), as_json=as_json), as_json=as_json)
+    _say_loaded(appliance.answer_or_exit(PolicyRollback(revision), as_json=as_json))
 
 
 @speaks
@@ -80,10 +82,7 @@ def revisions(appliance: Appliance, as_json: Json = False) -> None:
         say(f"{row.revision:>5}  {loaded}  {row.who}: {row.note}  {row.file}  {mark}".rstrip())
 
 
-def _say_loaded(body: Loaded, *, as_json: bool) -> None:
-    if as_json:
-        say_json(body)
-        return
+def _say_loaded(body: Loaded) -> None:
     for warning in body.warnings:
         say(warning, "yellow")
     say(
@@ -92,10 +91,3 @@ def _say_loaded(body: Loaded, *, as_json: bool) -> None:
     if body.confirm_by is not None:
         until = datetime.datetime.fromtimestamp(body.confirm_by, datetime.UTC).isoformat(timespec="seconds")
         say(f"it goes back by itself at {until} unless you say: rosrv policy confirm", "yellow")
-
-
-def _seconds(text: str) -> float:
-    seconds = seconds_of(text, "smh")
-    if seconds is None:
-        raise usage_error(f"--confirm-within {text!r} is not a time: write 30s, 5m or 1h")
-    return seconds

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.admin import PolicyReload
-from appliance.cli.running import ask
+from appliance.cli.admin_socket import AdminSocket
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT
@@ -150,7 +150,7 @@ def test_reloads_under_load(working: Field) -> None:
         for _ in range(67):
             for text, fine in ((even, True), (odd, True), (odd + "nonsense\n[", False)):
                 working.appliance.policy_file.write_text(text)
-                answer = ask(working.appliance.state, PolicyReload())
+                answer = AdminSocket(working.appliance.state).ask(PolicyReload())
                 assert answer.ok is fine, answer
         burst.finish()
         over.set()

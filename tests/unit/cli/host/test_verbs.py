@@ -163,7 +163,7 @@ def test_an_address_that_cannot_be_told_enrols_nobody(
     ("flags", "said"),
     [
         (("--appliance", "a b"), "neither an address nor a name"),
-        (("--appliance", "10.0.0.1", "--token", "--within", "soon"), "no time such as 30m"),
+        (("--appliance", "10.0.0.1", "--token", "--within", "soon"), "not a time: write 30m"),
         (("--appliance", "10.0.0.1", "--token", "--csr", "x"), "two ways"),
         (("--appliance", "10.0.0.1", "--ports", "99999"), "is no range of ports"),
         (("--appliance", "10.0.0.1", "--open", "ssh"), "is no service"),
