@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.docker import APPLIANCE, BASE, DEMO, Compose, Engine, images, project
 
 RUNS = 5

@@ -23,8 +23,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from appliance.network.lab import Lab
 from benchmarks.relay_throughput import HERE
+from examples.landshark.lab import Lab
 from tests.support.machine import Machine
 from tests.support.machine_disk import ROOT
 from tests.support.nodes import PYTHON, RosSession

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.outside import outside

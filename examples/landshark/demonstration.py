@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from appliance.cli.output import say_json
-from appliance.network.lab import Lab
 from appliance.network.namespaces import NetworkError, has_privileges
 from appliance.shipped import SHIPPED
 from examples.landshark.doorway import Doorway
+from examples.landshark.lab import Lab
 from examples.landshark.mistakes import Mistakes, Ways
 from examples.landshark.results import Result
 from examples.landshark.stage import (

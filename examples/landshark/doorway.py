@@ -13,7 +13,7 @@ import threading
 from types import TracebackType
 from typing import Self
 
-from appliance.network.lab import Host
+from examples.landshark.lab import Host
 
 CONNECTIONS = 64  # a browser has a handful; further ones wait in the kernel's queue
 CONNECT_SECONDS = 5.0

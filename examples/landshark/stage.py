@@ -25,9 +25,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from appliance.network.lab import Host, Lab
 from appliance.shipped import IS_CHECKOUT
 from examples.landshark.doorway import Doorway
+from examples.landshark.lab import Host, Lab
 
 NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
 APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"

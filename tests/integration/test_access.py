@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs

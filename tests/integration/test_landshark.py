@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from examples.landshark.stage import MASTER_URI, Actor, Stage
 from tests.support.nodes import ROOT, has_ros
 from tests.support.requirements import need_root, needs

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Host, Process

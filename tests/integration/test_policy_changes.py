@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.requirements import needs

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host
+from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.requirements import needs

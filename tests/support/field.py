@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine

@@ -20,7 +20,7 @@ LIMIT = 30.0 * float(os.environ.get("TESTS_PATIENCE", "1"))
 
 
 class Host(Protocol):
-    """Where a process runs: the machine itself, or a host of the lab (`appliance.network.lab.Host`)."""
+    """Where a process runs: the machine itself, or a host of the lab (`examples.landshark.lab.Host`)."""
 
     @property
     def address(self) -> str:

@@ -8,8 +8,8 @@ import contextlib
 from collections.abc import Iterator
 
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
 from appliance.network.namespaces import Namespace
+from examples.landshark.lab import INTERFACE, Host, Lab
 
 _PORT = "port-root"
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.lab import Host
+from examples.landshark.lab import Host
 from tests.support.processes import Process
 
 _MOUNTS = """\

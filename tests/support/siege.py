@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.lab import Host, Lab
 from appliance.ros.xmlrpc import FaultReceived, parse_response
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Process, ThisMachine

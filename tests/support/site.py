@@ -7,7 +7,7 @@ the other one that the robot does not notice.
 from pathlib import Path
 from typing import Self
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.rosmaster import PlainMaster
 

@@ -8,8 +8,8 @@ import subprocess
 from dataclasses import dataclass
 
 from appliance.network import links
-from appliance.network.lab import Host
 from appliance.network.namespaces import Namespace
+from examples.landshark.lab import Host
 
 
 @dataclass(frozen=True)

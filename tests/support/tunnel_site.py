@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine

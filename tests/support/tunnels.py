@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from appliance.ipsec.strongswan import plugins
 from appliance.network.esp import choose_esp
-from appliance.network.lab import Host
+from examples.landshark.lab import Host
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_program
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from appliance.network.lab import INTERFACE, Host
 from appliance.network.namespaces import Namespace
+from examples.landshark.lab import INTERFACE, Host
 from tests.support.processes import LIMIT
 
 _EVERYTHING = 0x0003  # ETH_P_ALL

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.network.lab import Host, Lab
 from examples.landshark.doorway import CONNECTIONS, Doorway
+from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_root
 
 LIMIT = 30.0

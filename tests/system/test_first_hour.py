@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import ROSRV
 from tests.support.processes import Process
 from tests.support.requirements import need_root

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root
 

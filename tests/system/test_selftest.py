@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.requirements import need_root
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import Process

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.field import Field
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from appliance.network.lab import Lab
 from appliance.shares.table import AUDIT_BYTES, AUDIT_KINDS
+from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege

@@ -13,9 +13,9 @@ import pytest
 from appliance.network.firewall.firewall import FirewallReport
 from appliance.network.firewall.rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.lab import Host, Lab
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.enclosure import Contained, InNamespace, Ports
+from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 from tests.support.translators import TRANSLATORS, load
 

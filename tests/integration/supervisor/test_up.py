@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.lab import Lab
 from appliance.supervisor.roles import ROSMASTER, ROSOUT
+from examples.landshark.lab import Lab
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.waiting import allowed

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright, expect
 
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root
 from tests.support.tunnels import need_strongswan

@@ -16,7 +16,7 @@ import pytest
 
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.esp_packets import initiators_keys
 from tests.support.processes import LIMIT, Event
 from tests.support.requirements import need_program, need_root

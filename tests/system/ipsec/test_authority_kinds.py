@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.requirements import need_root
 from tests.support.tunnel_site import TunnelSite
 from tests.support.tunnels import need_strongswan

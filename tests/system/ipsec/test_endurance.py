@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.network.lab import INTERFACE, Host, Lab
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_root
 from tests.support.tunnel_site import LONG, TunnelSite, left_behind, numbers

@@ -23,7 +23,7 @@ import pytest
 
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network import links
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.appliance import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT

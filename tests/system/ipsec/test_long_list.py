@@ -9,7 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.ipsec.authority import Authority
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
 from tests.support.tunnel_site import LONG, OCU, TunnelSite

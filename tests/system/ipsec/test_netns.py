@@ -4,7 +4,7 @@ import json
 import subprocess
 from pathlib import Path
 
-from appliance.network.lab import Lab
+from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
 from tests.support.requirements import need_root

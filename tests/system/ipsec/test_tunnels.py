@@ -15,7 +15,7 @@ import pytest
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Lab
+from examples.landshark.lab import INTERFACE, Lab
 from tests.support.nodes import RosSession
 from tests.support.processes import Event
 from tests.support.requirements import need_root

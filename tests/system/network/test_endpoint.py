@@ -6,8 +6,8 @@ import pytest
 
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address, outward_address
-from appliance.network.lab import INTERFACE, Lab
 from appliance.network.namespaces import NetworkError
+from examples.landshark.lab import INTERFACE, Lab
 from tests.support.requirements import need_root
 
 ROUTE = "this machine's address towards its default route"

@@ -18,8 +18,8 @@ from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.proof import prove
 from appliance.network.firewall.rules import Chain, FirewallSettings, PortRange, RateLimit, Rule, Verdict
-from appliance.network.lab import INTERFACE, Host, Lab
 from appliance.network.probe import PROBE_UID, Outcome, probe_port
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.requirements import need_program, need_root
 from tests.system.network.test_isolation import serving
 

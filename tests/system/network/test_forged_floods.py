@@ -10,7 +10,7 @@ import pytest
 
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.rules import FirewallSettings, PortRange
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.forged_syns import flood_command
 from tests.support.requirements import need_program, need_root
 from tests.support.translators import load

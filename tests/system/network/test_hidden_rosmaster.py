@@ -12,8 +12,8 @@ import pytest
 
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.rules import FirewallSettings
-from appliance.network.lab import Host, Lab
 from appliance.network.probe import probe_port
+from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 
 CONTROL, ROSMASTER, OTHER = 61011, 61012, 61055

@@ -16,9 +16,9 @@ import pytest
 from appliance.network import links
 from appliance.network.firewall.rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.lab import Host, Lab
 from appliance.network.listeners import listening_ports
 from appliance.network.namespaces import Namespace, NetworkError
+from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 
 MASTER, FIRST, LAST = 11311, 20000, 20009

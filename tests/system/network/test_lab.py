@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from appliance.network import links
-from appliance.network.lab import Lab, clear_leftovers
 from appliance.network.namespaces import Namespace, NetworkError, namespaces
+from examples.landshark.lab import Lab, clear_leftovers
 from tests.support.requirements import need_root
 
 
@@ -93,13 +93,17 @@ def test_closing_ends_every_process_and_leaves_nothing() -> None:
 def test_what_a_crashed_lab_left_is_cleared_away() -> None:
     """The next lab of the same prefix ends the processes and deletes the namespaces of a killed one."""
     program = (
-        "import sys; from appliance.network.lab import Lab\n"
+        "import sys; from examples.landshark.lab import Lab\n"
         "lab = Lab('rosrv-labcrash').__enter__()\n"
         "child = lab.host('robot', '10.77.0.10/24').popen(['sleep', '600'])\n"
         "print(child.pid, flush=True); sys.stdin.read()"
     )
     crashed = subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", program],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[3],
     )
     assert crashed.stdout is not None
     assert crashed.stdin is not None

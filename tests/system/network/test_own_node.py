@@ -12,8 +12,8 @@ import pytest
 from appliance.channel.own_node import ADDRESS
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.rules import FirewallSettings, OwnNode, PortRange
-from appliance.network.lab import Host, Lab
 from appliance.supervisor.users import account_of
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs

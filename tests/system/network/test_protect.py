@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network import links
-from appliance.network.lab import Host, Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.system.network.test_isolation import serving, source_seen

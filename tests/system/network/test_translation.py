@@ -12,8 +12,8 @@ from appliance.network import links
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.rules import FirewallSettings
-from appliance.network.lab import Host, Lab
 from appliance.network.namespaces import Namespace
+from examples.landshark.lab import Host, Lab
 from tests.support.docker import Engine
 from tests.support.forged_syns import ETH_P_ALL, send_syn, syn_sources
 from tests.support.requirements import need_program, need_root

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
 from tests.support.tunnel_site import ATTACKER, LONG, MIDDLE, OCU, OWN, TunnelSite, left_behind

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from appliance.network import links
-from appliance.network.lab import INTERFACE, Host, Lab
 from appliance.network.namespaces import Namespace, namespaces
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
