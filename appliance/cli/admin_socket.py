@@ -9,7 +9,7 @@ import msgspec
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.source import AuditSource
+    from appliance.cli.audit.source import FileLog
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
@@ -26,7 +26,7 @@ class AdminSocket:
     def __init__(self, state: Path) -> None:
         self.state = state
 
-    def audit(self) -> "AuditSource":
+    def audit(self) -> "FileLog":
         """The audit log's file, which can be read without a running appliance."""
         from appliance.cli.audit.source import FileLog  # noqa: PLC0415  only for the verbs that read it
 

@@ -200,7 +200,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
 def _own(running: Appliance) -> str:
     """The address of the appliance that runs on this machine. Raises `ValueError`."""
     hint = "give its address as this machine sees it: --appliance 192.168.1.20"
-    if running.remote:
+    if running.place is not None:
         raise ValueError(f"how this machine sees the appliance is not known over REST; {hint}")
     try:
         answer = running.ask(StatusWanted())

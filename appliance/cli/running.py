@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Concatenate, ParamSpec, Protocol
+from typing import TYPE_CHECKING, Annotated, Concatenate, ParamSpec
 
 import msgspec
 import typer
@@ -21,7 +21,9 @@ from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.output import say_json, usage_error
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.source import AuditSource
+    from appliance.cli.audit.rest import RestLog
+    from appliance.cli.audit.source import FileLog
+    from appliance.cli.rest.way import RestWay
 
 DEFAULT_STATE = Path("/var/lib/rosrv")  # as appliance.config has it, which is not imported for every verb
 TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
@@ -55,16 +57,6 @@ ApiCa = Annotated[
 _P = ParamSpec("_P")
 
 
-class Way(Protocol):
-    """A way to ask the running appliance."""
-
-    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Ask one thing. Raises `NotRunningError`."""
-
-    def audit(self) -> "AuditSource":
-        """Its audit log."""
-
-
 @dataclass(frozen=True)
 class Appliance:
     """The appliance that a verb is for.
@@ -72,21 +64,15 @@ class Appliance:
     `said`: it was named, on the command line or in the environment. `place` is the URL of REST; None over the socket.
     """
 
-    way: Way
+    way: "AdminSocket | RestWay"
     said: bool = False
-
-    @property
-    def remote(self) -> bool:
-        """Whether it is asked over REST, perhaps from another machine."""
-        return not isinstance(self.way, AdminSocket)
-
     place: str | None = None
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
         return self.way.ask(request)
 
-    def audit(self) -> "AuditSource":
+    def audit(self) -> "FileLog | RestLog":
         """Its audit log; over the state directory it need not run."""
         return self.way.audit()
 

@@ -1,10 +1,9 @@
-"""Where the audit verbs read: the log's file here, or the running appliance's log over REST (`audit_rest.py`)."""
+"""Where the audit verbs read: the log's file here. `RestLog` reads the running appliance's, with the same methods."""
 
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
@@ -19,38 +18,11 @@ _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]
 
 
-class AuditSource(Protocol):
-    """An audit log. All raise `LogUnreadableError`, over REST `NotRunningError`."""
-
-    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> Page:
-        """A page of records."""
-
-    def show(self, record_id: str, neighbours: int) -> Shown | None:
-        """One record with its neighbours; None when there is none."""
-
-    def export(self, wanted: Filter) -> Iterator[Entry]:
-        """All records that match, the oldest first."""
-
-    def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
-        """The same as evidence: sequences, and lines of NDJSON with their places in the chain."""
-
-    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
-        """The last records that match, the oldest first; then, if `on`, those that come, without end."""
-
-    def verify(
-        self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
-    ) -> Verification:
-        """Whether the log is complete and unchanged; `progress` is told the sequence that was looked at last."""
-
-    def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Signed checkpoints after a number, in order; some of them, none when there is no more."""
-
-    def last(self) -> int:
-        """The sequence of the last record."""
-
-
 class FileLog:
-    """The log in a state directory; works while the appliance runs, when it is stopped, and on a copy."""
+    """The log in a state directory; works while the appliance runs, when it is stopped, and on a copy.
+
+    All raise `LogUnreadableError`, those of `RestLog` `NotRunningError`.
+    """
 
     def __init__(self, state: Path) -> None:
         self._state = state
@@ -80,7 +52,7 @@ class FileLog:
         return ((one.sequence, evidence_line(one, chain)) for one, chain in evidence(self._path, wanted))
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
-        """The last records that match, then those that come."""
+        """The last records that match, the oldest first; then, if `on`, those that come, without end."""
         path = self._path
         follower = Follower(path, wanted)
         if lines:
@@ -93,14 +65,17 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Whether it is complete and unchanged, held against the signer's memory if that can be read."""
+        """Whether it is complete and unchanged, held against the signer's memory if that can be read.
+
+        `progress` is told the sequence that was looked at last.
+        """
         path = self._path
         signer = path.parent.parent / "signer"
         may = os.access(signer, os.R_OK | os.X_OK)
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Signed checkpoints after a number, in order."""
+        """Signed checkpoints after a number, in order; some of them, none when there is no more."""
         return signed_checkpoints(self._path, after)
 
     def last(self) -> int:

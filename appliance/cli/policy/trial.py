@@ -28,7 +28,7 @@ def try_policy(
     appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
 ) -> Trial:
     """Try a file; `robot` and `enrolled` go before what the appliance knows. Raises `NotRunningError`."""
-    if appliance.remote:
+    if appliance.place is not None:
         return _by_dry_run(appliance, file)
     known = known_of(robot, enrolled, Known.of(asdict(appliance.ask(PolicyWanted()).given())))
     try:

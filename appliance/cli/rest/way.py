@@ -9,7 +9,7 @@ from appliance.cli.rest.orders import carry_out
 from appliance.cli.rest.session import ProblemError, RestClient
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.source import AuditSource
+    from appliance.cli.audit.rest import RestLog
 
 
 class RestWay:
@@ -27,7 +27,7 @@ class RestWay:
         except ProblemError as problem:
             return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:])
 
-    def audit(self) -> "AuditSource":
+    def audit(self) -> "RestLog":
         """Its audit log."""
         from appliance.cli.audit.rest import RestLog  # noqa: PLC0415  only for the verbs that read it
 
