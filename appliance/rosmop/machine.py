@@ -199,7 +199,10 @@ def load() -> ctypes.PyDLL:
     if package is None or package.origin is None or not found.startswith(VERSION):
         raise MachineError(f"wasmtime {VERSION}x is needed, and {found} is here")
     folder = f"linux-{os.uname().machine}"
-    library = ctypes.PyDLL(str(Path(package.origin).with_name(folder) / "_libwasmtime.so"))
+    file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
+    library = ctypes.PyDLL(file)
+    # The one that takes long: a module is compiled beside whatever else goes on.
+    library.__dict__["wasmtime_module_new"] = ctypes.CDLL(file).wasmtime_module_new
     for name, (result, *given) in _C.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, given

@@ -1,5 +1,6 @@
 """A module runs within its bounds: what it may do, how it is stopped, and that nothing is left behind."""
 
+import contextlib
 import resource
 import struct
 import subprocess
@@ -8,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import wasmtime
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from appliance.rosmop import machine
 from appliance.rosmop.machine import PAGE, Machine, MachineError, MachineTrap
@@ -195,6 +198,43 @@ def test_machines_share_an_engine_and_nothing_else() -> None:
     one.memory[0] = 1
     one.close()
     assert (other.call("count", fuel=FUEL), other.memory[0]) == (1, 0)
+
+
+RICH = bytes(
+    wasmtime.wat2wasm(f"""(module (type $none (func)) (memory (export "memory") 1) (data (i32.const 8) "data")
+    (table 2 funcref) (elem (i32.const 1) $fill) (global $n (mut i64) (i64.const 5))
+    (func $fill (export "fill") (param i32 i32) (memory.fill (local.get 0) (i32.const 1) (local.get 1)))
+    (func (export "copy") (param i32 i32 i32) (memory.copy (local.get 0) (local.get 1) (local.get 2)))
+    (func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))
+    (func (export "sum") (param i32 i64) (result i64) (local $a i64)
+        (loop (local.set $a (i64.add (local.get $a) (i64.load offset=8 (local.get 0)))) (call $fill (local.get 0)
+        (i32.const 3)) (br_if 0 (local.tee 0 (i32.sub (local.get 0) (i32.const 1)))))
+        (global.set $n (i64.add (global.get $n) (local.get $a))) (global.get $n))
+    (func $self (export "all") {" ".join(TRAPS.values())}))""")
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, len(RICH) - 1), st.integers(0, 255)), max_size=4),
+    length=st.sampled_from([len(RICH)] * 9 + [len(RICH) // 2]),
+    argument=st.sampled_from([0, 1, -1, 5, PAGE - 4, PAGE, 1 << 31, (1 << 63) - 1]),
+)
+def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: int) -> None:
+    """They are refused, trap, or do something else within their own memory."""
+    code = bytearray(RICH)
+    for at, value in changes:
+        code[at] = value
+    other = made("", PAGE)
+    with contextlib.suppress(MachineError, MachineTrap):
+        one = Machine(bytes(code[:length]), LIMIT)
+        for number in range(8):
+            for arguments in ((), (argument,), (argument, 3), (argument, 3, argument)):
+                with contextlib.suppress(MachineError, MachineTrap, struct.error):
+                    one.call(number, *arguments, fuel=10_000)
+        assert len(one.memory) <= LIMIT
+        one.memory[:] = bytes(len(one.memory))
+    assert bytes(other.memory) == bytes(PAGE)
 
 
 def resident() -> int:
