@@ -11,7 +11,6 @@ from appliance.api import (
     audit,
     console,
     enrol,
-    explaining,
     graph,
     health,
     hosts,
@@ -21,7 +20,6 @@ from appliance.api import (
     monitors,
     policy,
     policy_changes,
-    policy_tests,
     tokens,
     whoami,
 )
@@ -60,8 +58,6 @@ def build_app(services: Services) -> FastAPI:
         health,
         policy,
         policy_changes,
-        explaining,
-        policy_tests,
         hosts,
         enrol,
         monitors,
@@ -70,10 +66,10 @@ def build_app(services: Services) -> FastAPI:
         audit,
         graph,
         metrics,
+        live,
+        whoami,
     ):
         app.include_router(part.routes(services))
-    app.include_router(live.routes(services, services.history))
-    app.include_router(whoami.routes(services))
     app.include_router(console.routes())
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

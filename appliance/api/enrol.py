@@ -25,15 +25,8 @@ from appliance.api.rates import Buckets
 from appliance.api.roles import answered
 from appliance.api.routing import Responses, Routes, answer, body, content
 from appliance.api.services import Services
-from appliance.channel.admin import (
-    A,
-    AdminRequest,
-    AuthorityWanted,
-    HostEnrol,
-    HostRenewed,
-    HostRenewItself,
-    RevocationsWanted,
-)
+from appliance.channel import admin
+from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.hosts import NewCertificate
 from appliance.ipsec.kit import archive, members
 
@@ -80,7 +73,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         peer = _peer(request)
         patience.require(peer)
         try:
-            parts = await _ask(services, HostEnrol(brought.token, brought.request, peer))
+            parts = await _ask(services, admin.HostEnrol(brought.token, brought.request, peer))
         except ProblemError as problem:
             if problem.status == 403:
                 patience.failed(peer)
@@ -115,23 +108,23 @@ def _add_renewal(router: Routes, services: Services) -> None:
             proof = base64.b64decode(renewal.proof, validate=True)
         except binascii.Error as error:
             raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
-        return await _ask(services, HostRenewItself(name, renewal.request, proof, _peer(request)))
+        return await _ask(services, admin.HostRenewItself(name, renewal.request, proof, _peer(request)))
 
     @router.post("/v1/hosts/{name}/renewed", operation_id="host_renewed", responses=_TUNNEL, status_code=204)
     async def renewed(name: OneName, request: Request) -> None:
         """For a host in its tunnel: the new certificate is in place; the one before ends, the tunnel comes anew."""
-        await _ask(services, HostRenewed(name, _peer(request)))
+        await _ask(services, admin.HostRenewed(name, _peer(request)))
 
     @router.get("/v1/revocations", operation_id="revocations", responses=_PEM, response_class=Response)
     async def revocations() -> Response:
         """The signed list of revoked certificates (CRL)."""
-        listed = await _ask(services, RevocationsWanted())
+        listed = await _ask(services, admin.RevocationsWanted())
         return Response(listed.revocations, media_type="application/x-pem-file")
 
     @router.get("/v1/authority", operation_id="authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
         """The certificate of the appliance's authority."""
-        own = await _ask(services, AuthorityWanted())
+        own = await _ask(services, admin.AuthorityWanted())
         return Response(own.authority, media_type="application/x-pem-file")
 
 

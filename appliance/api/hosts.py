@@ -27,26 +27,8 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, Viewer, answered, ask
 from appliance.api.routing import ETAG, Responses, Routes, Tagged, answer, body, content
 from appliance.api.services import Services
-from appliance.channel.admin import (
-    HostAdd,
-    HostEndpoint,
-    HostKit,
-    HostList,
-    HostPorts,
-    HostRenew,
-    HostRevoke,
-    HostsReload,
-    HostToken,
-)
-from appliance.channel.answers.hosts import (
-    EnrolmentToken,
-    Host,
-    Hosts,
-    KitParts,
-    PortsSeen,
-    Reloaded,
-    Revoked,
-)
+from appliance.channel import admin
+from appliance.channel.answers import hosts as answers
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -63,7 +45,7 @@ _KIT: Responses = {
 _NEW: Responses = {
     201: {
         "description": "Enrolled: the kit (how=kit); or a one-time token (how=token)",
-        "content": content(EnrolmentToken) | _ARCHIVE,
+        "content": content(answers.EnrolmentToken) | _ARCHIVE,
         "headers": ETAG,
     }
 }
@@ -84,15 +66,15 @@ def _add_looks(router: Routes, services: Services) -> None:
     control = services.control
 
     @router.get("", operation_id="hosts")
-    async def hosts(bearer: Viewer) -> Tagged[Hosts]:
+    async def hosts(bearer: Viewer) -> Tagged[answers.Hosts]:
         """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
-        found = await ask(control, HostList(), bearer)
+        found = await ask(control, admin.HostList(), bearer)
         return Tagged(found, found.revision)
 
     @router.get("/{name}", operation_id="host", responses=_UNKNOWN)
-    async def host(name: OneName, bearer: Viewer) -> Tagged[Host]:
+    async def host(name: OneName, bearer: Viewer) -> Tagged[answers.Host]:
         """One host."""
-        found = await ask(control, HostList(), bearer)
+        found = await ask(control, admin.HostList(), bearer)
         for one in found.hosts:
             if one.name == name:
                 return Tagged(one, found.revision)
@@ -108,7 +90,7 @@ def _add_looks(router: Routes, services: Services) -> None:
         ] = None,
     ) -> Response:
         """The kit of an enrolled host as it is now, without its private key, which the host has."""
-        parts = await ask(control, HostKit(name), bearer)
+        parts = await ask(control, admin.HostKit(name), bearer)
         return _archive(parts, await _placed(services, Wishes(endpoint or ""), bearer), None)
 
 
@@ -129,7 +111,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
             made = await _token(services, new.name, new, expected, bearer)
             return answer(made, 201, made.revision)
         key, request = await _key_and_request(new.request)
-        order = HostAdd(new.name, request, new.days, new.address, expected)
+        order = admin.HostAdd(new.name, request, new.days, new.address, expected)
         wishes = await _placed(services, wishes, bearer)
         parts = answered(await services.control.ask(order, bearer, SLOW_SECONDS))
         return _archive(parts, wishes, key, 201)
@@ -140,7 +122,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         wishes: Annotated[TokenWishes, body(TokenWishes)],
         bearer: Admin,
         if_match: IfMatch = None,
-    ) -> Tagged[EnrolmentToken]:
+    ) -> Tagged[answers.EnrolmentToken]:
         """A one-time token: with it the host enrols itself, for the first time or anew with another key."""
         made = await _token(services, name, wishes, _expected(if_match), bearer)
         return Tagged(made, made.revision)
@@ -158,7 +140,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         expected, wishes = _expected(if_match), _wishes(new)
         key, request = await _key_and_request(new.request)
         wishes = await _placed(services, wishes, bearer)
-        order = HostRenew(name, request, new.days, expected)
+        order = admin.HostRenew(name, request, new.days, expected)
         return _archive(answered(await services.control.ask(order, bearer, SLOW_SECONDS)), wishes, key)
 
 
@@ -166,15 +148,15 @@ def _add_changes(router: Routes, services: Services) -> None:
     control = services.control
 
     @router.post("/reload", operation_id="reload_hosts", responses=_CHANGES)
-    async def reload(bearer: Operator, if_match: IfMatch = None) -> Tagged[Reloaded]:
+    async def reload(bearer: Operator, if_match: IfMatch = None) -> Tagged[answers.Reloaded]:
         """Read hosts.yaml again: tunnels that it wants or no longer wants; nobody is enrolled or revoked by it."""
-        done = await ask(control, HostsReload(_expected(if_match)), bearer)
+        done = await ask(control, admin.HostsReload(_expected(if_match)), bearer)
         return Tagged(done, done.revision)
 
     @router.delete("/{name}", operation_id="revoke_host", responses=_CHANGES | _UNKNOWN)
-    async def revoke(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[Revoked]:
+    async def revoke(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[answers.Revoked]:
         """Let a host in no more: its certificate, tunnel, registrations and connections end within a second."""
-        done = await ask(control, HostRevoke(name, _expected(if_match)), bearer)
+        done = await ask(control, admin.HostRevoke(name, _expected(if_match)), bearer)
         return Tagged(done, done.revision)
 
     @router.put("/{name}/ports", operation_id="tell_host_ports", responses=_CHANGES | _UNKNOWN)
@@ -183,9 +165,9 @@ def _add_changes(router: Routes, services: Services) -> None:
         told: Annotated[PortsTold, body(PortsTold)],
         bearer: Operator,
         if_match: IfMatch = None,
-    ) -> Tagged[PortsSeen]:
+    ) -> Tagged[answers.PortsSeen]:
         """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
-        order = HostPorts(name, told.state, told.open, told.checked, _expected(if_match))
+        order = admin.HostPorts(name, told.state, told.open, told.checked, _expected(if_match))
         known = await ask(control, order, bearer)
         return Tagged(known.ports, known.revision)
 
@@ -194,15 +176,15 @@ async def _placed(services: Services, wishes: Wishes, bearer: Bearer) -> Wishes:
     """The wishes with the address of the appliance, which it finds where nobody said it."""
     if wishes.endpoint:
         return wishes
-    found = await ask(services.control, HostEndpoint(), bearer)
+    found = await ask(services.control, admin.HostEndpoint(), bearer)
     return replace(wishes, endpoint=found.endpoint)
 
 
 async def _token(
     services: Services, name: str, asked: TokenWishes, expected: int | None, bearer: Bearer
-) -> EnrolmentToken:
+) -> answers.EnrolmentToken:
     _wishes(asked)  # refuses what makes no sense
-    order = HostToken(
+    order = admin.HostToken(
         name,
         asked.endpoint,
         asked.ports,
@@ -216,7 +198,7 @@ async def _token(
     return answered(await services.control.ask(order, bearer, SLOW_SECONDS))
 
 
-def _archive(parts: KitParts, wishes: Wishes, key: str | None, status: int = 200) -> Response:
+def _archive(parts: answers.KitParts, wishes: Wishes, key: str | None, status: int = 200) -> Response:
     """A kit as it is downloaded."""
     headers = {
         "ETag": etag(parts.revision),

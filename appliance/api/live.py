@@ -16,7 +16,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from appliance.api.access import Bearer
 from appliance.api.alarms import Alarm, open_alarms
 from appliance.api.control import ControlAwayError
-from appliance.api.history import BUSY_SECONDS, History, Sample, Seen
+from appliance.api.history import BUSY_SECONDS, Sample, Seen
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes
@@ -57,7 +57,7 @@ class _Now(msgspec.Struct, frozen=True):
     sample: Sample
 
 
-def routes(services: Services, history: History) -> Routes:
+def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1", tags=["status"])
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
@@ -67,7 +67,7 @@ def routes(services: Services, history: History) -> Routes:
         points: Annotated[int, Query(ge=2, le=1800, description="at most so many samples")] = 360,
     ) -> Hour:
         """Decisions, relayed messages and what monitors did over the last hour, as counters."""
-        return Hour(history.samples(points))
+        return Hour(services.history.samples(points))
 
     @router.get("/live", operation_id="live_state", responses=_TEXT)
     async def live(
@@ -81,15 +81,14 @@ def routes(services: Services, history: History) -> Routes:
         Ends when the token does.
         """
         give_back = streams.take(bearer, peer_of(request), "clients follow")
-        following = _follow(services, history, bearer, graph)
+        following = _follow(services, bearer, graph)
         return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     return router
 
 
-async def _follow(
-    services: Services, history: History, bearer: Bearer, graph: bool
-) -> AsyncIterator[ServerSentEvent]:
+async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncIterator[ServerSentEvent]:
+    history = services.history
     number = max(0, history.seen.number - 1)  # what was seen last is told at once
     graph_due = 0.0
     with history.following():

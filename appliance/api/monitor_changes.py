@@ -22,17 +22,8 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, answered, ask
 from appliance.api.routing import ETAG, Responses, Routes, Tagged, body
 from appliance.api.services import Services
-from appliance.channel.admin import (
-    A,
-    AdminRequest,
-    MonitorLoad,
-    MonitorReload,
-    MonitorRemove,
-    MonitorReplace,
-    MonitorResume,
-    MonitorsWanted,
-    MonitorSwitch,
-)
+from appliance.channel import admin
+from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import Switched
 
@@ -70,7 +61,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         A text with an error changes nothing: the answer (422) has every finding with its line and column.
         """
         _may_load(bearer, dry_run=dry_run)
-        order = MonitorLoad(new.files, new.definitions, new.note, _expected(if_match, dry_run=dry_run))
+        order = admin.MonitorLoad(new.files, new.definitions, new.note, _expected(if_match, dry_run=dry_run))
         return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
     @router.put("/{name}", operation_id="replace_monitor", responses=_CHANGES | UNKNOWN)
@@ -89,10 +80,10 @@ def _add_texts(router: Routes, services: Services) -> None:
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
-            order = MonitorReplace(name, new.text, new.definitions, new.note, expected)
+            order = admin.MonitorReplace(name, new.text, new.definitions, new.note, expected)
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)
-        tried = MonitorLoad({file: new.text}, new.definitions, new.note, expected)
+        tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected)
         return await _tried(services, tried, bearer)
 
     @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
@@ -104,12 +95,12 @@ def _add_texts(router: Routes, services: Services) -> None:
             raise ProblemError(
                 403, "not-for-this-role", "removing what was loaded from elsewhere is for admins"
             )
-        return await _replaced(control, MonitorReload(_expected(if_match), prune), bearer)
+        return await _replaced(control, admin.MonitorReload(_expected(if_match), prune), bearer)
 
     @router.delete("/{name}", operation_id="remove_monitor", responses=_CHANGES | UNKNOWN)
     async def remove_monitor(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[Replaced]:
         """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
-        return await _replaced(control, MonitorRemove([name], _expected(if_match)), bearer)
+        return await _replaced(control, admin.MonitorRemove([name], _expected(if_match)), bearer)
 
     @router.delete("", operation_id="remove_monitors", responses=_CHANGES | UNKNOWN)
     async def remove_monitors(
@@ -121,7 +112,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         if_match: IfMatch = None,
     ) -> Tagged[Replaced]:
         """The same for several at once."""
-        return await _replaced(control, MonitorRemove(name, _expected(if_match)), bearer)
+        return await _replaced(control, admin.MonitorRemove(name, _expected(if_match)), bearer)
 
 
 def _add_switches(router: Routes, control: ControlLink) -> None:
@@ -140,9 +131,9 @@ def _add_switches(router: Routes, control: ControlLink) -> None:
         return await _switched(control, to.names, to, _expected(if_match), bearer)
 
 
-async def _tried(services: Services, order: MonitorLoad, bearer: Bearer) -> Tagged[Replaced]:
+async def _tried(services: Services, order: admin.MonitorLoad, bearer: Bearer) -> Tagged[Replaced]:
     """A dry run."""
-    loaded = await ask(services.control, MonitorsWanted(texts=True), bearer)
+    loaded = await ask(services.control, admin.MonitorsWanted(texts=True), bearer)
     if order.expected not in (None, loaded.tag):
         text = f"the monitors are at {loaded.tag}, not at {order.expected}: look at them first"
         raise _stale(text, loaded.tag)
@@ -165,7 +156,7 @@ async def _replaced(
     control: ControlLink, order: AdminRequest[answers.Replaced], bearer: Bearer
 ) -> Tagged[Replaced]:
     done = await _ordered(control, order, bearer)
-    rows = (await ask(control, MonitorsWanted(), bearer)).monitors
+    rows = (await ask(control, admin.MonitorsWanted(), bearer)).monitors
     fields = asdict(done) | {"warnings": findings_of(done.warnings)}
     return Tagged(Replaced(**fields, loaded=True, monitors=[row.name for row in rows]), done.tag)
 
@@ -173,16 +164,16 @@ async def _replaced(
 async def _switched(
     control: ControlLink, names: list[str], to: Switch, expected: str | None, bearer: Bearer
 ) -> Tagged[Switched]:
-    order: AdminRequest[Switched] = MonitorResume(names, expected)
+    order: AdminRequest[Switched] = admin.MonitorResume(names, expected)
     if to.enabled is not None:
-        order = MonitorSwitch(names, to.enabled, expected)
+        order = admin.MonitorSwitch(names, to.enabled, expected)
     done = await _ordered(control, order, bearer)
     return Tagged(done, done.tag)
 
 
 async def _file_of(control: ControlLink, name: str, bearer: Bearer) -> str:
     """The file that a monitor stands in. Raises `ProblemError` (404)."""
-    loaded = await ask(control, MonitorsWanted(texts=True), bearer)
+    loaded = await ask(control, admin.MonitorsWanted(texts=True), bearer)
     files = {row.name: row.file for row in loaded.monitors}
     if name in (loaded.files or {}):
         return name

@@ -1,18 +1,65 @@
-"""`/v1/policy`: look at the policy in force and at those before it."""
+"""`/v1/policy`: look at the policy in force and at those before it; why a request is decided as it is; the tests."""
 
-from typing import Annotated
+import asyncio
+from typing import Annotated, Literal
 
 import msgspec
-from fastapi import Path
+from fastapi import Path, Query
 
-from appliance.api.policy_models import LONGEST_REVISION
+from appliance.api.access import Bearer
+from appliance.api.judgement import explanation, judge_text
+from appliance.api.policy_models import (
+    LONGEST_REVISION,
+    Decided,
+    Explained,
+    LostRule,
+    Question,
+    RuleText,
+    Text,
+)
 from appliance.api.roles import Viewer, ask
-from appliance.api.routing import Responses, Routes, Tagged
+from appliance.api.routing import Responses, Routes, Tagged, body
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
+from appliance.channel.answers.described import told
 from appliance.channel.answers.policy import PolicyInForce, Revisions, RevisionText
+from appliance.policy.explain import Explanation
+from appliance.policy.model import Category, Rule
 
 _UNKNOWN: Responses = {404: {"description": "There is no such revision."}}
+_MOST_SHOWN = 1000
+
+
+class Draft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The text to run them on; null: the policy in force."""
+
+    text: Text | None = None
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """One case: what it expects, and what is decided; `line` and `column` are its place in `file`."""
+
+    file: str
+    line: int
+    column: int
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    expected: Literal["allow", "deny"]
+    decision: Decided
+    reason: str
+    passed: bool
+
+
+class Tested(msgspec.Struct, frozen=True, kw_only=True):
+    """The cases of the policy's tests, at most a thousand of them; none when the file does not exist."""
+
+    file: str
+    exists: bool
+    passed: int
+    failed: int
+    cases: Annotated[list[Case], told("those that failed first")]
 
 
 def routes(services: Services) -> Routes:
@@ -39,4 +86,88 @@ def routes(services: Services) -> Routes:
         known = await ask(control, PolicyWanted(revision), bearer)
         return msgspec.convert(known, RevisionText, from_attributes=True)
 
+    async def explained(question: Question, bearer: Bearer) -> Explained:
+        current = await ask(control, PolicyWanted(), bearer)
+        async with services.judging:
+            found = await asyncio.to_thread(
+                explanation,
+                question.text,
+                current,
+                host=question.host,
+                node=question.node,
+                category=question.category,
+                resource=question.resource,
+            )
+        return _explained(found)
+
+    @router.get("/explain", operation_id="explain")
+    async def explain_request(
+        bearer: Viewer,
+        host: Annotated[str, Query(min_length=1, max_length=100, description="an address, or `robot`")],
+        category: Category,
+        resource: Annotated[str, Query(min_length=1, max_length=256)],
+        node: Annotated[
+            str, Query(max_length=256, description="the name it gives, where a node is needed")
+        ] = "",
+    ) -> Explained:
+        """Why the policy in force decides a request as it does."""
+        return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
+
+    @router.post("/explain", operation_id="explain_under")
+    async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
+        """The same under another text, which is not loaded."""
+        return await explained(question, bearer)
+
+    @router.post("/test", operation_id="test_policy")
+    async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
+        """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
+        current = await ask(control, PolicyWanted(), bearer)
+        async with services.judging:
+            ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
+        cases = [
+            Case(
+                file=one.file,
+                line=one.line,
+                column=one.column,
+                **one.request.fields(),
+                expected="allow" if one.expected else "deny",
+                decision=one.decision.word,
+                reason=one.decision.reason,
+                passed=one.passed,
+            )
+            for one in ran
+        ]
+        passed = sum(one.passed for one in cases)
+        return Tested(
+            file=current.cases_file,
+            exists=current.cases is not None,
+            passed=passed,
+            failed=len(cases) - passed,
+            cases=sorted(cases, key=lambda one: one.passed)[:_MOST_SHOWN],
+        )
+
     return router
+
+
+def _rule(rule: Rule) -> RuleText:
+    return RuleText(section=rule.section, key=rule.key, file=rule.file, line=rule.line)
+
+
+def _explained(found: Explanation) -> Explained:
+    decision = found.decision
+    return Explained(
+        **found.request.fields(),
+        decision=decision.word,
+        rule=_rule(decision.rule) if decision.rule else None,
+        reason=decision.reason,
+        told=found.told,
+        through=list(found.through),
+        limit=found.limit,
+        lost=[
+            LostRule(rule=_rule(one.rule), would="allow" if one.grants else "deny", why=one.why)
+            for one in found.lost
+        ],
+        node=_explained(found.node) if found.node is not None else None,
+        command=_explained(found.command) if found.command is not None else None,
+        allowed=found.allowed,
+    )

@@ -18,14 +18,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Operator, ask
 from appliance.api.routing import Responses, Routes, Tagged, body
 from appliance.api.services import Services
-from appliance.channel.admin import (
-    PolicyConfirm,
-    PolicyLoad,
-    PolicyReload,
-    PolicyRollback,
-    PolicyWanted,
-    RegistrationsWanted,
-)
+from appliance.channel import admin
 from appliance.channel.answers.policy import Confirmed, Loaded
 
 _CHANGES: Responses = {
@@ -65,7 +58,7 @@ def routes(services: Services) -> Routes:
                 403, "not-for-this-role", "loading a policy is for admins; operators may use dry_run=1"
             )
         expected = None if dry_run and if_match is None else expected_revision(if_match)
-        order = PolicyLoad(posted.text, posted.note, confirm_within, expected)
+        order = admin.PolicyLoad(posted.text, posted.note, confirm_within, expected)
         report = await _load(services, order, bearer, dry_run=dry_run)
         return Tagged(report, report.revision)
 
@@ -74,7 +67,7 @@ def routes(services: Services) -> Routes:
         to: Annotated[Rollback, body(Rollback)], bearer: Operator, if_match: IfMatch = None
     ) -> Tagged[Loaded]:
         """Bring a kept revision into force again, as a new one."""
-        order = PolicyRollback(to.revision, expected_revision(if_match))
+        order = admin.PolicyRollback(to.revision, expected_revision(if_match))
         loaded = await ask(services.control, order, bearer)
         return Tagged(loaded, loaded.revision)
 
@@ -83,25 +76,25 @@ def routes(services: Services) -> Routes:
         bearer: Operator, if_match: IfMatch = None, confirm_within: Confirm = None
     ) -> Tagged[Loaded]:
         """Read the policy file again."""
-        order = PolicyReload(confirm_within, expected_revision(if_match))
+        order = admin.PolicyReload(confirm_within, expected_revision(if_match))
         loaded = await ask(services.control, order, bearer)
         return Tagged(loaded, loaded.revision)
 
     @router.post("/confirm", operation_id="confirm_policy", responses=_CHANGES)
     async def confirm(bearer: Operator, if_match: IfMatch = None) -> Tagged[Confirmed]:
         """Keep a policy that was loaded with `confirm_within`."""
-        confirmed = await ask(services.control, PolicyConfirm(expected_revision(if_match)), bearer)
+        confirmed = await ask(services.control, admin.PolicyConfirm(expected_revision(if_match)), bearer)
         return Tagged(confirmed, confirmed.revision)
 
     return router
 
 
-async def _load(services: Services, order: PolicyLoad, bearer: Bearer, *, dry_run: bool) -> Report:
-    current = await ask(services.control, PolicyWanted(), bearer)
+async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, dry_run: bool) -> Report:
+    current = await ask(services.control, admin.PolicyWanted(), bearer)
     if order.expected not in (None, current.revision):
         text = f"revision {current.revision} is in force, not {order.expected}"
         raise ProblemError(412, "changed-meanwhile", text)
-    live = (await ask(services.control, RegistrationsWanted(), bearer)).registrations
+    live = (await ask(services.control, admin.RegistrationsWanted(), bearer)).registrations
     try:
         async with services.judging:
             judgement = await asyncio.to_thread(judge_change, order.text, current, live)

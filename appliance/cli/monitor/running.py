@@ -10,15 +10,8 @@ from msgspec.structs import asdict
 from rich.console import Console
 from rich.table import Column, Table
 
-from appliance.channel.admin import (
-    AdminAnswer,
-    MonitorLoad,
-    MonitorReload,
-    MonitorRemove,
-    MonitorResume,
-    MonitorsWanted,
-    MonitorSwitch,
-)
+from appliance.channel import admin
+from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
@@ -34,7 +27,7 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv monitor list --json
     """
-    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json)
     if as_json:
         for row in body.monitors:
             say_json(row)
@@ -105,7 +98,7 @@ def load(
             AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
         )
         return
-    _say_replaced(appliance.answer_or_exit(MonitorLoad(texts, definitions, note), as_json=as_json))
+    _say_replaced(appliance.answer_or_exit(admin.MonitorLoad(texts, definitions, note), as_json=as_json))
     _say_disabled(appliance, texts)
 
 
@@ -115,7 +108,7 @@ def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
     Example: rosrv monitor remove safeTrigger
     """
-    _say_replaced(appliance.answer_or_exit(MonitorRemove(names), as_json=as_json))
+    _say_replaced(appliance.answer_or_exit(admin.MonitorRemove(names), as_json=as_json))
 
 
 @speaks
@@ -130,7 +123,7 @@ def reload(
 
     Example: rosrv monitor reload
     """
-    body = appliance.answer_or_exit(MonitorReload(prune=prune), as_json=as_json)
+    body = appliance.answer_or_exit(admin.MonitorReload(prune=prune), as_json=as_json)
     _say_replaced(body)
     if body.kept:
         say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
@@ -143,14 +136,14 @@ def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
     Example: rosrv monitor resume safeTrigger
     """
-    body = appliance.answer_or_exit(MonitorResume(names), as_json=as_json)
+    body = appliance.answer_or_exit(admin.MonitorResume(names), as_json=as_json)
     say(f"resumed: {', '.join(body.names) or 'none was held'}")
 
 
 @speaks
 def rv_state(appliance: Appliance, as_json: Json = False) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
-    body = appliance.ask_or_exit(MonitorsWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json)
     real, port, rows = body.rv_state
     if as_json:
         say_json(body.rv_state)
@@ -161,7 +154,7 @@ def rv_state(appliance: Appliance, as_json: Json = False) -> None:
 
 
 def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
-    body = appliance.ask_or_exit(MonitorSwitch(names, enabled), as_json=as_json)
+    body = appliance.ask_or_exit(admin.MonitorSwitch(names, enabled), as_json=as_json)
     if as_json:
         say_json({**asdict(body), "enabled": enabled})
         return
@@ -196,7 +189,7 @@ def _say_replaced(body: Replaced) -> None:
 
 def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
     """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
-    rows = appliance.ask_or_exit(MonitorsWanted(), as_json=False).monitors
+    rows = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=False).monitors
     names = [row.name for row in rows if row.file in files and not row.enabled]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")
