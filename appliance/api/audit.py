@@ -91,6 +91,9 @@ def _wanted(
     text: Annotated[
         str | None, Query(max_length=256, description="anywhere in names, reason, details")
     ] = None,
+    who: Annotated[
+        str | None, Query(max_length=256, description="the token's name, or `operator`; a glob")
+    ] = None,
     deny: Annotated[bool, Query(description="only what was denied: the same as decision=deny")] = False,
     topic: Annotated[str | None, Query(max_length=256, description="another word for resource")] = None,
     looks: Annotated[
@@ -113,6 +116,7 @@ def _wanted(
             severity=severity,
             rule=rule,
             text=text,
+            who=who,
             without_looks=not looks,
         )
     except (MomentError, OverflowError, ValueError) as error:

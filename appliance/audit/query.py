@@ -26,7 +26,8 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the least one;
     `host`, `caller_id`, `resource`, `category` and `event` are exact, or globs when they contain `*`, `?`
     or `[`; `rule` is a glob for the rule's section or its key; `text` is found anywhere in names, reason and
-    details, regardless of case. `without_looks` leaves out REST calls that were allowed and only looked (GET, HEAD).
+    details, regardless of case; `who` is a glob for the name of the token (or `operator`) that asked.
+    `without_looks` leaves out REST calls that were allowed and only looked (GET, HEAD).
     """
 
     decision: tuple[str, ...] = ()
@@ -40,9 +41,12 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     severity: Severity | None = None
     rule: str | None = None
     text: str | None = None
+    who: str | None = None
     without_looks: bool = False
 
 
+# A detail that somebody spoilt is nobody's.
+_WHO = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN json_extract(CAST(detail AS TEXT), '$.who') END"
 # A look's method stands in its details, also of counted ones. Quotes that a client writes are escaped there.
 _NO_LOOK = """NOT (
     category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
@@ -82,6 +86,8 @@ def conditions(wanted: Filter) -> list[Condition]:
                 "record_rule",
             )
         )
+    if wanted.who is not None:
+        found.append(Condition(f"({_WHO}) GLOB ?", (_checked("who", wanted.who),)))
     if wanted.without_looks:
         found.append(Condition(_NO_LOOK, ()))
     if wanted.since is not None:

@@ -49,6 +49,9 @@ def _filter(
     text: Annotated[
         str | None, typer.Option("--text", help="Found anywhere in names, reason and details")
     ] = None,
+    who: Annotated[
+        str | None, typer.Option("--who", help="Name of the token that asked, or operator; a glob")
+    ] = None,
 ) -> Filter:
     now = time.time_ns()
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
@@ -64,6 +67,7 @@ def _filter(
         severity=severity,
         rule=rule,
         text=text,
+        who=who,
     )
 
 

@@ -169,3 +169,34 @@ def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: C
                          .map(name => name.innerText)""",
     )
     assert broken == []
+
+
+def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """A refusal is in sight and a lookup is not; one press shows all, one what people changed; a search is kept."""
+    refuse(attempt, "/matters")
+    attempt("getParam", "/matters_not", "/nothing")
+    reader = opened()
+    page = reader.go("audit")
+    expect(page.get_by_role("row", name="/matters").first).to_be_visible()
+    expect(page.get_by_role("row", name="/matters_not")).to_have_count(0)
+    searches = page.get_by_role("group", name="Searches")
+    searches.get_by_role("button", name="All", exact=True).click()
+    expect(page.get_by_role("row", name="/matters_not").first).to_be_visible()
+    searches.get_by_role("button", name="Refused").click()
+    expect(page.locator("tbody tr").first).to_contain_text("deny")
+    page.get_by_label("Text").fill("matters")
+    searches.get_by_role("button", name="Keep this search").click()
+    page = reader.go("audit")
+    page.get_by_role("button", name="matters, deny", exact=True).click()
+    expect(page.get_by_label("Text")).to_have_value("matters")
+    expect(page.get_by_role("img", name="When:")).to_be_visible()
+
+
+def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) -> None:
+    """Who switched a monitor is found, and named where a node would be."""
+    name = json.loads(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()[0])["name"]
+    appliance.rosrv("monitor", "disable", name)
+    appliance.recorded("--who", "*", event="monitor disabled")
+    page = opened().go("audit")
+    page.get_by_role("button", name="Changes by people").click()
+    expect(page.get_by_role("row", name="monitor disabled").first).to_contain_text("operator")

@@ -216,3 +216,12 @@ def test_calls_that_only_looked_are_left_out(log: AuditLog, path: Path) -> None:
     assert [entry.record.detail["method"] for entry in shown] == ["POST", "GET", 'X","method":"GET', "GET"]
     followed = Follower(path, Filter(resource="/v1/x", without_looks=True), 0).poll(100)
     assert [entry.sequence for entry in followed] == [entry.sequence for entry in shown]
+
+
+def test_who_asked(log: AuditLog, path: Path) -> None:
+    """The name of a token finds what it asked, a glob what anybody did; a node's own words are nobody's name."""
+    details: list[dict[str, Any]] = [{"who": "alice"}, {"who": "bob"}, {"text": '"who":"alice"'}, {}]
+    for detail in details:
+        log.record(decision(log, resource="/v1/x", detail=detail))
+    assert settle(log) is None
+    assert [len(sequences(path, Filter(who=who))) for who in ("alice", "*", "a*", "eve")] == [1, 2, 1, 0]

@@ -6,13 +6,13 @@ import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { go } from "../router.js";
 
-export const NAMES = ["text", "decision", "since", "until", "host", "caller_id", "resource", "category", "event", "severity", "rule", "looks"];
+export const NAMES = ["text", "decision", "since", "until", "host", "caller_id", "resource", "category", "event", "severity", "rule", "who", "looks"];
 const FEW = ["text", "decision", "since"];
 const SINCE = /** @type {[string, string][]} */ ([["", "Any time"], ["15m", "Last 15 minutes"], ["1h", "Last hour"], ["1d", "Last day"], ["1w", "Last week"]]);
 const DECISIONS = /** @type {[string, string][]} */ ([["", "Any decision"], ["deny", "Deny"], ["would deny", "Would deny"], ["allow", "Allow"]]);
 const SEVERITIES = /** @type {[string, string][]} */ ([["", "Any"], ["debug", "Debug and up"], ["info", "Info and up"], ["notice", "Notice and up"], ["warning", "Warning and up"], ["alarm", "Alarm"]]);
 const LOOKS = /** @type {[string, string][]} */ ([["", "Hidden"], ["1", "Shown"]]);
-const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule", looks: "REST looks" };
+const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule", who: "Who", looks: "REST looks" };
 
 /** @param {URLSearchParams} query @returns {Record<string, string>} those that are set */
 export function filterOf(query) {
@@ -44,7 +44,7 @@ export function Filters({ filter, record }) {
     </div>
     ${more && html`<div class="form-grid">
       ${field("host", { placeholder: "10.0.0.*", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
-      ${field("rule", { placeholder: "Publishers, or a key", mono: true })}${field("category", { placeholder: "publish, command, monitor" })}${field("event", { placeholder: "decision, message dropped" })}
+      ${field("rule", { placeholder: "Publishers, or a key", mono: true })}${field("category", { placeholder: "publish, command, monitor" })}${field("event", { placeholder: "decision, message dropped" })}${field("who", { placeholder: "name of a token, or operator" })}
       ${field("looks", { options: LOOKS })}${field("severity", { options: SEVERITIES })}${field("until", { placeholder: "10m, or 2026-11-20T08:00", mono: true })}
     </div>`}
     ${Object.keys(filter).some((name) => !FEW.includes(name)) && html`<div class="row">${Object.entries(filter).filter(([name]) => !FEW.includes(name)).map(([name, value]) => html`<button key=${name} class="chip" onClick=${() => set(name)("")} aria-label=${`Remove the filter ${name}`}>

@@ -9,6 +9,7 @@ import { Icon } from "../parts/icon.js";
 import { Failure, Notice } from "../parts/notice.js";
 import { failed } from "../parts/toast.js";
 import { get, queryText, send } from "../rest.js";
+import { askedOf } from "./records.js";
 
 export function Verify() {
   const [shown, setShown] = useState(/** @type {{value?: any, error?: unknown} | null} */ (null));
@@ -36,7 +37,7 @@ function Verdict(/** @type {{value: any}} */ { value }) {
 export function Export({ filter }) {
   const run = async () => {
     try {
-      const response = await send("GET", `/v1/audit/export${queryText(filter)}`);
+      const response = await send("GET", `/v1/audit/export${queryText(askedOf(filter))}`);
       save(await response.blob(), `rosrv-audit-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}.ndjson`);
     } catch (error) {
       failed(error);

@@ -8,8 +8,13 @@ const PAGE = 100;
 const KEPT = 2000; // while it is followed; what the reader asked for by hand comes on top
 const PAUSE = 250; // after the last key of a search
 
-/** What is asked: calls of REST that only looked (this page's own, above all) only where they are asked for. */
+/**
+ * What is asked: calls of REST that only looked (this page's own, above all) only where they are asked for; and without
+ * a filter but of time what matters, from notices on: refusals, what monitors did, changes, faults.
+ */
 export function askedOf(/** @type {Record<string, string>} */ { looks, ...filter }) {
+  const matters = !looks && Object.keys(filter).every((name) => name === "since" || name === "until");
+  if (matters) return { ...filter, severity: "notice", looks: "0" };
   return looks || filter.event || filter.category ? filter : { ...filter, looks: "0" };
 }
 

@@ -8,10 +8,12 @@ import { go, place } from "../router.js";
 import { typing } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { auditPath, filterOf, Filters } from "./filters.js";
+import { Presets } from "./presets.js";
 import { Export, Verify } from "./proof.js";
 import { RecordPanel } from "./record.js";
 import { useRecords } from "./records.js";
 import { RecordTable } from "./table.js";
+import { Timeline } from "./timeline.js";
 
 export function Audit() {
   const { rest: chosen, query } = useStore(place);
@@ -23,13 +25,14 @@ export function Audit() {
       <div class="head-actions">
         <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
         <${Verify} /><${Export} filter=${filter} /></div></div>
+    <${Presets} filter=${filter} />
     <${Filters} filter=${filter} record=${chosen} />
     ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Not following now: ${standing.reason} It is tried again by itself.</div>`}
     <div class=${`audit-grid${chosen ? " with-record" : ""}`}>
       <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
         ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
         ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${Object.keys(filter).length ? "Take a filter away, or look further back." : "The log is empty; the appliance writes to it from its start on."}</${Empty}>`
-          : html`<${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
+          : html`<${Timeline} records=${records} chosen=${chosen} filter=${filter} /><${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
       </section>
       ${chosen && html`<${RecordPanel} key=${chosen} id=${chosen} filter=${filter} />`}
     </div>`;
