@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from appliance.relay.monitors.places import Place
-from appliance.rosmop.batch import Walked, Walker
+from appliance.rosmop.walking import Walked, Walker
 
 
 class Count(NamedTuple):
@@ -22,39 +22,29 @@ class Counts:
         self.place = place
         self.begun = False
         """Whether something is counted."""
-        self._events = len(walker.events)
         self._clear()
 
     def add(self, walked: Walked, time: int) -> int:
         """Count a walk; how many messages it dropped."""
         self.begun = True
-        happened = self._happened
-        for number, count in enumerate(walked.happened):
-            happened[number] += count
-        if walked.changed:
-            changed = self._changed
-            for who, count in walked.changed:
-                changed[who] = changed.get(who, 0) + count
-        if not self.walker.drops:
-            return 0
-        gone = 0
+        for who, count in walked.changed:
+            self._changed[who] = self._changed.get(who, 0) + count
         for number, count in enumerate(walked.dropped):
             if count:
-                gone += count
                 self._dropped[number] += count
                 self._last_drop[number] = time
-        return gone
+        return sum(walked.dropped)
 
     def take(self) -> tuple[list[Count], dict[tuple[str, ...], int]]:
         """The counts of all events, and of changed messages by the events that changed them; they begin anew."""
-        counts = [Count(*each) for each in zip(self._happened, self._dropped, self._last_drop, strict=True)]
+        happened = self.walker.happened()
+        counts = [Count(*each) for each in zip(happened, self._dropped, self._last_drop, strict=True)]
         changed = {self.walker.writers(who): count for who, count in self._changed.items()}
         self._clear()
         return counts, changed
 
     def _clear(self) -> None:
         self.begun = False
-        self._happened = [0] * self._events
-        self._dropped = [0] * self._events
         self._changed: dict[int, int] = {}
-        self._last_drop = [0] * self._events
+        self._dropped = [0] * len(self.walker.events)
+        self._last_drop = [0] * len(self.walker.events)

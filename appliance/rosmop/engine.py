@@ -12,8 +12,8 @@ Theory of operation:
    a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
    the caller calls `advance` when `next_due` has come. Ticks that take longer than the caller's `patience` allows are
    left out, and that is logged; deadlines wait for the next time.
-4. `walker` offers, for most topics, loops that do what `process` does to many messages at once (`batch.py`), as far
-   as these need nothing that is recorded or explained. Whoever uses them must not see a difference but in time.
+4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walking.py`), as
+   far as these need nothing that is recorded or explained. Whoever uses it must not see a difference but in time.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
 """
@@ -23,7 +23,6 @@ from types import MappingProxyType
 from typing import Literal
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.batch import Walker, walkers
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
 from appliance.rosmop.faults import explain, happened
 from appliance.rosmop.logics.interface import Categories, RunFaultError
@@ -36,6 +35,7 @@ from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
+from appliance.rosmop.walking import Walker, walkers
 
 OnFault = Literal["drop", "pass"]
 
@@ -45,6 +45,12 @@ MAX_TICKS = 100_000
 
 def _never() -> bool:
     return False
+
+
+def _come_home(monitor: Monitor) -> None:
+    """Before Python looks at a monitor's state, or that of others on its topics, it is with Python."""
+    if monitor.home is not None:
+        monitor.home.leave()
 
 
 class MonitorSet:
@@ -90,7 +96,9 @@ class MonitorSet:
 
     @property
     def monitors(self) -> tuple[Monitor, ...]:
-        """The running specifications, in order."""
+        """The running specifications, in order, with their state."""
+        for monitor in self._monitors:
+            _come_home(monitor)
         return self._monitors
 
     @property
@@ -158,8 +166,8 @@ class MonitorSet:
                 return steps[0].event.service_type
         return None
 
-    def write_loops(self) -> None:
-        """Write the loops that `walker` offers; takes about as long as compiling the specifications."""
+    def write_module(self) -> None:
+        """Write the module that `walker` offers the walks of."""
         self._walkers = walkers(self._compiled, self._monitors)
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
@@ -167,11 +175,11 @@ class MonitorSet:
         return self._contexts.get(topic, ())
 
     def walker(self, topic: str) -> Walker | None:
-        """The loops for messages on this topic; None if there are none."""
+        """The walk for messages on this topic; None if there is none."""
         return self._walkers.get(topic) if topic in self._steps else None
 
     def walks(self, walker: Walker, time_ns: int) -> bool:
-        """Whether loops may be used now: nothing is due, no monitor waits for its first message or could not begin."""
+        """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""
         return (self._due is None or self._due > time_ns) and not self._broken and walker.ready()
 
     def monitor(self, name: str) -> Monitor:
@@ -322,6 +330,7 @@ class MonitorSet:
             outcome.before = self.advance(time_ns)
         if not steps:
             return outcome
+        _come_home(steps[0].monitor)
         self._turn.now = time_ns
         message = Message(buffer, time_ns)
         writers: tuple[str, ...] = ()
@@ -472,6 +481,7 @@ class MonitorSet:
 
     def _tick(self, timer: Timer, time_ns: int, ticks: dict[int, int]) -> Outcome:
         step = timer.step
+        _come_home(step.monitor)
         due = timer.due or 0
         outcome = Outcome(time=due)
         outcome.timer = step.name
@@ -510,6 +520,7 @@ class MonitorSet:
         self._turn.log.append(LogLine("WARN", text, timer.step.monitor.name))
 
     def _expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
+        _come_home(monitor)
         deadline = running.run.deadline or 0
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
         outcome = Outcome(time=deadline)

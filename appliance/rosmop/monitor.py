@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
@@ -12,6 +13,14 @@ from appliance.rosmop.syntax import tree
 
 FAILING_AFTER = 10
 """Faults after which a monitor is shown as failing."""
+
+
+class Home(Protocol):
+    """Where the state of monitors is: with Python, or in a module."""
+
+    def leave(self) -> None:
+        """See that Python has it."""
+
 
 Handler = Callable[[Message | None], None]
 
@@ -71,6 +80,8 @@ class Monitor:
     faults: int = 0
     seen: bool = False
     """A message of one of its events has come."""
+    home: Home | None = None
+    """Where its state is, if that may be in a module."""
 
     @property
     def name(self) -> str:

@@ -90,7 +90,7 @@ class Compiler:
                 self._standard = standard_definitions()
             definitions = self._standard.extended(Definitions.from_files(message.definitions))
             monitors = MonitorSet.load(dict(message.files), definitions, message.on_fault)
-            monitors.write_loops()
+            monitors.write_module()
             return monitors
         except SpecificationError as error:
             return [str(one) for one in error.findings]

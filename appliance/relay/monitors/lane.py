@@ -1,6 +1,6 @@
 """One topic of one incarnation on its way through the monitors.
 
-The messages of a batch are taken many at a time where they need nothing but the common (`rosmop/batch.py`), one by
+The messages of a batch are taken many at a time where they need nothing but the common (`rosmop/walking.py`), one by
 one where there is something to tell; what nobody changed or dropped leaves in the buffer it came in.
 
 A message that comes alone costs little work and much fetching: at a thousand a second other programs have filled
@@ -19,10 +19,10 @@ from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Sighting
 from appliance.relay.monitors.telling import Telling
-from appliance.rosmop.batch import Prepared, Walker
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import BUDGET
+from appliance.rosmop.walking import Prepared, Walker
 
 LONGEST = 2.0
 """Seconds of processor time that monitors may take until the loop comes to its timers again."""
@@ -88,8 +88,8 @@ class Lane:
         assert self._counts is not None  # noqa: S101  and counts for it
         pieces: list[memoryview | bytes | bytearray] = []
         try:
-            walked = self._walker.walk(batch.view, 0, 0, pieces, batch.stride, now, self._prepared)
-        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
+            walked = self._walker.walk(batch.view, 0, 0, pieces, now, self._prepared)
+        except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, self._walker, now)
             return self._through(batch, Passage(batch, now))
         if not self._counts.begun:
@@ -103,7 +103,7 @@ class Lane:
         return self._through(batch, passage)
 
     def _failed(self, error: Exception, walker: Walker, now: int) -> None:
-        """The loops of this topic are not right: tell it, and leave everything to the engine from now on."""
+        """The walk of this topic is not right: tell it, and leave everything to the engine from now on."""
         self._middle.telling.defect(error, self._place, now)
         self._defect = walker
         self._sight = None
@@ -127,18 +127,18 @@ class Lane:
         if walker is self._defect or not monitors.walks(walker, passage.time):
             return False
         prepared, counts = self._prepare(monitors, walker)
-        began = time.thread_time() if passage.messages > _MANY else None  # else too little to count
+        counted = passage.messages > _MANY or not walker.brief  # else it is too little
+        began = time.thread_time() if counted else None
         try:
             walked = walker.walk(
                 passage.view,
                 passage.position,
                 passage.run,
                 passage.pieces,
-                passage.stride,
                 passage.time,
                 prepared,
             )
-        except Exception as error:  # noqa: BLE001  a defect of the loops must not end the relay
+        except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
         if began is not None:
@@ -160,7 +160,7 @@ class Lane:
         if counts is None or counts.walker is not walker:
             counts = self._counts = Counts(walker, place)
         self._walker, self._sight = walker, self._middle.sight
-        self._until = _NEVER if monitors.next_due is None else monitors.next_due
+        self._until = (_NEVER if monitors.next_due is None else monitors.next_due) if walker.brief else 0
         return prepared, counts
 
     def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:

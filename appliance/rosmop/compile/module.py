@@ -36,7 +36,7 @@ class Module:
         self._line_sites: list[int] = []
         self._names = 0
         self._structs: dict[tuple[str, str], str] = {}
-        self._functions: dict[str, tuple[int, int]] = {}
+        self._functions: set[str] = set()
 
     def fresh(self, prefix: str) -> str:
         """A name that nothing else has."""
@@ -61,24 +61,18 @@ class Module:
             self._structs[key] = self.use(getattr(struct.Struct(code), method), "s")
         return self._structs[key]
 
-    @property
-    def structs(self) -> dict[str, tuple[str, str]]:
-        """The names that `struct` has given: the `struct` code and the method of each."""
-        return {name: key for key, name in self._structs.items()}
-
     def add(self, lines: list[tuple[str, int]]) -> None:
         """Append lines with their sites (-1: none): those of one function."""
         head = lines[0][0] if lines else ""
         if head.startswith("def "):
-            self._functions[head[4 : head.index("(")]] = (len(self._lines), len(lines))
+            self._functions.add(head[4 : head.index("(")])
         for line, site in lines:
             self._lines.append(line)
             self._line_sites.append(site)
 
-    def function(self, name: str) -> str | None:
-        """The source of a function; None if there is none of this name."""
-        first, count = self._functions.get(name, (0, 0))
-        return "\n".join(self._lines[first : first + count]) if count else None
+    def has(self, name: str) -> bool:
+        """Whether there is a function of this name."""
+        return name in self._functions
 
     @property
     def next_line(self) -> int:

@@ -208,7 +208,7 @@ class Printer:
         lines.add(f"{node.name} = {name}(b, {spot(node.at)}, {node.count}, {skipper}, {self._context})")
 
     def _skipper(self, skipper: form.Skipper) -> str:
-        if self._module.function(skipper.name) is None:
+        if not self._module.has(skipper.name):
             inner = Lines()
             for statement in skipper.body:
                 self._statement(inner, statement)

@@ -626,3 +626,39 @@ class Function:
     body: tuple[Statement, ...]
     shared: tuple[str, ...] = ()
     happens: int | None = None
+
+
+# Programs
+
+
+@dataclass(frozen=True, slots=True)
+class Advance:
+    """What an event does to a property: the next state for each of its states; -1 where a handler runs then, or where
+    the property has no table of states. `property` is its number among those with tables; None without one.
+    """
+
+    property: int | None
+    table: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event on a topic: its function, and the steps of its specification's properties when it has happened.
+
+    `specification` counts from 0 among those of the topic.
+    """
+
+    function: str
+    specification: int
+    advances: tuple[Advance, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """Specifications that share topics or variables, and nothing with others: the variables of each of them, how many
+    properties with tables they have, and their topics with the events on each, in order.
+    """
+
+    variables: tuple[str, ...]
+    properties: int
+    topics: tuple[tuple[str, tuple[Event, ...]], ...]

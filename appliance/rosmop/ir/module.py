@@ -1,128 +1,72 @@
-"""The scalar part of the form as a WebAssembly module: numbers, conditions, loops, fields that are numbers, drops.
+"""The scalar part of the form as WebAssembly: numbers, conditions, loops, fields that are numbers, drops.
 
-`module_of` writes functions of events and what they call; `NotScalarError` names what is beyond this part (strings,
-vectors, whole messages, output, recursion). The module has no imports.
+`Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
-- The export of an event takes where the message is in `memory` and its size (i32, i32), and returns bits (i32): it
-  happened (1), drops the message (2), has made its bytes others (4).
-- A variable of the set stands at its address, in 8 bytes.
-- A fault is a trap; before it the site is stored at 0 and the reason (of `REASONS`) at 4. A trap of the runtime's own
-  (no fuel is left) stores nothing.
-
-Work and memory are bounded by the runtime (fuel, limits of the store), so what the form charges is not written.
+- An event takes where the message is in the memory and its size (i32, i32), and returns bits (i32): `HAPPENED`,
+  `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`.
+- What is beyond this part (strings, vectors, whole messages, output, recursion) and every fault is `ELSEWHERE`: this
+  message is for Python's functions, and what was done to it is taken back. Within a helper function it is a trap. An
+  event of which no message can come past such a place has no module: `NotScalarError` names what is beyond.
+- A variable of the set stands at its address, in 8 bytes. Before a field is written, what stood there is noted in the
+  log (address, size, bytes; 16 bytes each) that `UNDO` points behind.
+- What the form charges is taken from the budget of its specification, as everywhere.
 """
 
-import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.values import BILLION, struct_code, struct_size
-from appliance.rosmop.runtime.wire import MAX_EMPTY
+from appliance.rosmop.ir.interpreter import SHORT
+from appliance.rosmop.ir.values import struct_code, struct_size
+from appliance.rosmop.ir.wasm import (
+    ABS,
+    CALCULATE,
+    COMPARE,
+    DROP,
+    ELSE,
+    END,
+    F32,
+    F64,
+    I32,
+    I64,
+    IF,
+    LOAD,
+    NEG,
+    NOTHING,
+    RETURN,
+    SELECT,
+    STORE,
+    UNREACHABLE,
+    constant,
+    row,
+    unsigned,
+)
+from appliance.rosmop.runtime import times
+from appliance.rosmop.runtime.times import BILLION
+from appliance.rosmop.runtime.wire import FEW, MAX_EMPTY
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-VARIABLES = 8
-"""The address of the first variable."""
+HAPPENED, DROPPED, CHANGED, ELSEWHERE = 1, 2, 4, 8
 
-REASONS = ("", "division by zero", "the bytes are not a message of this type")
-
-_I32, _I64, _F32, _F64 = 0x7F, 0x7E, 0x7D, 0x7C
-_IF, _ELSE, _END, _RETURN, _DROP, _SELECT = b"\x04", b"\x05", b"\x0b", b"\x0f", b"\x1a", b"\x1b"
-_NOTHING = b"\x40"
-_UNREACHABLE = b"\x00"
-_COMPARE = {
-    _I32: {"==": 0x46, "!=": 0x47, "<": 0x48, ">": 0x4A, "<=": 0x4C, ">=": 0x4E},
-    _I64: {"==": 0x51, "!=": 0x52, "<": 0x53, ">": 0x55, "<=": 0x57, ">=": 0x59},
-    _F32: {"==": 0x5B, "!=": 0x5C, "<": 0x5D, ">": 0x5E, "<=": 0x5F, ">=": 0x60},
-    _F64: {"==": 0x61, "!=": 0x62, "<": 0x63, ">": 0x64, "<=": 0x65, ">=": 0x66},
-}
-_CALCULATE = {
-    _I32: {"+": 0x6A, "-": 0x6B, "*": 0x6C, "/": 0x6D, "%": 0x6F, "&": 0x71, "|": 0x72, "^": 0x73, "<<": 0x74,
-           ">>": 0x75},
-    _I64: {"+": 0x7C, "-": 0x7D, "*": 0x7E, "/": 0x7F, "%": 0x81, "&": 0x83, "|": 0x84, "^": 0x85, "<<": 0x86,
-           ">>": 0x87},
-    _F32: {"+": 0x92, "-": 0x93, "*": 0x94, "/": 0x95},
-    _F64: {"+": 0xA0, "-": 0xA1, "*": 0xA2, "/": 0xA3},
-}  # fmt: skip
-_LOAD = {"?": 0x2D, "b": 0x2C, "B": 0x2D, "h": 0x2E, "H": 0x2F, "i": 0x28, "I": 0x28, "q": 0x29, "Q": 0x29, "f": 0x2A,
-         "d": 0x2B}  # fmt: skip
-_STORE = {1: 0x3A, 2: 0x3B, 4: 0x36, 8: 0x37}
-
-_ABS, _NEG = {_F32: 0x8B, _F64: 0x99}, {_F32: 0x8C, _F64: 0x9A}
+UNDO, NOW, FIRST = 8, 16, 24
+"""Where the end of the log and the time stand, and what is given out begins."""
 
 
 class NotScalarError(Exception):
     """A function has something that this part of the form does not have."""
 
 
-@dataclass(frozen=True)
-class WasmModule:
-    """A module: its bytes, and where it keeps the variables of the set."""
-
-    code: bytes
-    addresses: Mapping[str, tuple[int, Type]]
-
-
-def module_of(
-    functions: Mapping[str, form.Function], events: Sequence[str], shared: frozenset[str]
-) -> WasmModule:
-    """The module of these events; `shared` are the names of the variables of the set. Raises `NotScalarError`."""
-    writer = _Writer(functions, shared)
-    for name in events:
-        writer.index_of(name, (_I32, _I32), _I32)
-    bodies = []
-    for function, parameters, result in writer.waiting:  # grows while functions call others
-        bodies.append(_Body(writer, functions[function], parameters, result).code())
-    types = [b"\x60" + _row([bytes((one,)) for one in given]) + _row([bytes((result,))])
-             for _, given, result in writer.waiting]  # fmt: skip
-    exports = [_name(name) + b"\x00" + _unsigned(index) for index, name in enumerate(events)]
-    sections = (
-        (1, _row(types)),
-        (3, _row([_unsigned(index) for index in range(len(types))])),
-        (5, _row([b"\x00\x01"])),
-        (7, _row([*exports, _name("memory") + b"\x02\x00"])),
-        (10, _row(bodies)),
-    )
-    code = b"".join(bytes((number,)) + _unsigned(len(content)) + content for number, content in sections)
-    return WasmModule(b"\0asm\x01\0\0\0" + code, MappingProxyType(writer.addresses))
-
-
-def _unsigned(value: int) -> bytes:
-    """LEB128."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*out, value))
-
-
-def _signed(value: int) -> bytes:
-    out = bytearray()
-    while not -64 <= value < 64:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*out, value & 0x7F))
-
-
-def _row(items: Sequence[bytes]) -> bytes:
-    return _unsigned(len(items)) + b"".join(items)
-
-
-def _name(name: str) -> bytes:
-    return _unsigned(len(name)) + name.encode()
-
-
-def _wasm(kind: Type) -> int:
-    """The type of the machine for one of the language."""
+def machine_type(kind: Type) -> int:
+    """The type of the machine for one of the language. Raises `NotScalarError`."""
     if isinstance(kind, kinds.Bool) or (isinstance(kind, kinds.Integer) and kind.bits <= 32):
-        return _I32
+        return I32
     if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
-        return _I64
+        return I64
     if isinstance(kind, kinds.Floating):
-        return _F32 if kind.bits == 32 else _F64
+        return F32 if kind.bits == 32 else F64
     raise NotScalarError(str(kind))
 
 
@@ -130,61 +74,139 @@ def _is_signed(kind: Type) -> bool:
     return not isinstance(kind, kinds.Integer) or kind.signed
 
 
-def _constant(machine: int, value: float) -> bytes:
-    if machine in (_I32, _I64):
-        bits = 32 if machine == _I32 else 64
-        whole = int(value) & (1 << bits) - 1
-        return (b"\x41" if bits == 32 else b"\x42") + _signed(whole - (whole >> bits - 1 << bits))
-    return b"\x43" + struct.pack("<f", value) if machine == _F32 else b"\x44" + struct.pack("<d", value)
+@dataclass
+class Cells:
+    """Where the state of specifications that share topics or variables stands: 8 bytes for each property's state, then
+    for each variable that is used.
+    """
 
-
-class _Writer:
-    """The functions that are needed, in the order of their numbers, and the addresses of variables."""
-
-    def __init__(self, functions: Mapping[str, form.Function], shared: frozenset[str]) -> None:
-        self.functions = functions
-        self.shared = shared
-        self.addresses: dict[str, tuple[int, Type]] = {}
-        self.waiting: list[tuple[str, tuple[int, ...], int]] = []
-
-    def index_of(self, name: str, parameters: tuple[int, ...], result: int) -> int:
-        """The number of a function."""
-        key = (name, parameters, result)
-        if key not in self.waiting:
-            self.waiting.append(key)
-        return self.waiting.index(key)
+    base: int
+    properties: int
+    variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
+    """Where each stands, and its type; in the order of the places."""
 
     def address(self, name: str, kind: Type) -> int:
-        """Where a variable of the set stands."""
-        _wasm(kind)
-        return self.addresses.setdefault(name, (VARIABLES + 8 * len(self.addresses), kind))[0]
+        """Where a variable stands."""
+        machine_type(kind)
+        place = self.base + 8 * (self.properties + len(self.variables))
+        return self.variables.setdefault(name, (place, kind))[0]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
+
+    `brief`: without loops. `passes`: some message comes to its end.
+    """
+
+    number: int
+    parameters: tuple[int, ...]
+    result: int
+    code: bytes
+    assigned: frozenset[str]
+    writes: int
+    drops: bool
+    brief: bool
+    passes: bool
+
+
+class Writer:
+    """The functions that are needed, in the order of their numbers, and who has which place in the memory."""
+
+    def __init__(self, functions: Mapping[str, form.Function], shared: Mapping[str, Cells]) -> None:
+        self.functions = functions
+        self.shared = shared
+        self.written: list[Written] = []
+        self._numbers: dict[tuple[object, ...], Written] = {}
+        self._budgets: dict[str, int] = {}
+        self._used = FIRST
+
+    def take(self, size: int) -> int:
+        """The address of so many bytes of memory."""
+        at = self._used
+        self._used += -(-size // 8) * 8
+        return at
+
+    def budget(self, context: str) -> int:
+        """Where the budget of a specification stands."""
+        if context not in self._budgets:
+            self._budgets[context] = self.take(8)
+        return self._budgets[context]
+
+    def event(self, name: str) -> Written:
+        """The function of an event. Raises `NotScalarError`."""
+        return self.function(self.functions[name], (I32, I32), I32)
+
+    def function(
+        self,
+        function: form.Function | form.Skipper,
+        parameters: tuple[int, ...],
+        result: int,
+        context: str = "",
+    ) -> Written:
+        """A function, written when it is first asked for; `context` is whose budget a skipper takes from."""
+        key = (function.name, parameters, result, context)
+        if key not in self._numbers:
+            written = _Body(self, function, parameters, result, context).written()
+            self._numbers[key] = written
+            self.written.append(written)
+        return self._numbers[key]
 
 
 class _Body:
     """Writes one function."""
 
     def __init__(
-        self, writer: _Writer, function: form.Function, parameters: tuple[int, ...], result: int
+        self,
+        writer: Writer,
+        function: form.Function | form.Skipper,
+        parameters: tuple[int, ...],
+        result: int,
+        context: str,
     ) -> None:
         self._writer = writer
         self._function = function
         self._result = result
-        self._is_event = function.happens is not None
-        names = ("at", "size") if self._is_event else function.parameters
-        self._locals = {name: (index, parameters[index]) for index, name in enumerate(names)}
-        self._parameters = len(parameters)
+        self._is_event = False
+        names: Sequence[str] = ("at", "size", "p")
+        if isinstance(function, form.Function):
+            self._is_event = function.happens is not None
+            names = ("at", "size") if self._is_event else function.parameters
+            context = function.context
+        self._context = context
+        self._types = parameters
+        self._locals = {
+            name: (index, kind) for index, (name, kind) in enumerate(zip(names, parameters, strict=True))
+        }
         self._depth = 0  # blocks that are open
         self._loops: list[int] = []  # at which depth the block of each loop is
+        self._depends = False  # whether messages may have left before
+        self._assigned: set[str] = set()
+        self._writes = 0
+        self._drops = False
+        self._brief = True
         if self._is_event:
-            self._local("dropped", _I32)
-            self._local("changed", _I32)
+            self._local("dropped", I32)
+            self._local("changed", I32)
 
-    def code(self) -> bytes:
-        """The body with its locals."""
-        body = self._block(self._function.body) + _UNREACHABLE + _END
-        made = sorted(self._locals.values())[self._parameters :]
-        whole = _row([b"\x01" + bytes((machine,)) for _, machine in made]) + body
-        return _unsigned(len(whole)) + whole
+    def written(self) -> Written:
+        """The function. Raises `NotScalarError`."""
+        body = self._block(self._function.body)
+        if isinstance(self._function, form.Skipper):
+            body += self._position(self._function.end) + RETURN
+        made = sorted(self._locals.values())[len(self._types) :]
+        whole = row([b"\x01" + bytes((machine,)) for _, machine in made]) + body + UNREACHABLE + END
+        return Written(
+            len(self._writer.written),
+            self._types,
+            self._result,
+            unsigned(len(whole)) + whole,
+            frozenset(self._assigned),
+            self._writes,
+            self._drops,
+            self._brief,
+            self._depends,
+        )
 
     # Parts
 
@@ -192,26 +214,26 @@ class _Body:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))
         if known != machine:
             raise NotScalarError(name)
-        return _unsigned(number)
+        return unsigned(number)
 
-    def _get(self, name: str, machine: int = _I32) -> bytes:
+    def _get(self, name: str, machine: int = I32) -> bytes:
         return b"\x20" + self._local(name, machine)
 
-    def _set(self, name: str, machine: int = _I32) -> bytes:
+    def _set(self, name: str, machine: int = I32) -> bytes:
         return b"\x21" + self._local(name, machine)
 
     def _if(self, test: bytes, yes: Callable[[], bytes], no: Callable[[], bytes] | None = None) -> bytes:
         self._depth += 1
-        inner = yes() + (_ELSE + no() if no is not None else b"")
+        inner = yes() + (ELSE + no() if no is not None else b"")
         self._depth -= 1
-        return test + _IF + _NOTHING + inner + _END
+        return test + IF + NOTHING + inner + END
 
-    def _fault(self, reason: int, site: int) -> bytes:
-        stores = b"".join(
-            _constant(_I32, address) + _constant(_I32, value) + b"\x36\x00\x00"
-            for address, value in ((0, site), (4, reason))
-        )
-        return stores + _UNREACHABLE
+    def _elsewhere(self) -> bytes:
+        return constant(I32, ELSEWHERE) + RETURN if self._is_event else UNREACHABLE
+
+    def _cell(self, opcode: int, address: int, value: bytes = b"") -> bytes:
+        """Load or store at an address."""
+        return constant(I32, 0) + value + bytes((opcode, 0)) + unsigned(address)
 
     # Statements
 
@@ -219,47 +241,58 @@ class _Body:
         return b"".join(self._statement(statement) for statement in statements)
 
     def _statement(self, node: form.Statement) -> bytes:
-        method = _STATEMENTS.get(type(node))
-        if method is None:
-            raise NotScalarError(type(node).__name__)
-        return method(self, node)
+        depth, loops = self._depth, len(self._loops)
+        try:
+            method = _STATEMENTS.get(type(node))
+            if method is None:
+                raise NotScalarError(type(node).__name__)
+            return method(self, node)
+        except NotScalarError:
+            if not depth and not self._depends:
+                raise
+            self._depth = depth
+            del self._loops[loops:]
+            return self._elsewhere()
 
     def _evaluate(self, node: form.Evaluate) -> bytes:
         value = node.value.value if isinstance(node.value, form.Discard) else node.value
         if isinstance(value, form.Assign):
-            return self._assigned(value)
+            return self._assigned_to(value)
         if isinstance(value, form.Literal) and value.value is None:
             return b""
-        return self._value(value) + _DROP
+        return self._value(value) + DROP
 
     def _either(self, node: form.If) -> bytes:
+        test = self._value(node.test)
+        self._depends = True
         no = (lambda: self._block(node.no)) if node.no else None
-        return self._if(self._value(node.test), lambda: self._block(node.yes), no)
+        return self._if(test, lambda: self._block(node.yes), no)
 
     def _loop(self, node: form.Loop) -> bytes:
+        self._brief = False
         self._depth += 2
         self._loops.append(self._depth)
         body = self._block(node.body)
         self._loops.pop()
         self._depth -= 2
-        return b"\x02\x40\x03\x40" + body + b"\x0c\x00" + _END + _END
+        return b"\x02\x40\x03\x40" + body + b"\x0c\x00" + END + END
 
     def _break(self, node: form.Break) -> bytes:
         del node
-        return b"\x0c" + _unsigned(self._depth - self._loops[-1] + 1)
+        return b"\x0c" + unsigned(self._depth - self._loops[-1] + 1)
 
     def _continue(self, node: form.Continue) -> bytes:
         del node
-        return b"\x0c" + _unsigned(self._depth - self._loops[-1])
+        return b"\x0c" + unsigned(self._depth - self._loops[-1])
 
     def _select(self, node: form.Select) -> bytes:
-        machine = _wasm(node.value.type)
+        machine = machine_type(node.value.type)
         value = f"{node.name} value"
-        code = self._value(node.value) + self._set(value, machine) + _constant(_I32, node.default)
+        code = self._value(node.value) + self._set(value, machine) + constant(I32, node.default)
         code += self._set(node.name)
         for wanted, index in node.table:
-            test = self._get(value, machine) + _constant(machine, wanted) + bytes((_COMPARE[machine]["=="],))
-            chosen = _constant(_I32, index) + self._set(node.name)
+            test = self._get(value, machine) + constant(machine, wanted) + bytes((COMPARE[machine]["=="],))
+            chosen = constant(I32, index) + self._set(node.name)
             code += self._if(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
         return code
 
@@ -267,108 +300,171 @@ class _Body:
         if node.references:
             raise NotScalarError("references")
         if node.value.type == kinds.VOID:
-            return _constant(_I32, 0) + _RETURN
-        return self._value(node.value) + _RETURN
+            return constant(I32, 0) + RETURN
+        return self._value(node.value) + RETURN
 
     def _leave(self, node: form.Leave) -> bytes:
-        dropped = self._get("dropped") + _constant(_I32, 1) + b"\x74"
-        changed = self._get("changed") + _constant(_I32, 2) + b"\x74"
-        return _constant(_I32, bool(node.happened)) + dropped + b"\x72" + changed + b"\x72" + _RETURN
+        dropped = self._get("dropped") + constant(I32, 1) + b"\x74"
+        changed = self._get("changed") + constant(I32, 2) + b"\x74"
+        return constant(I32, bool(node.happened)) + dropped + b"\x72" + changed + b"\x72" + RETURN
 
     def _charge(self, node: form.Charge) -> bytes:
-        del node
-        return b""
+        return self._spend(constant(I64, node.instructions))
+
+    def _spend(self, instructions: bytes) -> bytes:
+        budget = self._writer.budget(self._context)
+        left = self._cell(0x37, budget, self._cell(0x29, budget) + instructions + b"\x7d")
+        return left + self._if(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
 
     def _drop(self, node: form.Drop) -> bytes:
         del node
-        return _constant(_I32, 1) + self._set("dropped")
+        self._drops = True
+        return constant(I32, 1) + self._set("dropped")
+
+    def _read_value(self, node: form.ReadValue) -> bytes:
+        """A string is the place of its first byte and where it ends."""
+        if not isinstance(node.type, kinds.String):
+            raise NotScalarError(str(node.type))
+        begin = f"begin of {node.name}"
+        code = self._within(node.at, 4) + self._position(node.at.plus(4)) + self._set(begin, I64)
+        code += (
+            self._get(begin, I64) + b"".join(self._at(node.at, 0x28)) + b"\xad\x7c" + self._set(node.end, I64)
+        )
+        code += self._get(node.end, I64) + self._set(f"end of {node.name}", I64)
+        beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
+        return code + self._if(beyond, self._elsewhere)
 
     def _require(self, node: form.Require) -> bytes:
-        leave = form.Leave(node.site, False)
-        return self._if(self._value(node.test) + b"\x45", lambda: self._leave(leave))
+        test, leave = self._value(node.test) + b"\x45", form.Leave(node.site, False)
+        self._depends = True
+        return self._if(test, lambda: self._leave(leave))
+
+    def _not_past(self, node: form.NotPast) -> bytes:
+        past = self._get(node.count, I64) + constant(I64, node.index) + b"\x57"
+        self._depends = True
+        return self._if(past, self._elsewhere)
+
+    def _skip(self, node: form.Skip) -> bytes:
+        count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
+        left, place = (f"{what} {len(self._locals)}" for what in ("left", "place"))
+        code = count + self._set(left, I64) + self._position(node.at) + self._set(place, I64)
+        if node.inner:
+            code += self._spend(self._get(left, I64) + constant(I64, 1) + b"\x7c")
+        else:
+            many = self._get(left, I64) + constant(I64, FEW) + b"\x56"
+            code += self._if(many, lambda: self._spend(self._get(left, I64)))
+        self._depth += 2
+        if node.skipper is None:
+            end = self._after_text(form.AfterText(node.site, place, form.Spot(place, 0)))
+        else:
+            skipper = self._writer.function(node.skipper, (I32, I32, I64), I64, self._context)
+            end = self._get("at") + self._get("size") + self._get(place, I64)
+            end += b"\x10" + unsigned(skipper.number) + self._set(place, I64)
+        self._depth -= 2
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        code += b"\x02\x40\x03\x40" + over + end + less + b"\x0c\x00" + END + END
+        return code + self._get(place, I64) + self._set(node.name, I64)
 
     def _read_numbers(self, node: form.ReadNumbers) -> bytes:
         end = max(offset + struct_size(struct_code(kind) or "") for _, kind, offset in node.fields)
-        code = self._within(node.at, end, node.site)
+        code = self._within(node.at, end)
         for name, kind, offset in node.fields:
-            code += self._loaded(node.at.plus(offset), kind) + self._set(name, _wasm(kind))
+            code += self._loaded(node.at.plus(offset), kind) + self._set(name, machine_type(kind))
         return code
 
     def _position(self, at: form.Spot) -> bytes:
         """A position, in 64 bits: the lengths in a message are not to be trusted."""
-        offset = _constant(_I64, at.offset)
-        return offset if at.base is None else self._get(at.base, _I64) + offset + b"\x7c"
+        offset = constant(I64, at.offset)
+        return offset if at.base is None else self._get(at.base, I64) + offset + b"\x7c"
 
-    def _within(self, at: form.Spot, size: int, site: int) -> bytes:
+    def _within(self, at: form.Spot, size: int) -> bytes:
         """A fault unless so many bytes of the message stand there."""
         short = self._get("size") + b"\xad" + self._position(at.plus(size)) + b"\x54"
-        return self._if(short, lambda: self._fault(2, site))
+        return self._if(short, self._elsewhere)
 
     def _at(self, at: form.Spot, opcode: int) -> tuple[bytes, bytes]:
         """What stands before and in an access of the message at a position that is within it."""
-        base = self._get("at") + (b"" if at.base is None else self._get(at.base, _I64) + b"\xa7\x6a")
-        return base, bytes((opcode, 0)) + _unsigned(at.offset)
+        base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
+        return base, bytes((opcode, 0)) + unsigned(at.offset)
 
     def _loaded(self, at: form.Spot, kind: Type) -> bytes:
         codes = struct_code(kind) or ""
         if len(codes) == 2:
             extend = b"\xad" if codes[0] == "I" else b"\xac"
             seconds, rest = (b"".join(self._at(at.plus(more), 0x28)) + extend for more in (0, 4))
-            return seconds + _constant(_I64, BILLION) + b"\x7e" + rest + b"\x7c"
-        return b"".join(self._at(at, _LOAD[codes])) + (b"\x45\x45" if codes == "?" else b"")
+            return seconds + constant(I64, BILLION) + b"\x7e" + rest + b"\x7c"
+        return b"".join(self._at(at, LOAD[codes])) + (b"\x45\x45" if codes == "?" else b"")
 
     def _after_text(self, node: form.AfterText) -> bytes:
         length = b"".join(self._at(node.at, 0x28)) + b"\xad"
         end = self._position(node.at.plus(4)) + length + b"\x7c"
-        return self._within(node.at, 4, node.site) + end + self._set(node.name, _I64)
+        return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: form.Count) -> bytes:
         """The number of elements, in 64 bits; a fault if so many are not there."""
-        code = self._within(node.at, 4, node.site) + b"".join(self._at(node.at, 0x28)) + b"\xad"
-        number = self._get(node.name, _I64)
+        code = self._within(node.at, 4) + b"".join(self._at(node.at, 0x28)) + b"\xad"
+        number = self._get(node.name, I64)
         room = self._get("size") + b"\xad" + self._position(node.at.plus(4)) + b"\x7d"
-        least = number + _constant(_I64, node.least) + b"\x7e"
+        least = number + constant(I64, node.least) + b"\x7e"
         if not node.least:
-            least, room = number, _constant(_I64, MAX_EMPTY)
-        return (
-            code
-            + self._set(node.name, _I64)
-            + self._if(least + room + b"\x56", lambda: self._fault(2, node.site))
-        )
+            least, room = number, constant(I64, MAX_EMPTY)
+        return code + self._set(node.name, I64) + self._if(least + room + b"\x56", self._elsewhere)
 
     def _after_elements(self, node: form.AfterElements) -> bytes:
-        count = _constant(_I64, node.count) if isinstance(node.count, int) else self._get(node.count, _I64)
-        end = self._position(node.at) + count + _constant(_I64, node.size) + b"\x7e\x7c"
-        return end + self._set(node.name, _I64)
+        count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
+        end = self._position(node.at) + count + constant(I64, node.size) + b"\x7e\x7c"
+        return end + self._set(node.name, I64)
 
     def _write_back(self, node: form.WriteBack) -> bytes:
         code = self._if(self._get("dropped"), lambda: self._leave(form.Leave(node.site, True)))
         for write in node.writes:
             if write.end is not None:
-                raise NotScalarError("a field of variable size")
-            code += self._if(self._get(write.flag), lambda write=write: self._written(write))  # type: ignore[misc]
+                code += self._if(self._get(write.flag), self._elsewhere)
+                continue
+            self._writes += 1
+            code += self._if(self._get(write.flag), lambda write=write: self._put_field(write))  # type: ignore[misc]
         return code
 
-    def _written(self, write: form.Write) -> bytes:
-        """Put a number where it differs, bit by bit."""
+    def _put_field(self, write: form.Write) -> bytes:
+        """Put a number where it differs, bit by bit; Python decides which bits a NaN has."""
         codes = struct_code(write.value.type) or ""
-        if len(codes) == 2:
-            raise NotScalarError("a time that is assigned")
-        machine, size = _wasm(write.value.type), struct_size(codes)
-        whole = _I64 if size == 8 else _I32
-        bits = {_F32: b"\xbc", _F64: b"\xbd"}.get(machine, b"")
-        new = f"new {whole}"
-        code = self._value(write.value) + bits + self._set(new, whole)
+        machine, size = machine_type(write.value.type), struct_size(codes)
+        whole = I64 if size == 8 else I32
+        new, value = f"new {whole}", self._value(write.value)
+        code = b""
+        if machine in (F32, F64):
+            kept = f"kept {machine}"
+            none = self._get(kept, machine) + self._get(kept, machine) + bytes((COMPARE[machine]["!="],))
+            code = value + self._set(kept, machine) + self._if(none, self._elsewhere)
+            value = self._get(kept, machine) + (b"\xbc" if machine == F32 else b"\xbd")
+        elif len(codes) == 2:
+            code, value = self._parts_of(write.value.type, value)
+        code += value + self._set(new, whole)
         load = {1: 0x2D, 2: 0x2F, 4: 0x28, 8: 0x29}[size]
-        mask = _constant(_I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
-        differs = b"".join(self._at(write.at, load)) + self._get(new, whole) + mask
-        differs += bytes((_COMPARE[whole]["!="],))
+        mask = constant(I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
+        old = b"".join(self._at(write.at, load))
+        differs = old + self._get(new, whole) + mask + bytes((COMPARE[whole]["!="],))
 
         def put() -> bytes:
-            place, store = self._at(write.at, _STORE[size])
-            return place + self._get(new, whole) + store + _constant(_I32, 1) + self._set("changed")
+            entry, end = self._get("entry"), self._cell(0x28, UNDO) + self._set("entry")
+            base = b"" if write.at.base is None else self._get(write.at.base, I64) + b"\xa7\x6a"
+            address = self._get("at") + base + constant(I32, write.at.offset) + b"\x6a"
+            note = entry + address + b"\x36\x00\x00" + entry + constant(I32, size) + b"\x36\x00\x04"
+            note += entry + old + (b"" if whole == I64 else b"\xad") + b"\x37\x00\x08"
+            note += self._cell(0x36, UNDO, entry + constant(I32, 16) + b"\x6a")
+            place, store = self._at(write.at, STORE[size])
+            return (
+                end + note + place + self._get(new, whole) + store + constant(I32, 1) + self._set("changed")
+            )
 
         return code + self._if(differs, put)
+
+    def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
+        """What divides nanoseconds into seconds and the rest; the two as they stand."""
+        code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
+        low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + b"\x83"
+        return code, low + self._get("rest", I64) + constant(I64, 32) + b"\x86\x84"
 
     # Expressions
 
@@ -381,42 +477,55 @@ class _Body:
     def _literal(self, node: form.Literal) -> bytes:
         if not isinstance(node.value, int | float):
             raise NotScalarError(repr(node.value))
-        return _constant(_wasm(node.type), node.value)
+        return constant(machine_type(node.type), node.value)
 
     def _zero(self, node: form.Zero) -> bytes:
-        return _constant(_wasm(node.type), 0)
+        return constant(machine_type(node.type), 0)
 
     def _read(self, node: form.Read) -> bytes:
-        machine = _wasm(node.type)
-        if node.name not in self._writer.shared:
+        machine = machine_type(node.type)
+        cells = self._writer.shared.get(node.name)
+        if cells is None:
             return self._get(node.name, machine)
-        load = {_I32: 0x28, _I64: 0x29, _F32: 0x2A, _F64: 0x2B}[machine]
-        return _constant(_I32, 0) + bytes((load, 0)) + _unsigned(self._writer.address(node.name, node.type))
+        load = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}[machine]
+        return self._cell(load, cells.address(node.name, node.type))
 
-    def _assigned(self, node: form.Assign) -> bytes:
-        machine, value = _wasm(node.type), self._value(node.value)
-        if node.name not in self._writer.shared:
+    def _text_ends(self, node: form.Expression) -> tuple[bytes, bytes]:
+        """Where a string of the message begins and ends."""
+        if not isinstance(node, form.Read) or f"begin of {node.name}" not in self._locals:
+            raise NotScalarError("std::string")
+        return self._get(f"begin of {node.name}", I64), self._get(f"end of {node.name}", I64)
+
+    def _assigned_to(self, node: form.Assign) -> bytes:
+        if isinstance(node.type, kinds.String) and node.name not in self._writer.shared:
+            begin, end = self._text_ends(node.value)
+            return (
+                begin + self._set(f"begin of {node.name}", I64) + end + self._set(f"end of {node.name}", I64)
+            )
+        machine, value = machine_type(node.type), self._value(node.value)
+        cells = self._writer.shared.get(node.name)
+        if cells is None:
             return value + self._set(node.name, machine)
-        store = {_I32: 0x36, _I64: 0x37, _F32: 0x38, _F64: 0x39}[machine]
-        address = _unsigned(self._writer.address(node.name, node.type))
-        return _constant(_I32, 0) + value + bytes((store, 0)) + address
+        self._assigned.add(node.name)
+        store = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}[machine]
+        return self._cell(store, cells.address(node.name, node.type), value)
 
     def _assign(self, node: form.Assign) -> bytes:
-        return self._assigned(node) + self._read(form.Read(node.type, node.name))
+        return self._assigned_to(node) + self._read(form.Read(node.type, node.name))
 
     def _convert(self, node: form.Convert) -> bytes:
         code, source, target = self._value(node.value), node.value.type, node.type
-        one, other = _wasm(source), _wasm(target)
+        one, other = machine_type(source), machine_type(target)
         if isinstance(target, kinds.Bool):
-            return code + _constant(one, 0) + bytes((_COMPARE[one]["!="],))
+            return code + constant(one, 0) + bytes((COMPARE[one]["!="],))
         if isinstance(target, kinds.Floating):
             return code + _to_floating(one, other, signed=_is_signed(source))
         assert isinstance(target, kinds.Integer)  # noqa: S101  numbers are one of the three
         if isinstance(source, kinds.Floating):
-            return self._truncated(code + (b"\xbb" if one == _F32 else b""), target)
+            return self._truncated(code + (b"\xbb" if one == F32 else b""), target)
         if one == other:
             return code + _narrowed(target)
-        if other == _I64:
+        if other == I64:
             return code + (b"\xac" if _is_signed(source) else b"\xad")
         return code + b"\xa7" + _narrowed(target)
 
@@ -427,64 +536,94 @@ class _Body:
             return code + b"\xfc" + bytes((2 + wide + (not target.signed),))
         code += b"\xfc\x02" + self._set("cut")
         for limit, operator in ((target.least, "<"), (target.most, ">")):
-            limited, value = _constant(_I32, limit), self._get("cut")
-            test = value + limited + bytes((_COMPARE[_I32][operator],))
-            code += limited + value + test + _SELECT + self._set("cut")
+            limited, value = constant(I32, limit), self._get("cut")
+            test = value + limited + bytes((COMPARE[I32][operator],))
+            code += limited + value + test + SELECT + self._set("cut")
         return code + self._get("cut")
 
     def _arithmetic(self, node: form.Arithmetic) -> bytes:
-        machine, operator = _wasm(node.type), node.operator
+        machine, operator = machine_type(node.type), node.operator
         left, right = self._value(node.left), self._value(node.right)
-        opcode = _CALCULATE[machine][operator]
-        if machine in (_F32, _F64) or operator in "+-*&|^":
+        opcode = CALCULATE[machine][operator]
+        if machine in (F32, F64) or operator in "+-*&|^":
             return left + right + bytes((opcode,))
         unsigned = not _is_signed(node.type)
         if operator in ("<<", ">>"):
-            if _wasm(node.right.type) != machine:
-                right += b"\xa7" if machine == _I32 else b"\xad"
+            if machine_type(node.right.type) != machine:
+                right += b"\xa7" if machine == I32 else b"\xad"
             return left + right + bytes((opcode + (unsigned and operator == ">>"),))
         return self._divided(node, left, right, bytes((opcode + unsigned,)))
 
     def _divided(self, node: form.Arithmetic, left: bytes, right: bytes, opcode: bytes) -> bytes:
-        machine = _wasm(node.type)
-        one, other = (f"{side} {machine} {node.site}" for side in ("dividend", "divisor"))
+        machine = machine_type(node.type)
+        one, other = (f"{side} {machine} {len(self._locals)}" for side in ("dividend", "divisor"))
         code = left + self._set(one, machine) + right + self._set(other, machine)
-        zero = self._get(other, machine) + (b"\x45" if machine == _I32 else b"\x50")
-        code += self._if(zero, lambda: self._fault(1, node.site))
+        zero = self._get(other, machine) + (b"\x45" if machine == I32 else b"\x50")
+        code += self._if(zero, self._elsewhere)
         quotient = self._get(one, machine) + self._get(other, machine) + opcode
         if node.operator == "%" or not _is_signed(node.type):
             return code + quotient
-        minus = self._get(other, machine) + _constant(machine, -1) + bytes((_COMPARE[machine]["=="],))
-        negated = _constant(machine, 0) + self._get(one, machine) + bytes((_CALCULATE[machine]["-"],))
-        return code + minus + _IF + bytes((machine,)) + negated + _ELSE + quotient + _END
+        minus = self._get(other, machine) + constant(machine, -1) + bytes((COMPARE[machine]["=="],))
+        negated = constant(machine, 0) + self._get(one, machine) + bytes((CALCULATE[machine]["-"],))
+        return code + minus + IF + bytes((machine,)) + negated + ELSE + quotient + END
 
     def _unary(self, node: form.Unary) -> bytes:
-        machine, value = _wasm(node.type), self._value(node.value)
-        if machine in (_F32, _F64):
-            return value + bytes(((_ABS if node.operator == "abs" else _NEG)[machine],))
+        machine, value = machine_type(node.type), self._value(node.value)
+        if machine in (F32, F64):
+            return value + bytes(((ABS if node.operator == "abs" else NEG)[machine],))
         if node.operator == "~":
-            return value + _constant(machine, -1) + bytes((_CALCULATE[machine]["^"],))
+            return value + constant(machine, -1) + bytes((CALCULATE[machine]["^"],))
         kept = f"kept {machine}"
         code = value + self._set(kept, machine)
-        negated = _constant(machine, 0) + self._get(kept, machine) + bytes((_CALCULATE[machine]["-"],))
+        negated = constant(machine, 0) + self._get(kept, machine) + bytes((CALCULATE[machine]["-"],))
         if node.operator == "-":
             return code + negated
         if not _is_signed(node.type):
             return code + self._get(kept, machine)
-        negative = self._get(kept, machine) + _constant(machine, 0) + bytes((_COMPARE[machine]["<"],))
-        return code + negated + self._get(kept, machine) + negative + _SELECT
+        negative = self._get(kept, machine) + constant(machine, 0) + bytes((COMPARE[machine]["<"],))
+        return code + negated + self._get(kept, machine) + negative + SELECT
 
     def _compare(self, node: form.Compare) -> bytes:
-        machine = _wasm(node.left.type)
-        opcode = _COMPARE[machine][node.operator]
+        machine = machine_type(node.left.type)
+        opcode = COMPARE[machine][node.operator]
         if node.operator not in ("==", "!=") and not _is_signed(node.left.type):
             opcode += 1
         return self._value(node.left) + self._value(node.right) + bytes((opcode,))
 
+    def _compare_texts(self, node: form.CompareTexts) -> bytes:
+        """A string of the message and a short constant: as long, and the same bytes."""
+        given, known = (
+            (node.right, node.left) if isinstance(node.left, form.Literal) else (node.left, node.right)
+        )
+        if node.operator not in ("==", "!=") or not isinstance(known, form.Literal) or not node.short:
+            raise NotScalarError("std::string")
+        assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
+        begin, end = self._text_ends(given)
+        if len(known.value) > SHORT:
+            raise NotScalarError("std::string")
+        same, at = constant(I32, 1), 0
+        while at < len(known.value):
+            size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
+            number = int.from_bytes(known.value[at : at + size], "little")
+            machine, load = {1: (I32, 0x2D), 2: (I32, 0x2F), 4: (I32, 0x28), 8: (I64, 0x29)}[size]
+            same += (
+                self._get("at")
+                + begin
+                + b"\xa7\x6a"
+                + bytes((load, 0))
+                + unsigned(at)
+                + constant(machine, number)
+            )
+            same += bytes((COMPARE[machine]["=="],)) + b"\x71"
+            at += size
+        as_long = end + begin + b"\x7d" + constant(I64, len(known.value)) + b"\x51"
+        code = as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
+        return code + (b"\x45" if node.operator == "!=" else b"")
+
     def _logical(self, node: form.Logical) -> bytes:
-        yes, no = self._nested(node.right), _constant(_I32, node.operator == "or")
+        yes, no = self._nested(node.right), constant(I32, node.operator == "or")
         branches = (yes, no) if node.operator == "and" else (no, yes)
-        return self._value(node.left) + _IF + bytes((_I32,)) + branches[0] + _ELSE + branches[1] + _END
+        return self._value(node.left) + IF + bytes((I32,)) + branches[0] + ELSE + branches[1] + END
 
     def _nested(self, node: form.Expression) -> bytes:
         self._depth += 1
@@ -496,45 +635,148 @@ class _Body:
         return self._value(node.value) + b"\x45"
 
     def _conditional(self, node: form.Conditional) -> bytes:
-        kind = bytes((_wasm(node.type),))
+        kind = bytes((machine_type(node.type),))
         yes, no = self._nested(node.yes), self._nested(node.no)
-        return self._value(node.test) + _IF + kind + yes + _ELSE + no + _END
+        return self._value(node.test) + IF + kind + yes + ELSE + no + END
 
     def _sequence(self, node: form.Sequence) -> bytes:
         chosen = node.chosen % len(node.items)
         values = [
-            self._value(item) + (b"" if index == chosen else _DROP) for index, item in enumerate(node.items)
+            self._value(item) + (b"" if index == chosen else DROP) for index, item in enumerate(node.items)
         ]
         return b"".join(values)
 
+    def _now(self, node: form.Now) -> bytes:
+        del node
+        return self._cell(0x29, NOW)
+
+    def _moment(self, node: form.Moment) -> bytes:
+        both = self._value(node.left) + self._value(node.right)
+        return self._limited(node.type, both + bytes((CALCULATE[I64][node.operator],)))
+
+    def _moment_of(self, node: form.MomentOf) -> bytes:
+        return self._limited(
+            node.type, self._of_parts(self._value(node.seconds), self._value(node.nanoseconds))
+        )
+
+    def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
+        """Nanoseconds of two numbers in 64 bits; elsewhere if they are so large that this would not be exact."""
+        code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
+        for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
+            code += value + self._set(name, I64)
+            wide = self._get(name, I64) + constant(I64, most) + b"\x7c" + constant(I64, 2 * most) + b"\x56"
+            code += self._if(wide, self._elsewhere)
+        return (
+            code
+            + self._get(names[0], I64)
+            + constant(I64, BILLION)
+            + b"\x7e"
+            + self._get(names[1], I64)
+            + b"\x7c"
+        )
+
+    def _limited(self, kind: Type, code: bytes) -> bytes:
+        """A time or duration, elsewhere if it is none."""
+        least, most = (0, times.MAX_TIME) if kind == kinds.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        name = f"moment {len(self._locals)}"
+        code += self._set(name, I64)
+        for limit, opcode in ((least, b"\x53"), (most, b"\x55")):
+            code += self._if(self._get(name, I64) + constant(I64, limit) + opcode, self._elsewhere)
+        return code + self._get(name, I64)
+
     def _call(self, node: form.Call) -> bytes:
-        """`std::min` and `std::max`: the second if it is less, or greater."""
-        if node.function not in ("h_min", "h_max"):
+        if node.function in ("h_min", "h_max"):
+            return self._least(node)
+        if node.function == "a_part":
+            return self._with_part(node)
+        (argument,) = node.arguments if len(node.arguments) == 1 else (node,)
+        if node.function in _OPCODES and machine_type(argument.type) in (F64, I64):
+            return self._value(argument) + _OPCODES[node.function]
+        if node.function not in _OF_MOMENTS:
             raise NotScalarError(node.function)
-        machine = _wasm(node.type)
+        code = self._value(argument) + _OF_MOMENTS[node.function](self)
+        return code + b"\xa7" if machine_type(node.type) == I32 else code
+
+    def _with_part(self, node: form.Call) -> bytes:
+        """A time with other seconds, or other nanoseconds."""
+        moment, part, new = node.arguments
+        assert isinstance(part, form.Literal)  # noqa: S101  the name of a part
+        value = self._value(new)
+        if machine_type(new.type) == I32:
+            value += b"\xac" if _is_signed(new.type) else b"\xad"
+        old = self._value(moment)
+        if part.value == "sec":
+            return self._limited(node.type, self._of_parts(value, old + self._nanoseconds()))
+        return self._limited(node.type, self._of_parts(old + self._seconds(), value))
+
+    def _nanoseconds(self) -> bytes:
+        """The part of a moment: not less than nothing."""
+        code, value = self._set("moment", I64), self._get("moment", I64)
+        whole = self._get("whole", I64)
+        code += value + constant(I64, BILLION) + b"\x81" + self._set("whole", I64)
+        more = whole + constant(I64, BILLION) + b"\x7c" + self._set("whole", I64)
+        return code + self._if(whole + constant(I64, 0) + b"\x53", lambda: more) + whole
+
+    def _seconds(self) -> bytes:
+        rest = self._nanoseconds() + self._set("rest", I64)
+        return (
+            rest
+            + self._get("moment", I64)
+            + self._get("rest", I64)
+            + b"\x7d"
+            + constant(I64, BILLION)
+            + b"\x7f"
+        )
+
+    def _in_seconds(self) -> bytes:
+        """A moment as a double, rounded once: what has more than 53 bits is divided by 5^9 with 40 bits behind the
+        point, the last of which says whether something is left, and then by 2^9.
+        """
+        code, value = self._set("moment", I64), self._get("moment", I64)
+        size = self._get("whole", I64)
+        negative = value + constant(I64, 0) + b"\x53"
+        code += constant(I64, 0) + value + b"\x7d" + value + negative + SELECT + self._set("whole", I64)
+        short = size + b"\xb9" + constant(F64, 1e9) + b"\xa3"
+        over = constant(I64, 5**9)
+        rest = size + over + b"\x82" + constant(I64, 40) + b"\x86" + self._set("rest", I64)
+        left = self._get("rest", I64) + over + b"\x82\x50\x45\xad"
+        behind = (
+            self._get("rest", I64) + over + b"\x80" + left + b"\x84\xb9" + constant(F64, 2.0**-40) + b"\xa2"
+        )
+        long = rest + size + over + b"\x80\xb9" + behind + b"\xa0" + constant(F64, 2.0**-9) + b"\xa2"
+        code += size + constant(I64, 1 << 53) + b"\x54" + IF + bytes((F64,)) + short + ELSE + long + END
+        code += self._set("in seconds", F64)
+        result = self._get("in seconds", F64)
+        return code + result + bytes((NEG[F64],)) + result + negative + SELECT
+
+    def _least(self, node: form.Call) -> bytes:
+        """`std::min` and `std::max`: the second if it is less, or greater."""
+        machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
             self._value(argument) + self._set(name, machine)
             for name, argument in zip((one, other), node.arguments, strict=True)
         )
-        opcode = _COMPARE[machine]["<" if node.function == "h_min" else ">"] + (not _is_signed(node.type))
+        opcode = COMPARE[machine]["<" if node.function == "h_min" else ">"] + (not _is_signed(node.type))
         test = self._get(other, machine) + self._get(one, machine) + bytes((opcode,))
-        return code + self._get(other, machine) + self._get(one, machine) + test + _SELECT
+        return code + self._get(other, machine) + self._get(one, machine) + test + SELECT
 
     def _invoke(self, node: form.Invoke) -> bytes:
         if node.depth is not None:
             raise NotScalarError("recursion")
-        result = _I32 if node.type == kinds.VOID else _wasm(node.type)
-        parameters = tuple(_wasm(argument.type) for argument in node.arguments)
-        number = self._writer.index_of(node.function, parameters, result)
-        return b"".join(map(self._value, node.arguments)) + b"\x10" + _unsigned(number)
+        result = I32 if node.type == kinds.VOID else machine_type(node.type)
+        parameters = tuple(machine_type(argument.type) for argument in node.arguments)
+        called = self._writer.function(self._writer.functions[node.function], parameters, result)
+        self._assigned |= called.assigned
+        self._brief = self._brief and called.brief
+        return b"".join(map(self._value, node.arguments)) + b"\x10" + unsigned(called.number)
 
 
 def _to_floating(source: int, target: int, *, signed: bool) -> bytes:
-    if source in (_F32, _F64):
-        return b"" if source == target else b"\xb6" if target == _F32 else b"\xbb"
-    first = 0xB2 if target == _F32 else 0xB7
-    return bytes((first + 2 * (source == _I64) + (not signed),))
+    if source in (F32, F64):
+        return b"" if source == target else b"\xb6" if target == F32 else b"\xbb"
+    first = 0xB2 if target == F32 else 0xB7
+    return bytes((first + 2 * (source == I64) + (not signed),))
 
 
 def _narrowed(target: kinds.Integer) -> bytes:
@@ -543,8 +785,14 @@ def _narrowed(target: kinds.Integer) -> bytes:
         return b""
     if target.signed:
         return b"\xc0" if target.bits == 8 else b"\xc1"
-    return _constant(_I32, target.most) + b"\x71"
+    return constant(I32, target.most) + b"\x71"
 
+
+_OPCODES = {"h_sqrt": b"\x9f", "h_fabs": b"\x99", "h_floor": b"\x9c", "h_ceil": b"\x9b", "h_trunc": b"\x9d",
+            "m_is_zero": b"\x50", "m_whole": b""}  # fmt: skip
+_OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
+    {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
+)
 
 _STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyType(
     {
@@ -559,10 +807,13 @@ _STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyTyp
         form.Charge: _Body._charge,
         form.Drop: _Body._drop,
         form.Require: _Body._require,
+        form.NotPast: _Body._not_past,
+        form.Skip: _Body._skip,
         form.AfterText: _Body._after_text,
         form.Count: _Body._count,
         form.AfterElements: _Body._after_elements,
         form.ReadNumbers: _Body._read_numbers,
+        form.ReadValue: _Body._read_value,
         form.WriteBack: _Body._write_back,
     }
 )
@@ -577,7 +828,11 @@ _EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyTy
         form.Arithmetic: _Body._arithmetic,
         form.Unary: _Body._unary,
         form.Compare: _Body._compare,
+        form.CompareTexts: _Body._compare_texts,
         form.Logical: _Body._logical,
+        form.Now: _Body._now,
+        form.Moment: _Body._moment,
+        form.MomentOf: _Body._moment_of,
         form.Not: _Body._not,
         form.Conditional: _Body._conditional,
         form.Sequence: _Body._sequence,

@@ -18,7 +18,7 @@ MAX_EMPTY = 1_000_000
 """Elements without bytes that one array may have."""
 
 _MAX_DECODED = 1_000_000  # elements that are decoded one by one
-_FEW = 64  # elements that cost less than an instruction's worth of counting them
+FEW = 64  # elements that cost less than an instruction's worth of counting them
 
 
 def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
@@ -76,7 +76,7 @@ def elements(
 
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
     """Where `number` elements end, each of which ends where `end` says. Many are charged before they are walked."""
-    if number > _FEW:
+    if number > FEW:
         context.walk(number)
     for _ in range(number):
         start = end(buffer, start)

@@ -19,10 +19,10 @@ from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.batch import Walked
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.walking import Walked
 from tests.support.relay_memory import share
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
@@ -48,7 +48,7 @@ class Heard(Reporter):
 
 
 class Monitored:
-    """Monitors in the middle, with a clock that is set, with or without the loops that take messages together."""
+    """Monitors in the middle, with a clock that is set, with or without the module that takes messages together."""
 
     def __init__(
         self, texts: dict[str, str], known: Definitions, *, together: bool, on_fault: Any = "drop"
@@ -61,7 +61,7 @@ class Monitored:
         self._lanes: dict[str, Lane] = {}
         self.set = MonitorSet.load(texts, known, on_fault)
         if together:
-            self.set.write_loops()
+            self.set.write_module()
         self.middle._compiled(SpecificationsStated(1, [], {}, {}, restarted=False), self.set)
 
     def close(self) -> None:
@@ -299,8 +299,8 @@ def test_what_several_change_is_counted_for_each_of_them() -> None:
     assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
 
 
-def test_a_defect_of_the_loops_is_told_once_and_the_engine_goes_on() -> None:
-    """Messages go on, one by one; the loops of this topic are not tried again."""
+def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on() -> None:
+    """Messages go on, one by one; the walk of this topic is not tried again."""
     monitored = Monitored(
         {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
         definitions(),

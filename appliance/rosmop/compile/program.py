@@ -1,0 +1,92 @@
+"""What belongs together in a set: specifications that share topics, services or variables, as the form has them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from appliance.rosmop.compile.specification import SpecificationCode
+from appliance.rosmop.ir import form
+from appliance.rosmop.logics.interface import FiniteProperty
+
+
+@dataclass(frozen=True)
+class Group:
+    """A component, with the numbers of its specifications and of its properties with tables (specification, property),
+    and for each topic the events on it (specification, event).
+    """
+
+    component: form.Component
+    specifications: Sequence[int]
+    properties: tuple[tuple[int, int], ...]
+    events: tuple[tuple[tuple[int, int], ...], ...]
+
+
+def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
+    """The components of a set."""
+    owners: dict[object, int] = {}
+    chief = list(range(len(specifications)))
+
+    def find(number: int) -> int:
+        while chief[number] != number:
+            chief[number] = number = chief[chief[number]]
+        return number
+
+    for number, specification in enumerate(specifications):
+        keys: list[object] = [specification.name, *specification.uses]
+        keys += [(event.topic, event.part) for event in specification.events if event.topic is not None]
+        for key in keys:
+            chief[find(number)] = find(owners.setdefault(key, number))
+    together: dict[int, list[int]] = {}
+    for number in range(len(specifications)):
+        together.setdefault(find(number), []).append(number)
+    for numbers in together.values():
+        yield _group(specifications, numbers)
+
+
+def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> Group:
+    variables: list[str] = []
+    properties: list[tuple[int, int]] = []
+    topics: dict[str, list[tuple[int, int]]] = {}
+    for number in numbers:
+        specification = specifications[number]
+        variables += specification.variables.values()
+        properties += [
+            (number, index)
+            for index, each in enumerate(specification.properties)
+            if isinstance(each.property, FiniteProperty)
+        ]
+        for index, event in enumerate(specification.events):
+            if event.topic is not None and event.part is None:
+                topics.setdefault(event.topic, []).append((number, index))
+    rows = []
+    for topic, events in topics.items():
+        met = list(dict.fromkeys(number for number, _ in events))
+        rows.append(
+            (
+                topic,
+                tuple(
+                    _event(specifications, properties, number, index, met.index(number))
+                    for number, index in events
+                ),
+            )
+        )
+    component = form.Component(tuple(variables), len(properties), tuple(rows))
+    return Group(component, numbers, tuple(properties), tuple(map(tuple, topics.values())))
+
+
+def _event(
+    specifications: Sequence[SpecificationCode],
+    properties: Sequence[tuple[int, int]],
+    number: int,
+    index: int,
+    place: int,
+) -> form.Event:
+    advances = []
+    for each, code in enumerate(specifications[number].properties):
+        if isinstance(code.property, FiniteProperty):
+            automaton = code.property.automaton
+            handled = [bool(set(code.order) & set(verdict)) for verdict in automaton.verdicts]
+            table = tuple(-1 if handled[row[index]] else row[index] for row in automaton.table)
+            advances.append(form.Advance(properties.index((number, each)), table))
+        else:
+            advances.append(form.Advance(None, (-1,)))
+    return form.Event(specifications[number].events[index].function, place, tuple(advances))

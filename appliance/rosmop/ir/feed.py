@@ -1,0 +1,388 @@
+"""The walk over a read, as WebAssembly: frame by frame, the events of every message in order, patches in place.
+
+`module_of` writes one module for a set: for each topic an export `feed(at, end, now, told, enabled)` that takes the
+frames (4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where
+the first one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that
+one is for Python.
+
+- A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
+  begun. After a trap the message that is left begins at the number that stands at `POSITION`.
+- `told`: of these events (bit N for the topic's event N) a drop is left; with `LOUD` a change is. `enabled`: bits of
+  the topic's specifications.
+- An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
+  where (i32, i32) frames were dropped.
+- An event that happened is counted at `Feed.counters`, its drops behind those of all.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.module import (
+    CHANGED,
+    DROPPED,
+    ELSEWHERE,
+    HAPPENED,
+    NOW,
+    UNDO,
+    Cells,
+    NotScalarError,
+    Writer,
+)
+from appliance.rosmop.ir.wasm import (
+    ELSE,
+    END,
+    I32,
+    I64,
+    IF,
+    NOTHING,
+    RETURN,
+    constant,
+    load,
+    row,
+    store,
+    text,
+    unsigned,
+)
+from appliance.rosmop.runtime.context import BUDGET
+
+POSITION, EFFECT = 0, 4
+"""Where it stands which frame is looked at, and the address of the last effect."""
+
+AREA = 1 << 16
+"""Bytes of frames that are fed together."""
+
+LEFT = 1 << 62
+LOUD = 1 << 63
+MAX_EVENTS = 63
+MAX_EFFECTS = 4096
+MAX_TABLES = 8 << 20
+"""Bytes that the tables of all properties of a set may take."""
+
+_PAGE = 1 << 16
+_SLACK = 16  # bytes behind the frames that may be looked at
+_ADD, _SUB, _AND, _EQZ = b"\x6a", b"\x6b", b"\x71", b"\x45"
+_AND64, _OR64, _XOR64, _SHL64, _SHR64, _EQZ64 = b"\x83", b"\x84", b"\x85", b"\x86", b"\x88", b"\x50"
+_BR, _BR_IF, _LOOP, _BLOCK = b"\x0c", b"\x0d", b"\x03\x40", b"\x02\x40"
+
+
+@dataclass(frozen=True)
+class Feed:
+    """The walk for one topic: the name of its export, which events may drop or change, where events are counted.
+
+    `log` is where the log of patches begins, `undo` the addresses of variables and of what they held before the message
+    that is left. `brief`: it has no loops.
+    """
+
+    name: str
+    droppers: frozenset[int]
+    writers: frozenset[int]
+    counters: int
+    log: int
+    undo: tuple[tuple[int, int], ...]
+    brief: bool
+
+
+@dataclass(frozen=True)
+class FeedModule:
+    """A module: its bytes, how much memory it has, where frames are put and effects stand, the topics that it takes,
+    and where each component keeps its state.
+    """
+
+    code: bytes
+    memory: int
+    frames: int
+    effects: int
+    feeds: Mapping[str, Feed]
+    cells: Sequence[Cells]
+
+
+def module_of(functions: Mapping[str, form.Function], components: Sequence[form.Component]) -> FeedModule:
+    """The module of all topics that can have a walk."""
+    shared: dict[str, Cells] = {}
+    writer = Writer(functions, shared)
+    cells = []
+    for component in components:
+        room = component.properties + len(component.variables)
+        cells.append(Cells(writer.take(8 * room), component.properties))
+        shared |= dict.fromkeys(component.variables, cells[-1])
+    effects = writer.take(16 * (MAX_EFFECTS + 2))
+    feeds: dict[str, Feed] = {}
+    walks, tables = [], _Tables(writer)
+    for component, own in zip(components, cells, strict=True):
+        for topic, events in component.topics:
+            try:
+                walk = _Walk(writer, own, tables, effects, events)
+            except (NotScalarError, RecursionError):
+                continue
+            walks.append(walk.code())
+            feeds[topic] = walk.feed(f"feed {len(feeds)}")
+    frames = writer.take(AREA + _SLACK)
+    memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
+    return FeedModule(_assembled(writer, walks, feeds, tables, memory), memory, frames, effects, feeds, cells)
+
+
+class _Tables:
+    """The tables of properties: 2 bytes for each state."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self.known: dict[tuple[int, ...], int] = {}
+        self._size = 0
+
+    def address(self, table: tuple[int, ...]) -> int:
+        if table not in self.known:
+            self._size += 2 * len(table)
+            if self._size > MAX_TABLES:
+                raise NotScalarError("tables of properties")
+            self.known[table] = self._writer.take(2 * len(table))
+        return self.known[table]
+
+
+_AT, _END, _NOW, _TOLD, _ENABLED = range(5)
+_SIZE, _NEXT, _WHO, _LAST, _FIRST = range(5, 10)
+_PARAMETERS = (I32, I32, I64, I64, I64)
+
+
+def _get(local: int) -> bytes:
+    return b"\x20" + unsigned(local)
+
+
+def _set(local: int, value: bytes) -> bytes:
+    return value + b"\x21" + unsigned(local)
+
+
+class _Walk:
+    """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
+
+    def __init__(
+        self, writer: Writer, cells: Cells, tables: _Tables, effects: int, events: Sequence[form.Event]
+    ) -> None:
+        if len(events) > MAX_EVENTS:
+            raise NotScalarError("many events")
+        self._cells = cells
+        self._events = events
+        self._effects = effects
+        self._written = [writer.event(event.function) for event in events]
+        self._tables = [[tables.address(each.table) for each in event.advances] for event in events]
+        for event, written in zip(events, self._written, strict=True):
+            if not written.passes and any(max(each.table) < 0 for each in event.advances):
+                raise NotScalarError("a verdict with each message")
+        self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
+        self._counters = writer.take(16 * len(events))
+        assigned = sorted({name for written in self._written for name in written.assigned})
+        self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
+        self._log = writer.take(16 * sum(written.writes for written in self._written))
+        properties = {
+            each.property for event in events for each in event.advances if each.property is not None
+        }
+        self._states = {
+            number: _FIRST + len(events) + place for place, number in enumerate(sorted(properties))
+        }
+
+    def feed(self, name: str) -> Feed:
+        """What is said about it."""
+        return Feed(
+            name,
+            frozenset(number for number, written in enumerate(self._written) if written.drops),
+            frozenset(number for number, written in enumerate(self._written) if written.writes),
+            self._counters,
+            self._log,
+            self._undo,
+            all(written.brief for written in self._written),
+        )
+
+    def code(self) -> bytes:
+        """The function."""
+        here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
+        here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
+        body = [
+            store(I64, NOW, _get(_NOW)),
+            store(I32, EFFECT, constant(I32, self._effects)),
+            *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
+            self._begin(), _BLOCK, _BLOCK, _LOOP,
+            self._frame(),
+            _BLOCK, _BLOCK,
+            *(self._event(number) for number in range(len(self._events))),
+            self._changed() if any(written.writes for written in self._written) else b"",
+            _BR + b"\x01", END,
+            self._dropped(), END,
+            self._done(),
+            _BR + b"\x00", END, END,
+            here, RETURN, END,
+            here, constant(I64, LEFT), _OR64, END,
+        ]  # fmt: skip
+        made = [I32, I32, I64, I32, *[I32] * len(self._events), *[I32] * len(self._states)]
+        whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
+        return unsigned(len(whole)) + whole
+
+    def _state(self, number: int) -> int:
+        return self._cells.base + 8 * number
+
+    def _begin(self) -> bytes:
+        """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
+        code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
+        return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
+
+    def _frame(self) -> bytes:
+        """Leave unless the whole frame is there, and a place for an effect."""
+        room = _get(_END) + _get(_AT) + _SUB
+        stop = _BR_IF + b"\x01"
+        code = room + constant(I32, 4) + b"\x49" + stop
+        code += (
+            _set(_SIZE, _get(_AT) + b"\x28\x00\x00")
+            + _get(_SIZE)
+            + room
+            + constant(I32, 4)
+            + _SUB
+            + b"\x4b"
+            + stop
+        )
+        full = constant(I32, self._effects + 16 * MAX_EFFECTS)
+        code += load(I32, EFFECT) + full + b"\x4f" + stop
+        code += _set(_NEXT, _get(_AT) + _get(_SIZE) + _ADD + constant(I32, 4) + _ADD) + _set(
+            _WHO, constant(I64, 0)
+        )
+        code += b"".join(store(I64, budget, constant(I64, BUDGET)) for budget in self._budgets)
+        return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
+
+    def _event(self, number: int) -> bytes:
+        """Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
+        event, written, bits = self._events[number], self._written[number], _FIRST + number
+        left = _BR_IF + b"\x05"
+        code = (
+            _get(_ENABLED) + constant(I64, 1 << event.specification) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
+        )
+        code += _set(
+            bits, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE) + b"\x10" + unsigned(written.number)
+        )
+        code += self._is(bits, ELSEWHERE) + left
+        if written.writes:
+            loud = _get(_TOLD) + constant(I64, 0) + b"\x53"
+            changed = self._is(bits, CHANGED) + b"\x41\x00\x47"
+            code += changed + loud + _AND + left
+            code += _set(_WHO, _get(_WHO) + changed + b"\xad" + constant(I64, number) + _SHL64 + _OR64)
+        if written.drops:
+            dropped = self._is(bits, DROPPED) + b"\x41\x00\x47"
+            hidden = _get(_TOLD) + constant(I64, 1 << number) + _AND64 + _EQZ64
+            code += dropped + hidden + _EQZ + _AND + left
+            code += (
+                self._count(len(self._events) + number, dropped) + self._is(bits, DROPPED) + _BR_IF + b"\x01"
+            )
+        steps = [
+            self._advance(each, table)
+            for each, table in zip(event.advances, self._tables[number], strict=True)
+            if any(target != state for state, target in enumerate(each.table))
+        ]
+        if steps:
+            code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
+        return code + END
+
+    def _is(self, bits: int, which: int) -> bytes:
+        return _get(bits) + constant(I32, which) + _AND
+
+    def _advance(self, advance: form.Advance, table: int) -> bytes:
+        left = b"\x06"
+        if advance.property is None:
+            return _BR + left
+        state = self._states[advance.property]
+        following = _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)
+        return _set(state, following) + _get(state) + constant(I32, 0) + b"\x48" + _BR_IF + left
+
+    def _count(self, place: int, more: bytes) -> bytes:
+        address = self._counters + 8 * place
+        return store(I64, address, load(I64, address) + more + b"\xad\x7c")
+
+    def _changed(self) -> bytes:
+        """Note who changed it. What several have changed may be as it was: that is left unless the first place that was
+        written has other bytes. (Blocks: dropped, done, the loop, out, left.)
+        """
+        entry = self._log
+        size = (
+            constant(I64, 64)
+            + load(I64, entry)
+            + constant(I64, 32)
+            + _SHR64
+            + constant(I64, 3)
+            + _SHL64
+            + b"\x7d"
+        )
+        differs = load(I32, entry) + b"\x29\x00\x00" + load(I64, entry + 8) + _XOR64 + size + _SHL64
+        several = _get(_WHO) + _get(_WHO) + constant(I64, 1) + b"\x7d" + _AND64 + _EQZ64 + _EQZ
+        unsure = several + IF + NOTHING + differs + _EQZ64 + _BR_IF + b"\x06" + END
+        last, one = _get(_LAST), constant(I64, 1)
+        same = _set(_LAST, load(I32, EFFECT)) + last + b"\x29\x00\x00" + _get(_WHO) + b"\x51"
+        again = last + last + b"\x29\x00\x08" + one + b"\x7c\x37\x00\x08"
+        new = self._next_effect() + last + _get(_WHO) + b"\x37\x00\x00" + last + one + b"\x37\x00\x08"
+        counted = same + IF + NOTHING + again + ELSE + new + END
+        return _get(_WHO) + _EQZ64 + _EQZ + IF + NOTHING + unsure + counted + END
+
+    def _next_effect(self) -> bytes:
+        more = _set(_LAST, _get(_LAST) + constant(I32, 16) + _ADD)
+        return more + store(I32, EFFECT, _get(_LAST))
+
+    def _dropped(self) -> bytes:
+        """Note which bytes do not go on."""
+        last = _get(_LAST)
+        same = (
+            last
+            + b"\x29\x00\x00"
+            + constant(I64, -1)
+            + b"\x51"
+            + last
+            + b"\x28\x00\x0c"
+            + _get(_AT)
+            + b"\x46"
+            + _AND
+        )
+        new = (
+            self._next_effect()
+            + last
+            + constant(I64, -1)
+            + b"\x37\x00\x00"
+            + last
+            + _get(_AT)
+            + b"\x36\x00\x08"
+        )
+        code = _set(_LAST, load(I32, EFFECT)) + same + _EQZ + IF + NOTHING + new + END
+        return code + last + _get(_NEXT) + b"\x36\x00\x0c"
+
+    def _done(self) -> bytes:
+        """What came of the message stays."""
+        code = b"".join(
+            self._count(number, self._is(_FIRST + number, HAPPENED)) for number in range(len(self._events))
+        )
+        code += b"".join(
+            store(I32, self._state(number), _get(local)) for number, local in self._states.items()
+        )
+        return code + _set(_AT, _get(_NEXT)) + self._begin()
+
+
+def _assembled(
+    writer: Writer, walks: Sequence[bytes], feeds: Mapping[str, Feed], tables: _Tables, memory: int
+) -> bytes:
+    first = len(writer.written)
+    shapes = [(each.parameters, each.result) for each in writer.written]
+    shapes += [(_PARAMETERS, I64)] * len(walks)
+    types = [
+        b"\x60" + row([bytes((one,)) for one in given]) + row([bytes((result,))]) for given, result in shapes
+    ]
+    exports = [
+        text(feed.name) + b"\x00" + unsigned(first + index) for index, feed in enumerate(feeds.values())
+    ]
+    pages = unsigned(memory // _PAGE)
+    data = []
+    for table, address in tables.known.items():
+        raw = struct.pack(f"<{len(table)}h", *table)
+        data.append(b"\x00" + constant(I32, address) + END + unsigned(len(raw)) + raw)
+    sections = (
+        (1, row(types)),
+        (3, row([unsigned(index) for index in range(len(types))])),
+        (5, row([b"\x01" + pages + pages])),
+        (7, row([*exports, text("memory") + b"\x02\x00"])),
+        (10, row([*(each.code for each in writer.written), *walks])),
+        (11, row(data)),
+    )
+    content = b"".join(bytes((number,)) + unsigned(len(part)) + part for number, part in sections)
+    return b"\0asm\x01\0\0\0" + content

@@ -1,0 +1,263 @@
+"""Runs the module of a set (`ir/feed.py`): when a topic's walk may be used, and what it has done.
+
+Invariants:
+- A walk ends before the first message that it leaves to the engine; of that message nothing has happened yet.
+- What a walk has done to the messages before is what `MonitorSet.process` does to them, one after the other, at the
+  time of the walk: bytes, variables, states of properties, which events happened.
+- The state of specifications that share topics or variables is in one place: in the module's memory from a walk on
+  (`Home.enter`), in Python until then, and again before Python looks at it (`Home.leave`).
+- Frames are copied into the module, and back if some were changed. Of a long one only the beginning is: what looks
+  further leaves the message.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from appliance.rosmop.compile.program import groups
+from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, Feed, FeedModule, module_of
+from appliance.rosmop.ir.module import UNDO, Cells
+from appliance.rosmop.ir.values import struct_code
+from appliance.rosmop.machine import Machine, MachineTrap
+from appliance.rosmop.monitor import Monitor, RunningProperty
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+FUEL = 50_000_000
+"""Instructions of one call: some hundredths of a second."""
+
+LONG, BEGINNING = 8192, 4096
+"""A message of more bytes than the first is looked at alone, and only so far."""
+
+_ADDRESS = 0xFFFFFFFF
+_LENGTH = struct.Struct("<I")
+_POSITION = struct.Struct("<II")
+_EFFECT = struct.Struct("<qq")
+_LOG = struct.Struct("<II8s")
+
+
+class Walked(NamedTuple):
+    """What a walk has done.
+
+    `position` is where the first message begins that is left; `run` where what goes on unchanged begins (behind the
+    last dropped message). `dropped` are counts for each of the walker's events, if any was; `changed` has a set of
+    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages.
+    """
+
+    position: int
+    run: int
+    dropped: Sequence[int]
+    changed: Sequence[tuple[int, int]]
+
+
+class Prepared(NamedTuple):
+    """What holds for all walks of a topic until the engine, or somebody else, has done something: bits of `told` (and
+    whether no message may be changed) and of `enabled`, as the module takes them.
+    """
+
+    told: int
+    enabled: int
+
+
+class Home:
+    """Where the state of specifications is that share topics or variables."""
+
+    def __init__(
+        self, machine: Machine, cells: Cells, namespace: dict[str, Any], running: Sequence[RunningProperty]
+    ) -> None:
+        self.machine = machine
+        self._memory = machine.memory
+        self._base = cells.base
+        self._namespace = namespace
+        self._running = running
+        self._names = [*cells.variables]
+        self._cells = struct.Struct(
+            "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
+        )
+        self.inside = False
+        """It is in the module's memory."""
+
+    def enter(self) -> None:
+        """Take the state into the module."""
+        states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
+        values = (self._namespace[name] for name in self._names)
+        self._cells.pack_into(self._memory, self._base, *states, *values)
+        self.inside = True
+
+    def leave(self) -> None:
+        """Give it back to Python."""
+        if not self.inside:
+            return
+        self.inside = False
+        values = self._cells.unpack_from(self._memory, self._base)
+        for running, state in zip(self._running, values, strict=False):
+            running.run.state = state  # type: ignore[attr-defined]  # of tables
+        self._namespace.update(zip(self._names, values[len(self._running) :], strict=True))
+
+
+def _cell(kind: Type) -> str:
+    """The `struct` code of a variable in the module's memory, 8 bytes."""
+    if isinstance(kind, kinds.Bool):
+        return "?7x"
+    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+        return "i4x" if kind.signed else "I4x"
+    code = struct_code(kind) or ""
+    return "q" if len(code) == 2 else "f4x" if code == "f" else code
+
+
+class Walker:
+    """The walk of one topic."""
+
+    def __init__(
+        self,
+        home: Home,
+        module: FeedModule,
+        feed: Feed,
+        monitors: Sequence[Monitor],
+        events: Sequence[str],
+    ) -> None:
+        self.events = tuple((name,) for name in events)
+        """For each event: what outcomes have as `events` where only it happens."""
+        self.monitors = tuple(monitor.name for monitor in monitors)
+        """For each event: the name of its monitor."""
+        self.drops = bool(feed.droppers)
+        """Whether messages may be dropped."""
+        self.changes = bool(feed.writers)
+        """Whether messages may be changed."""
+        self.brief = feed.brief
+        """Whether the time that a message takes is little enough not to be counted."""
+        self._monitors = tuple(dict.fromkeys(monitors))
+        self._memory = home.machine.memory  # it does not grow
+        self._feed = feed
+        self._frames = module.frames
+        self._effects = module.effects + _EFFECT.size
+        self._home = home
+        self._counts = struct.Struct(f"<{len(events)}q")
+        self._drops_before: Sequence[int] = (0,) * len(events)
+        self._call, self._name = home.machine.call, feed.name
+
+    def writers(self, who: int) -> tuple[str, ...]:
+        """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
+        return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
+
+    def happened(self) -> Sequence[int]:
+        """How often each event has happened since this was last asked."""
+        counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
+        self._counts.pack_into(self._memory, self._feed.counters, *(0 for _ in counts))
+        return counts
+
+    def ready(self) -> bool:
+        """Whether no monitor waits for its first message, or holds its topics."""
+        for monitor in self._monitors:  # noqa: SIM110  for each batch: half the price of a generator
+            if monitor.enabled and (monitor.held or not monitor.seen):
+                return False
+        return True
+
+    def prepare(self, *, loud: bool, told: Sequence[bool]) -> Prepared:
+        """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none.
+        Good until the engine is asked for anything.
+        """
+        bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
+        enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
+        return Prepared(bits, enabled)
+
+    def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
+        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked:
+        """Take messages from `position` on, as many as need nothing special.
+
+        Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written. What
+        goes on before a dropped message is appended to `pieces`.
+        """
+        if not self._home.inside:
+            self._home.enter()
+        memory, frames, end = self._memory, self._frames, len(view)
+        changed: list[tuple[int, int]] = []
+        begun = run
+        while position < end:
+            whole, size = 0, end - position
+            if size > LONG:
+                whole = _LENGTH.unpack_from(view, position)[0] + 4
+                if whole > LONG:
+                    size = BEGINNING
+                else:
+                    whole, size = 0, min(size, AREA)
+            memory[frames : frames + size] = view[position : position + size]
+            if whole:
+                _LENGTH.pack_into(memory, frames, size - 4)
+            try:
+                answer = self._call(self._name, frames, frames + size, time_ns, *prepared, fuel=FUEL) or 0
+            except MachineTrap:
+                answer = self._stopped(memory)
+            ahead = (answer & _ADDRESS) - frames
+            if answer > _ADDRESS:
+                if answer >= LEFT:
+                    self._undo(memory)
+                area = view[position : position + ahead]
+                for first, last in self._carry_out(memory, answer >> 32 & 0xFFFFFF, changed, area):
+                    if position + first > run:
+                        pieces.append(view[run : position + first])
+                    run = position + (whole or last)
+            position += whole if whole and ahead else ahead
+            if answer >= LEFT:
+                break
+        return Walked(position, run, self._dropped() if run != begun else (), changed)
+
+    def _carry_out(
+        self, memory: memoryview, count: int, changed: list[tuple[int, int]], area: memoryview
+    ) -> list[tuple[int, int]]:
+        """Note what was changed, and put it into `area`; from where to where frames in it were dropped."""
+        dropped, before = [], len(changed)
+        for who, what in _EFFECT.iter_unpack(memory[self._effects : self._effects + count * _EFFECT.size]):
+            if who == -1:
+                dropped.append(((what & _ADDRESS) - self._frames, (what >> 32) - self._frames))
+            else:
+                changed.append((who, what))
+        if len(changed) > before:
+            first = self._frames + 4  # the length of a long one is not its own
+            area[4:] = memory[first : first - 4 + len(area)]
+        return dropped
+
+    def _stopped(self, memory: memoryview) -> int:
+        """What the module would have answered where it was stopped: the message that it looked at is left."""
+        at, effect = _POSITION.unpack_from(memory, POSITION)
+        return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT)
+
+    def _undo(self, memory: memoryview) -> None:
+        """Take back what was done to the message that is left."""
+        for address, kept in self._feed.undo:
+            memory[address : address + 8] = memory[kept : kept + 8]
+        end = _LENGTH.unpack_from(memory, UNDO)[0]
+        for at, size, old in [*_LOG.iter_unpack(memory[self._feed.log : end])][::-1]:
+            memory[at : at + size] = old[:size]
+
+    def _dropped(self) -> Sequence[int]:
+        """How many messages each event has dropped since this was last asked."""
+        counts = self._counts.unpack_from(self._memory, self._feed.counters + self._counts.size)
+        before, self._drops_before = self._drops_before, counts
+        return [now - then for now, then in zip(counts, before, strict=True)]
+
+
+def walkers(compiled: Compiled, monitors: Sequence[Monitor]) -> dict[str, Walker]:
+    """The walkers of all topics that can have one; their monitors are told where their state is."""
+    found = list(groups(compiled.specifications))
+    module = module_of(compiled.functions, [group.component for group in found])
+    if not module.feeds:
+        return {}
+    machine = Machine(module.code, module.memory)
+    walks = {}
+    for group, cells in zip(found, module.cells, strict=True):
+        running = [monitors[number].properties[index] for number, index in group.properties]
+        home = Home(machine, cells, compiled.namespace, running)
+        for number in group.specifications:
+            monitors[number].home = home
+        for (topic, _), events in zip(group.component.topics, group.events, strict=True):
+            if topic in module.feeds:
+                own = [monitors[number] for number, _ in events]
+                names = [
+                    f"{monitors[number].name}.{monitors[number].code.events[index].name}"
+                    for number, index in events
+                ]
+                walks[topic] = Walker(home, module, module.feeds[topic], own, names)
+    return walks

@@ -1,0 +1,398 @@
+"""A set's module does what the interpreter does: bytes, drops, variables, states of properties; and what it leaves."""
+
+import struct
+from collections import Counter
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.rosmop import walking
+from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
+from appliance.rosmop.logics.interface import FiniteRun
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.walking import LONG, Walker
+from tests.unit.rosmop.interpreted import beside
+from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
+
+FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+STAMPED = struct.pack("<I3sIIdhI2dBI", 3, b"abc", 9, 8, 2.5, 1, 2, 0.5, 7.0, 1, 0)
+
+
+def plain(count: int = 0, x: float = 0.0, kind: int = 0, rest: bytes = b"") -> bytes:
+    """An `own/Plain`."""
+    return struct.pack("<BidfBII3qI", kind, count, x, 0.0, 0, 5, 7, 1, 2, 3, len(rest)) + rest
+
+
+def frames(bodies: Iterable[bytes]) -> bytes:
+    """Messages as they come."""
+    return b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+
+
+class Fed:
+    """A set with its module, and the same whose functions the interpreter runs, both started."""
+
+    def __init__(self, *texts: str, on_fault: OnFault = "drop") -> None:
+        sources = {f"{place}.rv": text for place, text in enumerate(texts)}
+        self.monitors = MonitorSet.load(sources, definitions(), on_fault)
+        self._other = beside(self.monitors)
+        self.monitors.write_module()
+        for one in (self.monitors, self._other):
+            one.start(0)
+            for monitor in one.monitors:
+                monitor.seen = True
+        self.came: Counter[str] = Counter()
+
+    def walker(self, topic: str = "/plain") -> Walker:
+        """The walk of a topic; there is one."""
+        found = self.monitors.walker(topic)
+        assert found is not None
+        return found
+
+    def check(self, bodies: list[bytes], topic: str = "/plain", time: int = 1) -> list[bytes]:
+        """Fail if messages that come together make a difference; what goes on."""
+        expected = []
+        for body in bodies:
+            outcome = self._other.process(topic, bytearray(body), time)
+            self.came[outcome.result if not outcome.faults else "fault"] += 1
+            if outcome.result != "dropped":
+                expected.append(bytes(outcome.buffer))
+        assert self._fed(frames(bodies), topic, time) == frames(expected)
+        assert self.state() == _state(self._other)
+        return expected
+
+    def state(self) -> list[str]:
+        """Variables and states of properties."""
+        return _state(self.monitors)
+
+    def _fed(self, given: bytes, topic: str, time: int) -> bytes:
+        view = memoryview(bytearray(given))
+        pieces: list[memoryview | bytes] = []
+        position = run = 0
+        walker = self.monitors.walker(topic)
+        while position < len(view):
+            if walker is not None and self.monitors.walks(walker, time):
+                before = position
+                walked = walker.walk(view, position, run, pieces, time, walker.prepare(loud=False, told=()))
+                position, run = walked.position, walked.run
+                self.came["together"] += position > before
+                if position == len(view):
+                    break
+            first = position + 4
+            following = first + int.from_bytes(view[position:first], "little")
+            outcome = self.monitors.process(topic, view[first:following], time)
+            if outcome.result == "dropped":
+                pieces.append(view[run:position])
+                run = following
+            elif outcome.buffer is not view and len(outcome.buffer) != following - first:
+                pieces += (view[run:position], frames([bytes(outcome.buffer)]))
+                run = following
+            position = following
+        return b"".join([*pieces, view[run:]])
+
+
+def _state(monitors: MonitorSet) -> list[str]:
+    state = []
+    for monitor in monitors.monitors:
+        names = monitors._compiled.namespace
+        state += [f"{name} {names.get(code)!r}" for name, code in monitor.code.variables.items()]
+        state += [str(one.run.state) for one in monitor.properties if isinstance(one.run, FiniteRun)]
+    return state
+
+
+def event(
+    body: str, parameters: str = "int count", pattern: str = "count:count", before: str = "int n = 0;"
+) -> str:
+    """A specification with one event on `/plain`."""
+    return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"
+
+
+# The same as the interpreter
+
+
+@FEW
+@given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
+def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
+    """Actions, conditions, helper functions, loops, properties; messages of several topics, and bytes that are none."""
+    try:
+        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2])
+    except SpecificationError:
+        return  # a draw that means nothing
+    messages = Messages(seed)
+    for number in range(4):
+        traffic = messages.traffic()
+        fed.check([*traffic.bodies(), *wild], traffic.topic, number)
+
+
+def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
+    """What the comparison above compares is not nothing."""
+    came: Counter[str] = Counter()
+    for seed in range(12):
+        try:
+            fed = Fed(*Specifications(seed).texts())
+        except SpecificationError:
+            continue
+        messages = Messages(seed)
+        for traffic in (messages.traffic() for _ in range(6)):
+            fed.check(list(traffic.bodies()), traffic.topic)
+        came += fed.came
+    assert min(came[what] for what in ("fault", "dropped", "changed", "passed", "together")) > 3
+
+
+EXPRESSIONS = (
+    "x % 7", "-x / 3", "x << 33", "(unsigned int) x >> 1", "~x", "abs(x)", "(int8_t) x", "(uint16_t) x", "(int) y",
+    "(uint8_t) y", "(unsigned long) y", "(float) x", "(long) y * x", "x ? y : 1", "x == y", "x && y", "!x || y < 0",
+    "std::max(x, 7)", "std::min(y, 0.5)", "(x += 2) + x++", "(unsigned int) x < 5u", "x / (x - x)", "y / 0", "x ^ 5L",
+    "1000 / (100 / (x | 1))", "std::min(x, std::max(3, std::min(x, 9)))", "sqrt(y)", "floor(y) - ceil(y)", "trunc(y)",
+    "fabs(y)", "sin(y)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS)
+def test_expressions_at_the_limits(expression: str) -> None:
+    """Numbers that overflow, do not fit, or are none."""
+    before = "double d = 0; long n = 0; float f = 0;"
+    fed = Fed(event(f"d = {expression}; n = d; f = d; x = n;", "int x, double y", "count:x, x:y", before))
+    for x in (0, 1, -1, 7, 2**31 - 1, -(2**31)):
+        fed.check(
+            [
+                plain(x, y)
+                for y in (0.0, -0.0, 0.5, -2.5, 300.0, 1e300, -1e300, float("inf"), float("nan"), 2.0**63)
+            ]
+        )
+    assert fed.came["together"] or expression in {"sin(y)", "x / (x - x)"}
+
+
+ACTIONS = {
+    "parts of a time": "long n = 0; unsigned int u = 0; E(ros::Time t, int count)'{when:t, count:count}' {"
+    " n = t.sec; u = t.nsec; t.sec = count; if (count > 3) { t.nsec = u + 7; } }",
+    "seconds": "double d = 0; double f = 0; ros::Duration g; E(ros::Time t)'{when:t}' {"
+    " g = t - ros::Time(1700000000, 123456789); d = t.toSec() + g.toSec(); f = ros::Time::now().toSec(); }",
+    "times": "ros::Time last; ros::Duration gap; E(ros::Time t)'{when:t}' {"
+    " gap = t - last; last = t; if (gap > ros::Duration(1,0)) { return; } t = t + gap; }",
+    "loop": "int n = 0; E(int count)'{count:count}' { for (int i = 0; i < count % 50; i++) {"
+    " n += i; if (n % 7 == 3) { continue; } n ^= 5; } }",
+    "switch": "int n = 0; E(int count)'{count:count}' {"
+    " switch (count) { case 1: n = 1; break; case 5: n += 7; default: n++; } }",
+    "a helper that cannot go on": "int n = 0;"
+    ' int f(int a, int b) { if (a > 3) { ROS_INFO("x"); } n += a; return b / a; }'
+    " E(int count)'{count:count}' { n = f(count, 7); count = n; }",
+    "an index past the end": "int n = 0; E(int r)'{rest[3]:r}' { n = r; }",
+    "a byte that is no bool": "bool was = false; E(bool on)'{on:on}' { was = on; on = on; }",
+}
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+def test_actions_of_every_kind(name: str) -> None:
+    """On messages of all kinds, many of them together."""
+    fed = Fed("s() { " + ACTIONS[name].replace("E(", "event e(").replace(")'", ") /plain own/Plain '") + " }")
+    for seed in range(6):
+        messages = Messages(seed)
+        for traffic in (messages.traffic() for _ in range(8)):
+            if traffic.topic == "/plain":
+                fed.check(list(traffic.bodies()), time=1_700_000_000_123_456_789 + seed)
+    assert fed.came["together"]
+
+
+@pytest.mark.parametrize("text", ["", "a", "abc", "map_frame", "a name of thirty bytes exactly", "x" * 64])
+def test_strings_are_compared_to_the_last_byte(text: str) -> None:
+    """With constants of all lengths, in patterns and in conditions; others of the same length or nearly."""
+    pattern = text.replace('"', "")
+    fed = Fed(f"""s() {{ int n = 0; event a() /stamped own/Stamped '{{frame:"{pattern}"}}' {{ n++; }}
+        event b(std::string f) /stamped own/Stamped '{{frame:f}}' {{ if (f != "{pattern}") {{ n += 100; }} }} }}""")
+    others = {text, text + "x", text[:-1], text[:-1] + "y", "z" + text[1:], text[::-1]}
+    for other in sorted(others):
+        raw = other.encode()
+        fed.check([struct.pack("<I", len(raw)) + raw + STAMPED[7:]] * 2, "/stamped")
+    assert fed.came["together"] == len(others)
+
+
+def test_seconds_of_every_size_are_rounded_once() -> None:
+    """As C++ and Python do, though the module divides in two steps."""
+    fed = Fed("s() { double d = 0; event e(ros::Time t) /plain own/Plain '{when:t}' { d = t.toSec(); } }")
+    for seconds in (0, 1, 9_007_199, 9_007_200, 1_700_000_000, 2**32 - 1):
+        for nanoseconds in (0, 1, 3, 254_740_991, 254_740_993, 499_999_999, 999_999_999):
+            body = plain()
+            fed.check([body[:18] + struct.pack("<II", seconds, nanoseconds) + body[26:]])
+    assert fed.came["together"] == 42
+
+
+# Hostile bytes, bounds
+
+
+def test_a_message_that_ends_anywhere_is_nobody_elses_bytes() -> None:
+    """Fields behind strings and arrays, of messages cut after each byte, with others behind them."""
+    fed = Fed("""s() { int n = 0; double d = 0; event e(double v, int k, std::string f) /stamped own/Stamped
+        '{frame:f, values[1]:v, kind:k}' { n += k; d = v; if (f == "abc") { k = 7; } } }""")
+    for end in range(len(STAMPED) + 1):
+        fed.check([STAMPED, STAMPED[:end], STAMPED], "/stamped")
+    assert fed.came["together"]
+
+
+@pytest.mark.parametrize("place", [0, 25, len(STAMPED) - 4])
+@pytest.mark.parametrize("length", [1, 3, 200, 2**31 - 1, 2**31, 2**32 - 5, 2**32 - 1])
+def test_lengths_that_lie(place: int, length: int) -> None:
+    """Of a string, an array of numbers, an array of strings: nothing outside the message is read or written."""
+    fed = Fed("""s() { int n = 0;
+            event e(double v, int k) /stamped own/Stamped '{values[1]:v, kind:k}' { n += k; v = 3; } }
+        t() { int m = 0;
+            event e(std::string last) /stamped own/Stamped '{names[1]:last}' { if (last == "x") { m++; } } }""")
+    bad = STAMPED[:place] + struct.pack("<I", length) + STAMPED[place + 4 :]
+    fed.check([STAMPED, bad, STAMPED], "/stamped")
+
+
+def test_a_fault_in_the_middle_of_a_batch_undoes_its_message_only() -> None:
+    """Variables, fields and states that events before it have changed are as they were when the engine begins."""
+    fed = Fed(
+        """a() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' { n += count; x = n; }
+               fsm: one [ e -> two ] two [ e -> one ] @fail { } }
+        b() { int m = 1; event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
+               m = m * 3; x = x + m; m = 100 / (count - 7); } }"""
+    )
+    fed.check([plain(count) for count in (1, 2, 7, 3, 7, 7, 4)])
+    assert fed.came["fault"] == 3
+    assert fed.came["together"] == 3
+
+
+def test_without_fuel_the_message_at_hand_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it ends: what is done is done, what is begun is taken back."""
+    text = event("for (int i = 0; i < 50; i++) { n += i; } count = n;")
+    for fuel in range(2000, 12000, 500):
+        monkeypatch.setattr(walking, "FUEL", fuel)
+        Fed(text).check([plain(number) for number in range(20)])
+
+
+def test_a_long_message_is_looked_at_where_it_begins() -> None:
+    """Changed and dropped there; a field that is further behind is left, and so is the bytes' number."""
+    picture = bytes(range(256)) * (LONG // 128)
+    fed = Fed(event("if (count == 3) { return; } count = count + 1; n++;"))
+    fed.check([plain(1, rest=picture), plain(2), plain(3, rest=picture), plain(4, rest=picture), plain(5)])
+    assert fed.came["together"] == 1
+    behind = Fed("s() { int n = 0; event e(int r) /plain own/Plain '{rest[9000]:r}' { n += r; } }")
+    behind.check([plain(rest=picture), plain(rest=picture)])
+    assert behind.state() == ["n 80"]
+
+
+def test_more_frames_than_fit_and_more_changes_than_are_noted() -> None:
+    """Go in several pieces."""
+    fed = Fed("""one() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
+        n++; if (count % 2) { x = n; } } }
+        two() { event e(float y) /plain own/Plain '{y:y}' when (y == 0) { y = 1; } }""")
+    many = [plain(number) for number in range(MAX_EFFECTS + AREA // 20)]
+    fed.check(many)
+    assert fed.came["together"] == 1
+    assert [*fed.walker().happened()] == [len(many)] * 2
+
+
+# State
+
+
+def test_variables_are_the_same_for_the_module_and_for_the_engine() -> None:
+    """Of specifications that see each other's, whichever takes the next message; of a set that replaces another."""
+    first = """a() { int n = 0; double d = 0; bool b = false; unsigned int u = 1; long l = -1; float f = 0; ros::Time t;
+        event e(int count) /plain own/Plain '{count:count}' {
+            n += count; d = n / 3.0; b = n % 2; u = u * 5; l = l * 7; f = d; t = ros::Time(1, 2); }
+        event said() /stamped own/Stamped '{}' { ROS_INFO("%d", n); } }"""
+    second = (
+        "b() { int seen = 0; event e(double x) /plain own/Plain '{x:x}' { seen = n; x = d; l = l + seen; } }"
+    )
+    fed = Fed(first, second)
+    for number in range(4):
+        fed.check([plain(number)] * 3)
+        fed.check([STAMPED], "/stamped")
+    fed.check([plain(9)] * 2)
+    before = fed.state()
+    following, _ = fed.monitors.replaced({"0.rv": first, "1.rv": second}, definitions(), 5)
+    assert _state(following) == before
+
+
+def test_what_happened_and_what_was_dropped_is_counted() -> None:
+    """For each event; what happened, once."""
+    fed = Fed("""s() { event a(int kind) /plain own/Plain '{kind:kind}' { }
+        event b(int count) /plain own/Plain '{count:count}' when (count > 1) { if (count > 2) { return; } } }""")
+    walker, view = fed.walker(), memoryview(bytearray(frames(plain(number) for number in (1, 2, 3, 3, 1, 4))))
+    pieces: list[memoryview] = []
+    walked = walker.walk(view, 0, 0, pieces, 1, walker.prepare(loud=False, told=()))
+    size = len(plain()) + 4
+    assert (walked.position, walked.run, [*walked.dropped]) == (6 * size, 6 * size, [0, 3])
+    assert [bytes(piece) for piece in pieces] == [bytes(view[: 2 * size]), bytes(view[4 * size : 5 * size])]
+    assert [[*walker.happened()] for _ in range(2)] == [[6, 4], [0, 0]]
+
+
+# What is left, and when
+
+
+@pytest.mark.parametrize(
+    ("body", "has"),
+    [
+        ("n = count;", True),
+        ('if (count > 3) { ROS_WARN("high"); }', True),
+        ("count = n; n++;", True),
+        ("if (n > 2) { return; }", True),
+        ("for (int i = 0; i < 3; i++) { n++; }", True),
+        ('ROS_INFO("each");', False),
+        ("std::string s;", False),
+        ("n = down(3);", False),
+        ("v.push_back(1);", False),
+        ("n = cos(count);", False),
+    ],
+)
+def test_a_topic_of_which_every_message_would_be_left_has_no_walk(body: str, has: bool) -> None:
+    """One of which some would be has."""
+    before = "int n = 0; std::vector<int> v; int down(int i) { return i ? down(i - 1) : 0; }"
+    fed = Fed(event(body, before=before))
+    assert (fed.monitors.walker("/plain") is not None) == has
+
+
+def test_walks_wait_until_a_monitor_has_begun() -> None:
+    """Not before the first message, not while it is held."""
+    monitors = MonitorSet.load({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
+    monitors.write_module()
+    monitors.start(0, restarted=True)
+    walker = monitors.walker("/plain")
+    assert walker is not None
+    answers = [monitors.walks(walker, 1)]
+    monitors.process("/plain", plain(), 1)
+    answers.append(monitors.walks(walker, 1))
+    monitors.resume("s")
+    monitors.process("/plain", plain(), 1)
+    answers.append(monitors.walks(walker, 1))
+    assert answers == [False, False, True]
+
+
+def test_walks_wait_while_something_is_due() -> None:
+    """A tick that is due comes before the next message; it finds what walks have left."""
+    fed = Fed(
+        "s() { int n = 0; event e() /plain own/Plain '{}' { n++; } event t() every 1ms { n = n * 10; } }"
+    )
+    fed.check([plain()] * 3, time=1000)
+    assert fed.monitors.walks(fed.walker(), 1000)
+    assert not fed.monitors.walks(fed.walker(), 2_000_000)
+    fed.check([plain()], time=1_500_000)
+    assert fed.state() == ["n 31"]
+
+
+def test_a_disabled_monitor_has_no_part_in_a_walk() -> None:
+    """Its topic has none; where there are others, they alone."""
+    fed = Fed(event("n = count;"), event("n++;").replace("s()", "t()"))
+    for one in (fed.monitors, fed._other):
+        one.set_enabled("s", False, 5)
+    fed.check([plain(7)] * 3)
+    assert fed.state() == ["n 0", "n 3"]
+    fed.monitors.set_enabled("t", False, 5)
+    assert fed.monitors.walker("/plain") is None
+
+
+def test_a_walk_stops_before_what_is_to_be_told() -> None:
+    """While changes are told in full nothing is changed, while drops are nothing is dropped."""
+    fed = Fed(event("count = 7; if (n > 2) { return; } n++;"))
+    walker, given = fed.walker(), frames([plain()] * 6)
+    view, size = memoryview(bytearray(given)), len(plain()) + 4
+    walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=True, told=[False]))
+    assert (bytes(view), walked.position) == (given, 0)
+    walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=False, told=[True]))
+    assert bytes(view) == frames([plain(7)] * 3 + [plain()] * 3)
+    assert (walked.position, [*walked.changed]) == (3 * size, [(1, 3)])
+    assert fed.state() == ["n 3"]
