@@ -77,6 +77,11 @@ def _monitors(status: Status) -> Iterator[Alarm]:
         yield Alarm(kind=f"monitor-failing:{name}", severity="alarm", text=text, about="monitors")
     for line in monitors.refused:
         yield Alarm(kind="monitors-refused", severity="warning", text=line, about="monitors")
+    if monitors.confirm_by is not None:
+        text = (
+            f"revision {monitors.revision} of the specifications goes back by itself unless it is confirmed"
+        )
+        yield Alarm(kind="monitors-unconfirmed", severity="warning", text=text, about="monitors")
     if monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications is not what their folder has"
         yield Alarm(kind="monitors-differ", severity="notice", text=text, about="monitors")

@@ -17,6 +17,8 @@ from appliance.api.dry_runs import DryRun
 from appliance.api.monitor_judgement import findings_of, judge, refusal
 from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
 from appliance.api.monitors import UNKNOWN, OneName
+from appliance.api.policy_changes import Confirm
+from appliance.api.policy_models import Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, answered, ask
@@ -25,7 +27,7 @@ from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers import monitors as answers
-from appliance.channel.answers.monitors import Switched
+from appliance.channel.answers.monitors import Confirmed, Switched
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
@@ -53,15 +55,18 @@ def _add_texts(router: Routes, services: Services) -> None:
     async def load_monitors(
         new: Annotated[NewSpecifications, body(NewSpecifications)],
         bearer: Operator,
+        *,
         if_match: IfMatch = None,
         dry_run: DryRun = False,
+        confirm_within: Confirm = None,
     ) -> Tagged[Replaced]:
         """Compile and load specifications; those in files of the same name are replaced, in one swap. For admins.
 
         A text with an error changes nothing: the answer (422) has every finding with its line and column.
         """
         _may_load(bearer, dry_run=dry_run)
-        order = admin.MonitorLoad(new.files, new.definitions, new.note, _expected(if_match, dry_run=dry_run))
+        expected = _expected(if_match, dry_run=dry_run)
+        order = admin.MonitorLoad(new.files, new.definitions, new.note, expected, confirm_within)
         return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
     @router.put("/{name}", operation_id="replace_monitor", responses=_CHANGES | UNKNOWN)
@@ -72,6 +77,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         bearer: Operator,
         if_match: IfMatch = None,
         dry_run: DryRun = False,
+        confirm_within: Confirm = None,
     ) -> Tagged[Replaced]:
         """Load a new text in the place of the file that this monitor stands in (or of the file of this name).
 
@@ -80,7 +86,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
-            order = admin.MonitorReplace(name, new.text, new.definitions, new.note, expected)
+            order = admin.MonitorReplace(name, new.text, new.definitions, new.note, expected, confirm_within)
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)
         tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected)
@@ -88,19 +94,38 @@ def _add_texts(router: Routes, services: Services) -> None:
 
     @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
     async def reload_monitors(
-        bearer: Operator, if_match: IfMatch = None, prune: Prune = False
+        bearer: Operator, *, if_match: IfMatch = None, prune: Prune = False, confirm_within: Confirm = None
     ) -> Tagged[Replaced]:
-        """Take what the folder has now; what was loaded from elsewhere stays, unless an admin says `prune`."""
+        """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
         if prune and bearer.role < Role.ADMIN:
             raise ProblemError(
-                403, "not-for-this-role", "removing what was loaded from elsewhere is for admins"
+                403, "not-for-this-role", "removing what the folder does not have is for admins"
             )
-        return await _replaced(control, admin.MonitorReload(_expected(if_match), prune), bearer)
+        return await _replaced(
+            control, admin.MonitorReload(_expected(if_match), prune, confirm_within), bearer
+        )
+
+    @router.post("/rollback", operation_id="roll_back_monitors", responses=_CHANGES)
+    async def roll_back_monitors(
+        to: Annotated[Rollback, body(Rollback)], bearer: Admin, if_match: IfMatch = None
+    ) -> Tagged[Replaced]:
+        """Bring a kept revision into force again, as a new one; what comes back is switched as it was."""
+        return await _replaced(control, admin.MonitorRollback(to.revision, _expected(if_match)), bearer)
+
+    @router.post("/confirm", operation_id="confirm_monitors", responses=_CHANGES)
+    async def confirm_monitors(bearer: Operator, if_match: IfMatch = None) -> Tagged[Confirmed]:
+        """Keep specifications that were loaded with `confirm_within`."""
+        done = await _ordered(control, admin.MonitorConfirm(_expected(if_match)), bearer)
+        return Tagged(done, done.tag)
 
     @router.delete("/{name}", operation_id="remove_monitor", responses=_CHANGES | UNKNOWN)
-    async def remove_monitor(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[Replaced]:
+    async def remove_monitor(
+        name: OneName, bearer: Admin, if_match: IfMatch = None, confirm_within: Confirm = None
+    ) -> Tagged[Replaced]:
         """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
-        return await _replaced(control, admin.MonitorRemove([name], _expected(if_match)), bearer)
+        return await _replaced(
+            control, admin.MonitorRemove([name], _expected(if_match), confirm_within), bearer
+        )
 
     @router.delete("", operation_id="remove_monitors", responses=_CHANGES | UNKNOWN)
     async def remove_monitors(
@@ -110,9 +135,12 @@ def _add_texts(router: Routes, services: Services) -> None:
         ],
         bearer: Admin,
         if_match: IfMatch = None,
+        confirm_within: Confirm = None,
     ) -> Tagged[Replaced]:
         """The same for several at once."""
-        return await _replaced(control, admin.MonitorRemove(name, _expected(if_match)), bearer)
+        return await _replaced(
+            control, admin.MonitorRemove(name, _expected(if_match), confirm_within), bearer
+        )
 
 
 def _add_switches(router: Routes, control: ControlLink) -> None:

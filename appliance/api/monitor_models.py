@@ -121,11 +121,11 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
         told("all monitors that are in their initial state by this change, new ones among them"),
     ] = []
     kept: Annotated[
-        list[str],
-        told(
-            "files that a reload left in force although the folder does not have them: loaded from elsewhere"
-        ),
+        list[str], told("files that a reload left in force although the folder does not have them")
     ] = []
+    confirm_by: Annotated[
+        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
+    ] = None
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

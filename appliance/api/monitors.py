@@ -10,6 +10,7 @@ from appliance.api.access import Bearer
 from appliance.api.audit import Desk
 from appliance.api.monitor_judgement import Compiler, events_of, picture_of, properties_of
 from appliance.api.monitor_models import Happened, History, Monitor
+from appliance.api.policy_models import LONGEST_REVISION
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes, Tagged
@@ -17,10 +18,10 @@ from appliance.api.services import Services
 from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
 from appliance.audit.search import Page, search
-from appliance.channel.admin import MonitorsWanted
-from appliance.channel.answers.monitors import Monitors, MonitorState
+from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
+from appliance.channel.answers.monitors import Monitors, MonitorState, Revisions, RevisionTexts
 
-UNKNOWN: Responses = {404: {"description": "There is no such monitor."}}
+UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE: Responses = {
     200: {"description": "OK", "content": {"image/svg+xml": {"schema": {"type": "string"}}}}
 }
@@ -67,6 +68,18 @@ def routes(services: Services) -> Routes:
         """All monitors with state and counters, and whether they are what the folder has."""
         loaded = await ask(services.control, MonitorsWanted(texts=texts), bearer)
         return Tagged(loaded, loaded.tag)
+
+    @router.get("/revisions", operation_id="monitor_revisions")
+    async def revisions(bearer: Viewer) -> Revisions:
+        """The kept revisions of the specifications, the newest first."""
+        return await ask(services.control, MonitorRevisions(), bearer)
+
+    @router.get("/revisions/{revision}", operation_id="monitor_revision", responses=UNKNOWN)
+    async def revision_texts(
+        revision: Annotated[int, Path(ge=1, le=LONGEST_REVISION)], bearer: Viewer
+    ) -> RevisionTexts:
+        """A kept revision with its texts."""
+        return await ask(services.control, MonitorRevisionWanted(revision), bearer)
 
     @router.get("/{name}", operation_id="monitor", responses=UNKNOWN)
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:

@@ -33,6 +33,7 @@ EVENTS: dict[str, str] = {
     "tunnel down": "The tunnel of an enrolled host is down; nothing of it is accepted until it is back.",
     "tunnel refused": "Somebody asked for a tunnel and was refused; `host` is the real address, `reason` says why.",
     "packets refused": "Packets of tunnels were dropped: sent again, or under another's address (user-space ESP only).",
+    "specifications confirmed": "Specifications that were loaded on trial were confirmed and stay in force.",
     "specifications loaded": "Specifications of monitors came into force; `detail` has who, and which files changed.",
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",

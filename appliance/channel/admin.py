@@ -96,13 +96,15 @@ class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors
 class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
-    `expected`, of this and every change below: the tag of the monitors that it is meant for; None for any.
+    Of this and every change below, `expected` is the tag of the monitors that it is meant for; None for any. What is
+    loaded or removed goes back by itself after `confirm_within` seconds unless confirmed.
     """
 
     files: dict[str, str]
     definitions: dict[str, str] = {}
     note: str = ""
     expected: str | None = None
+    confirm_within: float | None = None
 
 
 class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
@@ -113,16 +115,15 @@ class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor 
     definitions: dict[str, str] = {}
     note: str = ""
     expected: str | None = None
+    confirm_within: float | None = None
 
 
 class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):
-    """Take what the folder of specifications has now.
-
-    What was loaded from elsewhere stays, unless `prune`: then what the folder does not have is removed.
-    """
+    """Take what the folder of specifications has now; what it does not have stays, unless `prune`."""
 
     expected: str | None = None
     prune: bool = False
+    confirm_within: float | None = None
 
 
 class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor remove"):
@@ -130,6 +131,30 @@ class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor r
 
     names: list[str]
     expected: str | None = None
+    confirm_within: float | None = None
+
+
+class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor rollback"):
+    """Back to a kept revision; None: the one before the present."""
+
+    revision: int | None = None
+    expected: str | None = None
+
+
+class MonitorConfirm(AdminRequest[monitors.Confirmed], frozen=True, tag="monitor confirm"):
+    """Keep specifications that would go back by themselves."""
+
+    expected: str | None = None
+
+
+class MonitorRevisions(AdminRequest[monitors.Revisions], frozen=True, tag="monitor revisions"):
+    """The kept revisions of the specifications."""
+
+
+class MonitorRevisionWanted(AdminRequest[monitors.RevisionTexts], frozen=True, tag="monitor revision"):
+    """The texts of a kept revision."""
+
+    revision: int
 
 
 class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor switch"):
@@ -147,7 +172,10 @@ class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor r
     expected: str | None = None
 
 
-MonitorChange = MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorSwitch | MonitorResume
+MonitorChange = (
+    MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorRollback | MonitorConfirm | MonitorSwitch
+    | MonitorResume
+)  # fmt: skip
 
 
 class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
@@ -296,7 +324,8 @@ HostRequest = (
 _Common = (
     StatusWanted | InventoryWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted
     | PolicyRevisions
-    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorChange | TokenList | TokenRevoke
+    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorRevisions
+    | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke
     | HostRequest
 )  # fmt: skip
 RestRequest = _Common | ChallengeWanted

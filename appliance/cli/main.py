@@ -62,7 +62,25 @@ VERBS: dict[str, Verb | Group] = {
             ),
             "reload": Verb(
                 "appliance.cli.monitor.running:reload",
-                "Take what the folder of specifications has now; what was loaded from elsewhere stays in force.",
+                "Take what the folder of specifications has now; what it does not have stays in force, and is named.",
+            ),
+            "revisions": Verb(
+                "appliance.cli.monitor.revisions:revisions",
+                "List the kept revisions of the specifications, the newest first.",
+            ),
+            "show": Verb("appliance.cli.monitor.revisions:show", "Show the specifications of a revision."),
+            "diff": Verb(
+                "appliance.cli.monitor.revisions:diff",
+                "Show what a revision changed of the texts; exit status 1 when they are different.",
+            ),
+            "rollback": Verb(
+                "appliance.cli.monitor.revisions:rollback",
+                "Bring a kept revision of the specifications into force again; what comes back is switched as it was.",
+            ),
+            "confirm": Verb(
+                "appliance.cli.monitor.revisions:confirm",
+                "Keep specifications that were loaded with --confirm-within; exit status 1 when there is nothing to"
+                " confirm.",
             ),
             "resume": Verb(
                 "appliance.cli.monitor.running:resume",

@@ -72,9 +72,13 @@ def troubles_of(body: Status) -> list[str]:
     if body.rosmaster != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
     found += body.ipsec.troubles
-    if body.policy.confirm_by is not None:
-        left = max(0, round(body.policy.confirm_by - time.time()))
-        found.append(f"the policy goes back in {left} s unless confirmed: rosrv policy confirm")
+    for what, verb, deadline in (
+        ("the policy goes", "policy", body.policy.confirm_by),
+        ("the specifications go", "monitor", monitors.confirm_by),
+    ):
+        if deadline is not None:
+            left = max(0, round(deadline - time.time()))
+            found.append(f"{what} back in {left} s unless confirmed: rosrv {verb} confirm")
     return found
 
 

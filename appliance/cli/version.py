@@ -8,7 +8,9 @@ from appliance.inventory import inventory
 
 @speaks
 def version(appliance: Appliance, as_json: Json = False) -> None:
-    """Show which version this is, and what it stands on; with --state or --api, of the appliance that runs there.
+    """Show which version this is, and what it stands on.
+
+    With --state or --api: of the appliance that runs there.
 
     Example: rosrv version --json
     """

@@ -1,6 +1,7 @@
 """What operators ask of the monitors."""
 
 from dataclasses import asdict
+from typing import Any
 
 import msgspec
 
@@ -8,8 +9,10 @@ from appliance.channel import admin
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.control.assembly import Parts
-from appliance.specifications.monitors import Monitors
+from appliance.control.errors import UnknownThingError
+from appliance.specifications.monitors import Monitors, sources_of
 from appliance.specifications.monitors import Replaced as Done
+from appliance.store.state import MonitorRevisionRow
 
 
 class MonitorOrders:
@@ -31,6 +34,7 @@ class MonitorOrders:
             who=monitors.who,
             note=monitors.note,
             loaded=monitors.loaded,
+            confirm_by=monitors.confirm_by,
             folder=str(monitors.folder) if monitors.folder is not None else None,
             differs_from_folder=monitors.differs_from_folder,
             warnings=list(monitors.checked.warnings),
@@ -44,26 +48,72 @@ class MonitorOrders:
     async def load(self, request: admin.MonitorLoad, who: str) -> answers.Replaced:
         """Add or replace files of specifications."""
         done = await self._monitors.load(
-            request.files, request.definitions, who=who, note=request.note, expected=request.expected
+            request.files,
+            request.definitions,
+            who=who,
+            note=request.note,
+            expected=request.expected,
+            confirm_within=request.confirm_within,
         )
         return self._replaced(done)
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> answers.Replaced:
         """Put a text in the place of a monitor's file."""
         files = {self._monitors.file_of(request.name): request.text}
-        done = await self._monitors.load(
-            files, request.definitions, who=who, note=request.note, expected=request.expected
+        load = admin.MonitorLoad(
+            files, request.definitions, request.note, request.expected, request.confirm_within
         )
-        return self._replaced(done)
+        return await self.load(load, who)
 
     async def reload(self, request: admin.MonitorReload, who: str) -> answers.Replaced:
         """Take what the folder has."""
-        done = await self._monitors.reload(who=who, expected=request.expected, prune=request.prune)
+        done = await self._monitors.reload(
+            who=who, expected=request.expected, prune=request.prune, confirm_within=request.confirm_within
+        )
         return self._replaced(done)
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> answers.Replaced:
         """Remove specifications."""
-        return self._replaced(await self._monitors.remove(request.names, who=who, expected=request.expected))
+        done = await self._monitors.remove(
+            request.names, who=who, expected=request.expected, confirm_within=request.confirm_within
+        )
+        return self._replaced(done)
+
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> answers.Replaced:
+        """Bring a kept revision into force."""
+        done = await self._monitors.rollback(request.revision, who=who, expected=request.expected)
+        return self._replaced(done)
+
+    async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.Confirmed:
+        """Keep a change that would go back by itself."""
+        confirmed = await self._monitors.confirm(who=who, expected=request.expected)
+        return answers.Confirmed(confirmed, self._monitors.revision, self._monitors.tag)
+
+    async def revisions(self, _request: admin.MonitorRevisions) -> answers.Revisions:
+        """The kept revisions."""
+        rows = await self._monitors.revisions()
+        return answers.Revisions([answers.Revision(**self._revision(row)) for row in rows])
+
+    async def revision(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
+        """A revision with its texts. Raises `UnknownThingError`."""
+        for row in await self._monitors.revisions():
+            if row.revision == request.revision:
+                sources = sources_of(row)
+                return answers.RevisionTexts(
+                    **self._revision(row), files=sources.files, definitions=sources.definitions
+                )
+        raise UnknownThingError(f"there is no revision {request.revision} of the specifications")
+
+    def _revision(self, row: MonitorRevisionRow) -> dict[str, Any]:
+        """The fields of `Revision`."""
+        return {
+            "revision": row.revision,
+            "loaded": row.loaded,
+            "who": row.who,
+            "note": row.note,
+            "in_force": row.revision == self._monitors.revision,
+            "names": list(sources_of(row).files),
+        }
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> answers.Switched:
         """Enable or disable monitors."""
@@ -94,6 +144,7 @@ def monitors_status(monitors: Monitors) -> MonitorsState:
         refused=monitors.refused,
         who=monitors.who,
         differs_from_folder=monitors.differs_from_folder,
+        confirm_by=monitors.confirm_by,
     )
 
 

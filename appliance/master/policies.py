@@ -17,6 +17,7 @@ from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
 from appliance.recorder import Recorder
+from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import RevisionRow, StateStore
 
 _log = structlog.get_logger()
@@ -79,9 +80,7 @@ class Policies:
         self._robot = robot
         self._hosts = hosts
         self._current: Policy | None = None
-        self._revert: asyncio.Task[None] | None = None
-        self.confirm_by: float | None = None
-        self._back_to = 0  # the last revision that needed no confirmation
+        self._trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
         self.revision = 0
         self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
         self.changed: Callable[[Policy], int] = lambda policy: 0  # noqa: ARG005 - set by control when it is wired
@@ -92,6 +91,11 @@ class Policies:
         if self._current is None:
             raise RuntimeError("no policy is loaded yet")
         return self._current
+
+    @property
+    def confirm_by(self) -> float | None:
+        """When it goes back by itself unless confirmed, in seconds since the epoch."""
+        return self._trial.confirm_by
 
     @property
     def differs_from_file(self) -> bool:
@@ -111,14 +115,14 @@ class Policies:
         last = revisions[0] if revisions else None
         if last is not None and (restarted or last.who != _DISK):
             self._enforce(self._judged(last.text, last.file, self.known), last)
-            self._resume_confirmation()
+            self._trial.resume()
             return
         policy = self._judged(self._read(), str(self.file), self.known)
         if last is not None and last.text == policy.text:
             self._enforce(policy, last)
-            self._resume_confirmation()
+            self._trial.resume()
         else:
-            self._end_confirmation()
+            self._trial.end()
             self._keep(policy, who=_DISK, note="read at start")
 
     async def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
@@ -129,7 +133,7 @@ class Policies:
         """
         before = self.revision
         policy = await self._prepared(self._read, str(self.file), who)
-        self._note_confirmation(confirm_within)
+        self._trial.announce(before, confirm_within)
         revoked = self._keep(policy, who=_DISK, note="reloaded from disk", by=who)
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -143,7 +147,7 @@ class Policies:
         """
         before = self.revision
         policy = await self._prepared(lambda: text, f"revision {self._next_number()}", who)
-        self._note_confirmation(confirm_within)
+        self._trial.announce(before, confirm_within)
         revoked = self._keep(policy, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -161,16 +165,10 @@ class Policies:
     def rollback(self, revision: int | None, *, who: str) -> Loaded:
         """Bring a kept revision into force (None: the one before this). Raises `PolicyRefusedError`."""
         before = self.revision
-        rows = {row.revision: row for row in self._store.revisions()}
-        wanted = (
-            revision if revision is not None else max((one for one in rows if one < before), default=None)
-        )
-        row = rows.get(wanted) if wanted is not None else None
-        if row is None:
-            known = ", ".join(str(one) for one in sorted(rows)) or "none"
-            raise PolicyRefusedError(
-                [f"there is no revision {revision or 'before this one'}; kept are: {known}"]
-            )
+        try:
+            row = wanted(self._store.revisions(), revision, before)
+        except UnknownRevisionError as error:
+            raise PolicyRefusedError([str(error)]) from error
         policy = self._judged(row.text, row.file, self.known)
         revoked = self._keep(policy, who=who, note=f"rolled back to revision {row.revision}")
         return self._answer(policy, before, revoked, None)
@@ -179,7 +177,7 @@ class Policies:
         """Keep an unconfirmed change; False when there is none."""
         if self.confirm_by is None:
             return False
-        self._end_confirmation()
+        self._trial.end()
         self._recorder.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
         return True
 
@@ -277,43 +275,8 @@ class Policies:
         return self.changed(policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
-        back_to = self._back_to if self.confirm_by is not None else before
-        self._end_confirmation()
-        if confirm_within is not None:
-            self._await_confirmation(back_to, time.time() + confirm_within)
+        self._trial.changed(before, confirm_within)
         return Loaded(self.revision, before, [str(one) for one in policy.warnings], revoked, self.confirm_by)
 
-    # --- back by itself unless confirmed ---
-
-    def _note_confirmation(self, confirm_within: float | None) -> None:
-        """In the store before the revision is: control may die while the change is made."""
-        if confirm_within is not None:
-            back_to = self._back_to if self.confirm_by is not None else self.revision
-            self._store.save_setting("confirm", f"{back_to} {time.time() + confirm_within}")
-
-    def _await_confirmation(self, back_to: int, deadline: float) -> None:
-        self.confirm_by = deadline
-        self._back_to = back_to
-        self._store.save_setting("confirm", f"{back_to} {deadline}")
-        self._revert = asyncio.get_running_loop().create_task(self._go_back(back_to, deadline))
-
-    async def _go_back(self, revision: int, deadline: float) -> None:
-        await asyncio.sleep(max(0.0, deadline - time.time()))
-        self._revert = None
-        try:
-            self.rollback(revision, who="not confirmed in time")
-        except PolicyRefusedError as error:
-            _log.error("the policy could not go back", revision=revision, error=str(error))
-
-    def _end_confirmation(self) -> None:
-        if self._revert is not None:
-            self._revert.cancel()
-            self._revert = None
-        self.confirm_by = None
-        self._store.save_setting("confirm", "")
-
-    def _resume_confirmation(self) -> None:
-        kept = self._store.settings().get("confirm", "")
-        if kept:
-            back_to, deadline = kept.split()
-            self._await_confirmation(int(back_to), float(deadline))
+    async def _go_back(self, revision: int) -> None:
+        self.rollback(revision, who="not confirmed in time")

@@ -7,8 +7,11 @@ and say everything that is wrong with them. The relay compiles them again and ha
 Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
 with its monitor: another that is loaded later under the same name is as if nobody had switched it.
 
-Which files are the folder's is kept, too: a reload takes what the folder has in their place, and leaves what was loaded
-from elsewhere alone unless it is told to remove that.
+A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove that:
+nobody's protection ends because a file is not where it was.
+
+Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had last:
+whoever goes back to it has its monitors as they were.
 
 What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
 a change that is meant for another tag than the present one is refused.
@@ -17,11 +20,12 @@ a change that is meant for another tag than the present one is refused.
 import asyncio
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import structlog
 
 from appliance.audit.record import Severity
@@ -38,13 +42,13 @@ from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.observed import MonitorRecords
 from appliance.specifications.relays import Relays
 from appliance.specifications.stating import Revision, Stating
+from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
 
 _log = structlog.get_logger()
 _DISK = "disk"
 _SWITCHES = "monitor switches"
 _ACTS = "monitor acts"
-_FROM_FOLDER = "monitor files of the folder"
 ALLOCATION = "relays"
 _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
@@ -73,7 +77,7 @@ class Replaced:
 
     `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
     did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in
-    force although the folder does not have them: they were loaded from elsewhere.
+    force although the folder does not have them. It goes back by itself at `confirm_by` unless confirmed.
     """
 
     revision: int
@@ -85,6 +89,13 @@ class Replaced:
     moved: list[str]
     began: list[str]
     kept: list[str]
+    confirm_by: float | None
+
+
+class Kept(Sources, frozen=True):
+    """A revision as it is in the store; `switches` are those of its monitors when it was replaced."""
+
+    switches: dict[str, bool] = {}  # noqa: RUF012  each struct gets one of its own
 
 
 class Monitors:
@@ -112,8 +123,11 @@ class Monitors:
         self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
         self._switches: dict[str, bool] = {}
         self._acts = 0  # switches and resumptions, ever
-        self._from_folder: frozenset[str] = frozenset()  # the files in force that were read from the folder
         self._changing = asyncio.Lock()
+        self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
+        self._row = MonitorRevisionRow(
+            0, "{}", 0.0, _DISK, ""
+        )  # in force; of none that is kept until there is one
         self.revision = 0
         self.sources = Sources()
         self.checked = Checked()
@@ -132,21 +146,23 @@ class Monitors:
         settings = self._store.settings()
         self._switches = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
-        self._from_folder = frozenset(json.loads(settings.get(_FROM_FOLDER, "[]")))
         last = self._store.monitor_revision()
+        if last is not None:
+            self._row = last
         if last is not None and (restarted or last.who != _DISK):
-            sources = Sources(**json.loads(last.sources))
+            sources = sources_of(last)
             self._enforce(sources, _check_kept(sources, last), last)
-            if _FROM_FOLDER not in settings and last.who == _DISK:  # of a version that did not keep it
-                self._note_folder(sources.files)
+            self._trial.resume()
         else:
             sources = self._folder.read()
             checked = check(sources)
-            if last is not None and Sources(**json.loads(last.sources)) == sources:
+            if last is not None and sources_of(last) == sources:
                 self._enforce(sources, checked, last)
-            elif sources.files or last is not None:
-                self._keep(sources, checked, who=_DISK, note="read at start")
-            self._note_folder(sources.files)
+                self._trial.resume()
+            else:
+                self._trial.end()
+                if sources.files or last is not None:
+                    self._keep(sources, checked, who=_DISK, note="read at start")
         now = Revision(self.revision, self.sources, self.checked)
         self._stating.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         unknown = sorted(self._named() - self.checked.monitors.keys())
@@ -186,6 +202,11 @@ class Monitors:
         """Whether what is in force is something else than the folder has now; not where there is no folder."""
         return self.folder is not None and self._folder.looked_at() != self.sources
 
+    @property
+    def confirm_by(self) -> float | None:
+        """When what is in force goes back by itself unless confirmed, in seconds since the epoch."""
+        return self._trial.confirm_by
+
     def enabled(self, name: str) -> bool:
         """Whether a monitor's events happen."""
         default = self._enable == "all" or (self._enable != "none" and name in self._named())
@@ -203,6 +224,11 @@ class Monitors:
             raise UnknownMonitorError(self._unknown([name]))
         return self.checked.monitors[name]
 
+    async def revisions(self) -> list[MonitorRevisionRow]:
+        """All kept revisions, the newest first."""
+        await self._store.settled()
+        return await asyncio.to_thread(self._store.monitor_revisions)
+
     def statement(self, relay: int = 0) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
         return self._stating.statement(relay)
@@ -217,16 +243,26 @@ class Monitors:
         who: str,
         note: str,
         expected: str | None = None,
+        confirm_within: float | None = None,
     ) -> Replaced:
-        """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`."""
+        """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
+
+        This and every change of the specifications goes back by itself after `confirm_within` seconds unless confirmed.
+        """
         async with self._changing:
             self._expect(expected)
             sources = self.sources.with_files(files, definitions)
-            folders = self._from_folder - files.keys()
-            return await self._change(sources, who, who, note or "loaded", from_folder=folders)
+            return await self._change(sources, who, who, note or "loaded", confirm_within)
 
-    async def reload(self, *, who: str, expected: str | None = None, prune: bool = False) -> Replaced:
-        """Take what the folder has now; what was loaded from elsewhere stays, unless `prune`.
+    async def reload(
+        self,
+        *,
+        who: str,
+        expected: str | None = None,
+        prune: bool = False,
+        confirm_within: float | None = None,
+    ) -> Replaced:
+        """Take what the folder has now; what it does not have stays, unless `prune`.
 
         Raises `SpecificationsRefusedError`, also when there is no folder.
         """
@@ -235,18 +271,17 @@ class Monitors:
             if self.folder is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
-            from_folder = frozenset(sources.files)
-            kept = [] if prune else sorted(self.sources.files.keys() - self._from_folder - from_folder)
+            kept = [] if prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 left = {name: self.sources.files[name] for name in kept}
                 definitions = self.sources.definitions | sources.definitions
                 sources = sources.with_files(left, definitions)
             keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
-            return await self._change(
-                sources, keeper, who, "reloaded from disk", from_folder=from_folder, kept=kept
-            )
+            return await self._change(sources, keeper, who, "reloaded from disk", confirm_within, kept=kept)
 
-    async def remove(self, names: list[str], *, who: str, expected: str | None = None) -> Replaced:
+    async def remove(
+        self, names: list[str], *, who: str, expected: str | None = None, confirm_within: float | None = None
+    ) -> Replaced:
         """Remove files, by their names or those of their monitors.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
@@ -267,7 +302,40 @@ class Monitors:
                 text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
-            return await self._change(sources, who, who, note, from_folder=self._from_folder - files)
+            return await self._change(sources, who, who, note, confirm_within)
+
+    async def rollback(self, revision: int | None, *, who: str, expected: str | None = None) -> Replaced:
+        """Bring a kept revision into force again (None: the one before this; 0: nothing).
+
+        A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
+        """
+        async with self._changing:
+            self._expect(expected)
+            row = MonitorRevisionRow(0, "{}", 0.0, _DISK, "")
+            if revision != 0:
+                try:
+                    row = wanted(await self.revisions(), revision, self.revision)
+                except UnknownRevisionError as error:
+                    raise SpecificationsRefusedError([str(error)]) from error
+            note, switches = f"rolled back to revision {row.revision}", _kept(row).switches
+            return await self._change(sources_of(row), who, who, note, switches=switches)
+
+    async def confirm(self, *, who: str, expected: str | None = None) -> bool:
+        """Keep an unconfirmed change; False when there is none."""
+        async with self._changing:
+            self._expect(expected)
+            if self.confirm_by is None:
+                return False
+            self._trial.end()
+            self._recorder.happened(
+                "specifications confirmed",
+                f"revision {self.revision} of the specifications was confirmed",
+                category="monitor",
+                resource="",
+                who=who,
+            )
+            await self._store.settled()
+            return True
 
     async def switch(
         self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
@@ -366,9 +434,8 @@ class Monitors:
         await self._store.settled()
         self._acts += 1
 
-    def _note_folder(self, files: Iterable[str]) -> None:
-        self._from_folder = frozenset(files)
-        self._store.save_setting(_FROM_FOLDER, json.dumps(sorted(self._from_folder)))
+    async def _go_back(self, revision: int) -> None:
+        await self.rollback(revision, who="not confirmed in time")
 
     async def _change(
         self,
@@ -376,33 +443,54 @@ class Monitors:
         keeper: str,
         who: str,
         note: str,
+        confirm_within: float | None = None,
         *,
-        from_folder: Collection[str],
         kept: Sequence[str] = (),
+        switches: Mapping[str, bool] = {},
     ) -> Replaced:
-        before, previous = self.revision, self.sources
+        """`switches` are for monitors that are not in force yet."""
+        before, previous, switched = self.revision, self.sources, self._switches
+        self._switches = {
+            **{one: to for one, to in switches.items() if one not in self.checked.monitors},
+            **switched,
+        }
         try:
             checked = await asyncio.to_thread(check, sources)
             moved = await self._stating.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
+            self._switches = switched
+            hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
+            findings = error.findings + hint
             self._recorder.happened(
                 "specifications refused",
                 f"revision {self.revision} stays in force: {error.findings[0]}",
                 severity=Severity.WARNING,
-                findings=error.findings[:100],
+                findings=findings[:100],
                 who=who,
             )
-            raise
+            raise SpecificationsRefusedError(findings) from error
         began = self._stating.began(checked.monitors)
-        self._note_folder(from_folder)
-        self._keep(sources, checked, who=keeper, note=note, by=who, before=previous, began=began)
+        self._trial.announce(before, confirm_within)
+        self._keep(sources, checked, who=keeper, note=note, by=who, began=began)
+        self._trial.changed(before, confirm_within)
         await self._store.settled()
         await self._stating.all_taken()
         self.published()
         added, changed, removed = sources.difference(previous)
         began = self._stating.began(checked.monitors)  # by those that have it only now, too
         warnings = list(checked.warnings)
-        return Replaced(self.revision, before, added, changed, removed, warnings, moved, began, list(kept))
+        return Replaced(
+            self.revision,
+            before,
+            added,
+            changed,
+            removed,
+            warnings,
+            moved,
+            began,
+            list(kept),
+            self.confirm_by,
+        )
 
     def _keep(
         self,
@@ -412,18 +500,16 @@ class Monitors:
         who: str,
         note: str,
         by: str | None = None,
-        before: Sources | None = None,
         began: Sequence[str] = (),
     ) -> None:
-        text = json.dumps({"files": sources.files, "definitions": sources.definitions})
-        row = MonitorRevisionRow(self.revision + 1, text, time.time(), who, note)
-        last = self._store.monitor_revision()
-        if before is None and last is not None:
-            row = MonitorRevisionRow(last.revision + 1, text, time.time(), who, note)
-            before = Sources(**json.loads(last.sources))
+        last, before = self._row, sources_of(self._row)
+        if last.revision:
+            ended = Kept(before.files, before.definitions, self._switches)
+            self._store.save_monitor_revision(last._replace(sources=_text(ended)))
+        row = MonitorRevisionRow(last.revision + 1, _text(sources), time.time(), who, note)
         self._store.save_monitor_revision(row)
         self._enforce(sources, checked, row)
-        added, changed, removed = sources.difference(before or Sources())
+        added, changed, removed = sources.difference(before)
         self._recorder.happened(
             "specifications loaded",
             f"revision {row.revision} of the specifications is in force: {note}",
@@ -442,11 +528,9 @@ class Monitors:
 
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.revision = sources, checked, row.revision
-        self.who, self.note, self.loaded = row.who, row.note, row.loaded
-        left = {name: enabled for name, enabled in self._switches.items() if name in checked.monitors}
-        if left != self._switches:
-            self._switches = left
-            self._store.save_setting(_SWITCHES, json.dumps(left))
+        self._row, self.who, self.note, self.loaded = row, row.who, row.note, row.loaded
+        self._switches = {name: on for name, on in self._switches.items() if name in checked.monitors}
+        self._store.save_setting(_SWITCHES, json.dumps(self._switches))
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
@@ -457,11 +541,23 @@ def forget_revision(store: StateStore, now: float) -> int | None:
     last = store.monitor_revision()
     if last is None or last.who == _DISK:
         return None
-    nothing = json.dumps({"files": {}, "definitions": {}})
     store.save_monitor_revision(
-        MonitorRevisionRow(last.revision + 1, nothing, now, _DISK, f"revision {last.revision} was given up")
+        MonitorRevisionRow(last.revision + 1, "{}", now, _DISK, f"revision {last.revision} was given up")
     )
     return last.revision
+
+
+def _text(sources: Sources) -> str:
+    return msgspec.json.encode(sources).decode()
+
+
+def _kept(row: MonitorRevisionRow) -> Kept:
+    return msgspec.json.decode(row.sources, type=Kept)
+
+
+def sources_of(row: MonitorRevisionRow) -> Sources:
+    """What was in force."""
+    return msgspec.json.decode(row.sources, type=Sources)
 
 
 def _check_kept(sources: Sources, row: MonitorRevisionRow) -> Checked:

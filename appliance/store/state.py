@@ -242,6 +242,11 @@ class StateStore:
         """Keep specifications that come into force."""
         self._database.put("monitor_revision", *row)
 
+    def monitor_revisions(self) -> list[MonitorRevisionRow]:
+        """All kept revisions of the specifications, the newest first."""
+        rows = self._database.query("SELECT * FROM monitor_revision ORDER BY revision DESC")
+        return [MonitorRevisionRow(*row) for row in rows]
+
     def monitor_revision(self) -> MonitorRevisionRow | None:
         """The last that came into force; None when there never was one."""
         rows = self._database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")

@@ -17,9 +17,8 @@ from tests.support.machine import Done, Machine
 from tests.support.machine_disk import ROOT, clean_disk, newest_kernel
 from tests.support.requirements import need_program
 
-pytestmark = pytest.mark.timeout(
-    1800
-)  # packages are built, and a machine boots twice, each instruction computed
+# Packages are built, and a machine boots twice, each instruction computed, perhaps by a processor that others use.
+pytestmark = pytest.mark.timeout(5400)
 NODE_PACKAGES = (
     "python3-rospy",
     "python3-rostopic",
@@ -27,7 +26,7 @@ NODE_PACKAGES = (
     "python3-std-msgs",
     "systemd-resolved",
 )
-SERVE_SECONDS = 600.0
+SLOW_SECONDS = 1200.0  # of what is over in seconds on a machine of its own
 EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
 
 
@@ -99,12 +98,14 @@ def state_of(machine: Machine) -> dict[str, str]:
 
 def ros(machine: Machine, *command: str) -> Done:
     """A stock tool on the robot's machine; nothing is set but ROS_MASTER_URI."""
-    return machine.run("env", *(f"{key}={value}" for key, value in EVERYWHERE.items()), *command, seconds=120)
+    return machine.run(
+        "env", *(f"{key}={value}" for key, value in EVERYWHERE.items()), *command, seconds=SLOW_SECONDS
+    )
 
 
 def serves(machine: Machine) -> dict[str, object]:
     """The status of the appliance, once systemd says that it is ready."""
-    machine.run("systemctl", "start", "rosrv", seconds=SERVE_SECONDS)  # waits for a start that is under way
+    machine.run("systemctl", "start", "rosrv", seconds=SLOW_SECONDS)  # waits for a start that is under way
     status: dict[str, object] = json.loads(machine.run("rosrv", "status", "--json", check=False).output)
     return status
 
@@ -113,7 +114,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     """One command protects the robot; reboot, kill and upgrade keep it so, and removal leaves the machine as it was."""
     machine.start()
     before = state_of(machine)
-    machine.run("dpkg", "--install", "old.deb", seconds=900)
+    machine.run("dpkg", "--install", "old.deb", seconds=SLOW_SECONDS)
     assert serves(machine)["version"] == "0.1.0"
     assert machine.run("rosrv", "policy", "check", "/etc/rosrv/policies/default.ini").status == 0
     assert "/etc/rosrv/policies/default.ini" in machine.run("rosrv", "config", "show").output
@@ -140,7 +141,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
 
     machine.run("sh", "-c", "echo '# a line of mine' >> /etc/rosrv/policies/default.ini")
     machine.run("systemctl", "reload", "rosrv")
-    machine.run("dpkg", "--install", "new.deb", seconds=900)
+    machine.run("dpkg", "--install", "new.deb", seconds=SLOW_SECONDS)
     serves(machine)
     assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "0.1.1"
     assert "a line of mine" in machine.run("tail", "-1", "/etc/rosrv/policies/default.ini").output
@@ -154,10 +155,10 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     serves(machine)
     machine.run("rosrv", "audit", "verify")
 
-    machine.run("dpkg", "--remove", "rosrv", seconds=300)
+    machine.run("dpkg", "--remove", "rosrv", seconds=SLOW_SECONDS)
     after = state_of(machine)
     assert {name: text for name, text in after.items() if text != before[name]} == {}
-    machine.run("dpkg", "--purge", "rosrv", seconds=300)
+    machine.run("dpkg", "--purge", "rosrv", seconds=SLOW_SECONDS)
     looked = ("/etc", "/var", "/usr", "/lib", "/run", "-xdev", "-name", "*rosrv*")
     others = ("/var/lib/dpkg/*", "/var/log/*", "*rosrv-agent*", "*rosrv.agent*")
     left = machine.run("find", *looked, *(word for path in others for word in ("-not", "-path", path))).output

@@ -112,7 +112,7 @@ class Machine:
         self.boot_seconds = time.monotonic() - began
         return self
 
-    def run(self, *argv: str, seconds: float = 60.0, check: bool = True) -> Done:
+    def run(self, *argv: str, seconds: float = 600.0, check: bool = True) -> Done:
         """Run a program as root in the checkout's folder; with `check`, a status other than 0 is a failure."""
         assert self._line is not None, "the machine is not on"
         self._number += 1

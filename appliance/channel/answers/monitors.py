@@ -40,6 +40,9 @@ class Monitors(msgspec.Struct, frozen=True):
     who: str
     note: str
     loaded: float
+    confirm_by: Annotated[
+        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
+    ]
     folder: Annotated[str | None, told("what `reload` reads; null: no folder was given at start")]
     differs_from_folder: bool
     warnings: list[str]
@@ -65,6 +68,39 @@ class Replaced(msgspec.Struct, frozen=True):
     moved: list[str]
     began: list[str]
     kept: list[str]
+    confirm_by: float | None
+
+
+class Confirmed(msgspec.Struct, frozen=True):
+    """Whether there was something to confirm."""
+
+    confirmed: bool
+    revision: int
+    tag: Tag
+
+
+class Revision(msgspec.Struct, frozen=True):
+    """Specifications that came into force; `loaded` is seconds since the epoch."""
+
+    revision: int
+    loaded: float
+    who: str
+    note: str
+    in_force: bool
+    names: Annotated[list[str], told("of its files")]
+
+
+class Revisions(msgspec.Struct, frozen=True):
+    """The kept revisions, the newest first."""
+
+    revisions: list[Revision]
+
+
+class RevisionTexts(Revision, frozen=True):
+    """A kept revision with its texts."""
+
+    files: Annotated[dict[str, str], told("specifications by file name")]
+    definitions: Annotated[dict[str, str], told("those that came with them")]
 
 
 class Switched(msgspec.Struct, frozen=True):

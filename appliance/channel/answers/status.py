@@ -93,6 +93,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
     refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
     who: str
     differs_from_folder: bool
+    confirm_by: float | None
 
 
 class ForwardingState(msgspec.Struct, frozen=True):

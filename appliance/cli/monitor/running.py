@@ -15,6 +15,7 @@ from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
+from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
@@ -44,7 +45,7 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
     Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
     source = f" ({body.folder})" if body.folder else ""
     differs = (
-        "; not what the folder has (rosrv monitor reload takes that, and removes nothing that was loaded here)"
+        "; not what the folder has (rosrv monitor reload takes that, and removes nothing)"
         if body.folder and body.differs_from_folder
         else ""
     )
@@ -77,7 +78,9 @@ def load(
         list[Path] | None,
         typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
     ] = None,
+    *,
     note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
+    confirm_within: ConfirmWithin = None,
     as_json: Json = False,
 ) -> None:
     """Load specifications while the robot runs; a file of the same name is replaced.
@@ -98,33 +101,39 @@ def load(
             AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
         )
         return
-    _say_replaced(appliance.answer_or_exit(admin.MonitorLoad(texts, definitions, note), as_json=as_json))
+    order = admin.MonitorLoad(
+        texts, definitions, note, confirm_within=seconds_within(confirm_within, "monitor")
+    )
+    say_replaced(appliance.answer_or_exit(order, as_json=as_json))
     _say_disabled(appliance, texts)
 
 
 @speaks
-def remove(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+def remove(
+    appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = None, as_json: Json = False
+) -> None:
     """Remove specifications, by the names of their monitors or files.
 
-    Example: rosrv monitor remove safeTrigger
+    Example: rosrv monitor remove safeTrigger --confirm-within 5m
     """
-    _say_replaced(appliance.answer_or_exit(admin.MonitorRemove(names), as_json=as_json))
+    order = admin.MonitorRemove(names, confirm_within=seconds_within(confirm_within, "monitor"))
+    say_replaced(appliance.answer_or_exit(order, as_json=as_json))
 
 
 @speaks
 def reload(
     appliance: Appliance,
-    prune: Annotated[
-        bool, typer.Option("--prune", help="Also remove what was loaded from elsewhere than the folder")
-    ] = False,
+    prune: Annotated[bool, typer.Option("--prune", help="Also remove what the folder does not have")] = False,
+    confirm_within: ConfirmWithin = None,
     as_json: Json = False,
 ) -> None:
-    """Take what the folder of specifications has now; what was loaded from elsewhere stays in force.
+    """Take what the folder of specifications has now; what it does not have stays in force, and is named.
 
     Example: rosrv monitor reload
     """
-    body = appliance.answer_or_exit(admin.MonitorReload(prune=prune), as_json=as_json)
-    _say_replaced(body)
+    order = admin.MonitorReload(prune=prune, confirm_within=seconds_within(confirm_within, "monitor"))
+    body = appliance.answer_or_exit(order, as_json=as_json)
+    say_replaced(body)
     if body.kept:
         say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
     _say_disabled(appliance, [*body.added, *body.changed])
@@ -170,7 +179,8 @@ def _state(row: MonitorState) -> str:
     return "enabled" if row.enabled else "disabled"
 
 
-def _say_replaced(body: Replaced) -> None:
+def say_replaced(body: Replaced) -> None:
+    """What a change of the specifications did."""
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [
@@ -185,6 +195,7 @@ def _say_replaced(body: Replaced) -> None:
         say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
     if body.warnings:
         say(counted(len(body.warnings), "warning"), "yellow")
+    say_deadline(body.confirm_by, "monitor")
 
 
 def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:

@@ -1,26 +1,20 @@
 """`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
 
-import datetime
 from typing import Annotated
 
 import typer
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.channel.answers.policy import Loaded
-from appliance.cli.output import Json, counted, say, say_json
+from appliance.cli.output import Json, counted, say
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.spans import span_given
+from appliance.cli.trials import ConfirmWithin, say_confirmed, say_deadline, say_revisions, seconds_within
 
 
 @speaks
 def reload(
     appliance: Appliance,
-    confirm_within: Annotated[
-        str | None,
-        typer.Option(
-            help="Go back by itself after this time (30s, 5m, 1h) unless `rosrv policy confirm` comes"
-        ),
-    ] = None,
+    confirm_within: ConfirmWithin = None,
     as_json: Json = False,
 ) -> None:
     """Read the policy file again: check, test, swap at once, and take back what it no longer allows.
@@ -29,12 +23,8 @@ def reload(
 
     Example: rosrv policy reload --confirm-within 5m
     """
-    seconds = (
-        span_given("--confirm-within", confirm_within, "30s, 5m or 1h", "rosrv policy")
-        if confirm_within is not None
-        else None
-    )
-    _say_loaded(appliance.answer_or_exit(PolicyReload(seconds), as_json=as_json))
+    order = PolicyReload(seconds_within(confirm_within, "policy"))
+    _say_loaded(appliance.answer_or_exit(order, as_json=as_json))
 
 
 @speaks
@@ -58,13 +48,7 @@ def confirm(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv policy confirm
     """
-    body = appliance.ask_or_exit(PolicyConfirm(), as_json=as_json)
-    if as_json:
-        say_json(body)
-    else:
-        kept = f"revision {body.revision} stays in force"
-        say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
-    raise typer.Exit(0 if body.confirmed else 1)
+    say_confirmed(appliance.ask_or_exit(PolicyConfirm(), as_json=as_json), as_json=as_json)
 
 
 @speaks
@@ -73,13 +57,8 @@ def revisions(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv policy revisions
     """
-    for row in appliance.ask_or_exit(PolicyRevisions(), as_json=as_json).revisions:
-        if as_json:
-            say_json(row)
-            continue
-        loaded = datetime.datetime.fromtimestamp(row.loaded, datetime.UTC).isoformat(timespec="seconds")
-        mark = "in force" if row.in_force else ""
-        say(f"{row.revision:>5}  {loaded}  {row.who}: {row.note}  {row.file}  {mark}".rstrip())
+    body = appliance.ask_or_exit(PolicyRevisions(), as_json=as_json)
+    say_revisions(body.revisions, as_json=as_json)
 
 
 def _say_loaded(body: Loaded) -> None:
@@ -88,6 +67,4 @@ def _say_loaded(body: Loaded) -> None:
     say(
         f"revision {body.revision} is in force (was {body.replaced}); {counted(body.revoked, 'right')} revoked"
     )
-    if body.confirm_by is not None:
-        until = datetime.datetime.fromtimestamp(body.confirm_by, datetime.UTC).isoformat(timespec="seconds")
-        say(f"it goes back by itself at {until} unless you say: rosrv policy confirm", "yellow")
+    say_deadline(body.confirm_by, "policy")

@@ -23,7 +23,7 @@ def carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
         raise NotRunningError(f"{rest.url}: {_ONLY_THERE.get(type(request), _UNASKED)}")
     body = _answer(rest, operation, request)
     match asked:
-        case admin.MonitorLoad() | admin.MonitorReload() | admin.MonitorRemove():
+        case admin.MonitorLoad() | admin.MonitorReload() | admin.MonitorRemove() | admin.MonitorRollback():
             body["warnings"] = [_line(one) for one in body["warnings"]]
         case admin.HostPorts(name):
             body = {"name": name, "ports": body, "revision": 0}

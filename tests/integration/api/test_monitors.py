@@ -81,7 +81,7 @@ def test_a_specification_is_tried_loaded_replaced_and_removed(appliance: Applian
 
 
 def test_a_reload_leaves_what_was_loaded_over_rest(appliance: Appliance) -> None:
-    """The folder is read again; a safety monitor that it never had stays, until an admin says otherwise."""
+    """The folder is read again; a monitor that it does not have (any more) stays, until an admin says otherwise."""
     rest, file = appliance.rest(), appliance.directory / "monitors" / "count.rv"
     file.write_text(OTHER)
     assert "added count.rv" in appliance.rosrv("monitor", "reload").stdout
@@ -89,13 +89,39 @@ def test_a_reload_leaves_what_was_loaded_over_rest(appliance: Appliance) -> None
     assert "reload" not in appliance.rosrv("status", check=False).stdout
     file.unlink()
     said = appliance.rosrv("monitor", "reload").stdout
-    assert "removed count.rv" in said
-    assert "still in force: speed.rv" in said
-    assert [one["name"] for one in rest.get("/v1/monitors").json["monitors"]] == ["speed"]
+    assert "still in force: count.rv, speed.rv" in said
+    assert [one["name"] for one in rest.get("/v1/monitors").json["monitors"]] == ["count", "speed"]
     made = appliance.rosrv("token", "add", "op", "--role", "operator", "--json").stdout
     operator = rest.with_token(json.loads(made)["token"])
     assert send(operator, "POST", "/v1/monitors/reload?prune=1", None, "*").status == 403
-    assert "removed speed.rv" in appliance.rosrv("monitor", "reload", "--prune").stdout
+    assert "removed count.rv, speed.rv" in appliance.rosrv("monitor", "reload", "--prune").stdout
+
+
+def test_a_revision_is_gone_back_to_and_a_trial_is_confirmed(appliance: Appliance) -> None:
+    """Over REST and by command alike: what was in force, what changed, the way back, and the time limit."""
+    rest = appliance.rest()
+    loaded = load(rest, {"speed.rv": LIMIT})
+    gone = send(rest, "DELETE", "/v1/monitors/speed?confirm_within=600", None, loaded.etag)
+    assert gone.json["confirm_by"] > 0
+    assert "rosrv monitor confirm" in appliance.rosrv("status", check=False).stdout
+    assert send(rest, "POST", "/v1/monitors/confirm", None, gone.etag).json["confirmed"] is True
+    assert appliance.rosrv("monitor", "confirm", check=False).returncode == 1
+    rows = rest.get("/v1/monitors/revisions").json["revisions"]
+    kept, present = loaded.json["revision"], gone.json["revision"]
+    named = {row["revision"]: (row["names"], row["in_force"]) for row in rows}
+    assert (named[kept], named[present]) == ((["speed.rv"], False), ([], True))
+    assert rest.get(f"/v1/monitors/revisions/{kept}").json["files"] == {"speed.rv": LIMIT}
+    assert rest.get("/v1/monitors/revisions/999").status == 404
+    diff = appliance.rosrv("monitor", "diff", check=False)
+    assert diff.returncode == 1
+    assert [f"-{line}" for line in LIMIT.splitlines()] == diff.stdout.splitlines()[3:]
+    made = appliance.rosrv("token", "add", "watch", "--role", "operator", "--json").stdout
+    operator = rest.with_token(json.loads(made)["token"])
+    assert send(operator, "POST", "/v1/monitors/rollback", {"revision": kept}, "*").status == 403
+    back = send(rest, "POST", "/v1/monitors/rollback", {"revision": kept}, "*")
+    assert (back.json["added"], back.json["monitors"]) == (["speed.rv"], ["speed"])
+    assert "removed speed.rv" in appliance.rosrv("monitor", "rollback", str(present)).stdout
+    assert appliance.rosrv("monitor", "show", str(kept)).stdout.splitlines()[1:] == LIMIT.splitlines()
 
 
 def test_without_a_folder_a_reload_is_an_error() -> None:

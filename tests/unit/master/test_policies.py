@@ -47,8 +47,8 @@ class Appliance:
         try:
             yield policies
         finally:
-            if policies._revert is not None:
-                policies._revert.cancel()
+            if policies._trial._task is not None:
+                policies._trial._task.cancel()
             store.close()
 
 

@@ -106,7 +106,7 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
 
 
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
-    """What was loaded while the robot runs stays, over restarts, too; what the folder brought goes with its file."""
+    """What the folder does not have stays in force, over restarts, too, until somebody says that it is to go."""
     monitors = desk.monitors()
     await monitors.load({"b.rv": B}, {}, who="eve", note="")
     (desk.folder / "c.rv").write_text(C)
@@ -118,9 +118,97 @@ async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: D
     assert restarted.names() == ["a", "b", "c"]
     (desk.folder / "c.rv").unlink()
     again = await restarted.reload(who="operator")
-    assert (again.removed, again.kept, restarted.names()) == (["c.rv"], ["b.rv"], ["a", "b"])
+    assert (again.removed, again.kept, restarted.names()) == ([], ["b.rv", "c.rv"], ["a", "b", "c"])
     pruned = await restarted.reload(who="operator", prune=True)
-    assert (pruned.removed, pruned.kept, restarted.differs_from_folder) == (["b.rv"], [], False)
+    assert (pruned.removed, pruned.kept, restarted.differs_from_folder) == (["b.rv", "c.rv"], [], False)
+
+
+async def test_a_file_with_another_name_is_not_taken_beside_the_old_one(desk: Desk) -> None:
+    """Its monitor is in force already: nothing changes, and the words say which file has to go, and how."""
+    monitors = desk.monitors()
+    (desk.folder / "a.rv").rename(desk.folder / "new.rv")
+    with pytest.raises(
+        SpecificationsRefusedError, match=r"not of the folder, and kept: a\.rv \(prune removes"
+    ):
+        await monitors.reload(who="operator")
+    assert list(monitors.sources.files) == ["a.rv"]
+    pruned = await monitors.reload(who="operator", prune=True)
+    assert (pruned.added, pruned.removed, monitors.names()) == (["new.rv"], ["a.rv"], ["a"])
+
+
+async def test_a_revision_comes_back_with_its_switches(desk: Desk) -> None:
+    """Specifications and switches are as they were, over restarts; what was in force all the time keeps its switch."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors(enable="none")
+    await monitors.switch(["a", "b"], True, who="eve")
+    await monitors.remove(["b"], who="eve")
+    await monitors.switch(["a"], False, who="eve")
+    restarted = desk.monitors(enable="none", restarted=True)
+    back = await restarted.rollback(None, who="adam")
+    assert (back.added, back.removed, back.revision) == (["b.rv"], [], 3)
+    assert {name: restarted.enabled(name) for name in restarted.names()} == {"a": False, "b": True}
+    rows = await restarted.revisions()
+    assert [(row.revision, row.who, row.note) for row in rows] == [
+        (3, "adam", "rolled back to revision 1"),
+        (2, "eve", "removed b.rv"),
+        (1, "disk", "read at start"),
+    ]
+    with pytest.raises(SpecificationsRefusedError, match="there is no revision 9; kept are: 1, 2, 3"):
+        await restarted.rollback(9, who="adam")
+
+
+async def test_a_refused_rollback_leaves_no_switch_behind(desk: Desk) -> None:
+    """A monitor of that name that is loaded later is as if nobody had switched it."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors(enable="none")
+    await monitors.switch(["b"], True, who="eve")
+    await monitors.remove(["b"], who="eve")
+    desk.findings = ["the relay says no"]
+    with pytest.raises(SpecificationsRefusedError, match="the relay says no"):
+        await monitors.rollback(1, who="eve")
+    desk.findings = []
+    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    assert not monitors.enabled("b")
+
+
+async def gone_back(monitors: Monitors, revision: int) -> None:
+    """Wait until this revision is in force."""
+    async with asyncio.timeout(30):
+        while monitors.revision != revision:
+            await asyncio.sleep(0.01)
+
+
+async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
+    """The monitor that was removed on trial stands guard again, enabled as it was, also after a restart."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = desk.monitors(enable="none")
+    await monitors.switch(["b"], True, who="eve")
+    gone = await monitors.remove(["b"], who="eve", confirm_within=0.0)
+    assert gone.confirm_by is not None
+    await gone_back(monitors, 3)
+    assert (monitors.names(), monitors.enabled("b"), monitors.confirm_by) == (["a", "b"], True, None)
+    assert (monitors.who, monitors.note) == ("not confirmed in time", "rolled back to revision 1")
+    await monitors.remove(["b"], who="eve", confirm_within=300.0)
+    await monitors.remove(["a"], who="eve", confirm_within=300.0)
+    restarted = desk.monitors(enable="none", restarted=True)
+    assert restarted.names() == []
+    assert restarted.confirm_by is not None
+    assert await restarted.confirm(who="eve")
+    assert not await restarted.confirm(who="eve")
+    again = desk.monitors(enable="none", restarted=True)
+    assert (again.names(), again.confirm_by) == ([], None)
+    assert [fields["who"] for event, fields in desk.events if event == "specifications confirmed"] == ["eve"]
+
+
+async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
+    """Where there was no revision before."""
+    desk = Desk(tmp_path)
+    monitors = desk.monitors(folder=False)
+    await monitors.load({"b.rv": B}, {}, who="eve", note="", confirm_within=0.0)
+    await gone_back(monitors, 2)
+    assert monitors.names() == []
+    desk.store.close()
+    desk.log.close()
 
 
 async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:

@@ -1,0 +1,109 @@
+"""`rosrv monitor revisions|show|diff|rollback|confirm`: the specifications that were in force, and the way back."""
+
+import difflib
+from typing import Annotated
+
+import typer
+
+from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
+from appliance.channel.answers.monitors import RevisionTexts
+from appliance.cli.monitor.running import say_replaced
+from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.cli.running import Appliance, speaks
+from appliance.cli.trials import say_confirmed, say_revisions
+
+_Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]
+
+
+@speaks
+def revisions(appliance: Appliance, as_json: Json = False) -> None:
+    """List the kept revisions of the specifications, the newest first.
+
+    Example: rosrv monitor revisions
+    """
+    body = appliance.ask_or_exit(MonitorRevisions(), as_json=as_json)
+    say_revisions(body.revisions, as_json=as_json)
+
+
+@speaks
+def show(appliance: Appliance, revision: _Revision = None, as_json: Json = False) -> None:
+    """Show the specifications of a revision.
+
+    Example: rosrv monitor show 7
+    """
+    body = _texts(appliance, revision, as_json=as_json)
+    if as_json:
+        say_json(body)
+        return
+    for name, text in _named(body).items():
+        say(f"# {name}", "bold")
+        for line in text.splitlines():
+            say(line)
+
+
+@speaks
+def diff(
+    appliance: Appliance,
+    old: Annotated[int | None, typer.Argument(help="A kept revision; without it, the one before")] = None,
+    new: _Revision = None,
+    as_json: Json = False,
+) -> None:
+    """Show what a revision changed of the texts; exit status 1 when they are different.
+
+    Example: rosrv monitor diff 6 7
+    """
+    later = _texts(appliance, new, as_json=as_json)
+    before = old if old is not None else later.revision - 1
+    earlier = _named(_texts(appliance, before, as_json=as_json)) if before else {}
+    texts = _named(later)
+    lines = [
+        line
+        for name in sorted(earlier.keys() | texts.keys())
+        for line in difflib.unified_diff(
+            earlier.get(name, "").splitlines(), texts.get(name, "").splitlines(),
+            f"revision {before}: {name}", f"revision {later.revision}: {name}", lineterm="",
+        )
+    ]  # fmt: skip
+    if as_json:
+        say_json({"old": before, "new": later.revision, "lines": lines})
+        raise typer.Exit(1 if lines else 0)
+    for line in lines:
+        say(line, {"+": "green", "-": "red"}.get(line[0], ""))
+    raise typer.Exit(1 if lines else 0)
+
+
+@speaks
+def rollback(
+    appliance: Appliance,
+    revision: Annotated[
+        int | None, typer.Argument(help="A kept revision; without it, the one before")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Bring a kept revision of the specifications into force again; what comes back is switched as it was.
+
+    Example: rosrv monitor rollback 7
+    """
+    say_replaced(appliance.answer_or_exit(MonitorRollback(revision), as_json=as_json))
+
+
+@speaks
+def confirm(appliance: Appliance, as_json: Json = False) -> None:
+    """Keep specifications that were loaded with --confirm-within; exit status 1 when there is nothing to confirm.
+
+    Example: rosrv monitor confirm
+    """
+    say_confirmed(appliance.ask_or_exit(MonitorConfirm(), as_json=as_json), as_json=as_json)
+
+
+def _texts(appliance: Appliance, revision: int | None, *, as_json: bool) -> RevisionTexts:
+    if revision is None:
+        rows = appliance.ask_or_exit(MonitorRevisions(), as_json=as_json).revisions
+        revision = next((row.revision for row in rows if row.in_force), None)
+        if revision is None:
+            raise usage_error("no specifications were ever loaded")
+    return appliance.ask_or_exit(MonitorRevisionWanted(revision), as_json=as_json)
+
+
+def _named(body: RevisionTexts) -> dict[str, str]:
+    return body.files | {f"msg/{name}": text for name, text in body.definitions.items()}

@@ -1,0 +1,110 @@
+"""What the revisions of the policy and of the specifications have in common: a way back, and a time limit on it."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol, TypeVar
+
+import structlog
+
+from appliance.store.state import StateStore
+
+_log = structlog.get_logger()
+_AGAIN_SECONDS = 5.0
+
+
+class Numbered(Protocol):
+    """A revision that is kept."""
+
+    @property
+    def revision(self) -> int:
+        """Its number."""
+
+
+N = TypeVar("N", bound=Numbered)
+
+
+class UnknownRevisionError(Exception):
+    """There is no such revision; the text says which there are."""
+
+
+def wanted(rows: Sequence[N], revision: int | None, present: int) -> N:
+    """A kept revision (None: the one before the present). Raises `UnknownRevisionError`."""
+    known = {row.revision: row for row in rows}
+    number = revision if revision is not None else max((one for one in known if one < present), default=0)
+    if number not in known:
+        kept = ", ".join(map(str, sorted(known))) or "none"
+        raise UnknownRevisionError(f"there is no revision {revision or 'before this one'}; kept are: {kept}")
+    return known[number]
+
+
+class Trial:
+    """A change that goes back by itself unless it is confirmed, over restarts of control and of the appliance.
+
+    `go_back(revision)` brings that revision into force. Where it raises one of `refusals`, it is called again after
+    `_AGAIN_SECONDS`: nobody is there who could do it by hand.
+    """
+
+    def __init__(
+        self,
+        store: StateStore,
+        setting: str,
+        go_back: Callable[[int], Awaitable[object]],
+        refusals: tuple[type[Exception], ...],
+    ) -> None:
+        """`setting` is the name under which the store has it."""
+        self._store = store
+        self._setting = setting
+        self._go_back = go_back
+        self._refusals = refusals
+        self._task: asyncio.Task[None] | None = None
+        self._back_to = 0  # the last revision that needed no confirmation
+        self.confirm_by: float | None = None  # seconds since the epoch
+
+    def announce(self, present: int, within: float | None) -> None:
+        """A change comes; it is in the store before the revision is: control may die while the change is made."""
+        if within is not None:
+            self._save(self._target(present), time.time() + within)
+
+    def changed(self, before: int, within: float | None) -> None:
+        """The change is made: `before` was in force. Without `within` seconds nothing waits any more."""
+        back_to = self._target(before)
+        self.end()
+        if within is not None:
+            self._await(back_to, time.time() + within)
+
+    def end(self) -> None:
+        """What is in force stays."""
+        if self._task is not None and self._task is not asyncio.current_task():
+            self._task.cancel()
+        self._task = self.confirm_by = None
+        self._store.save_setting(self._setting, "")
+
+    def resume(self) -> None:
+        """Go on waiting after a start."""
+        kept = self._store.settings().get(self._setting, "")
+        if kept:
+            back_to, deadline = kept.split()
+            self._await(int(back_to), float(deadline))
+
+    def _target(self, present: int) -> int:
+        return present if self.confirm_by is None else self._back_to
+
+    def _save(self, back_to: int, deadline: float) -> None:
+        self._store.save_setting(self._setting, f"{back_to} {deadline}")
+
+    def _await(self, back_to: int, deadline: float) -> None:
+        self._back_to, self.confirm_by = back_to, deadline
+        self._save(back_to, deadline)
+        self._task = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
+
+    async def _run(self, back_to: int, deadline: float) -> None:
+        await asyncio.sleep(max(0.0, deadline - time.time()))
+        while True:
+            try:
+                await self._go_back(back_to)
+            except self._refusals as error:
+                _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
+                await asyncio.sleep(_AGAIN_SECONDS)
+            else:
+                return
