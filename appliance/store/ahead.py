@@ -6,7 +6,8 @@ are still in it are carried out again: each is idempotent, and their order is ke
 
 What that wins over a commit of each statement (`python -m benchmarks.state_writes`): the thread that answers everybody
 is held up for half as long by a registration (20 µs, not 45), and never by SQLite's one writer, which keeps a tree of
-parameters of 16 MiB for a third of a second.
+parameters of 16 MiB for a third of a second. Beside any tree one registration in a hundred would wait 3 to 17 ms, where
+both cores are busy; ahead of it, 0.06 ms.
 
 What this outlasts is the death of the process, not of the machine's power: as the database's own WAL without fsync.
 """
