@@ -39,10 +39,16 @@ def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> mes
 
 
 class ControlLink:
-    """Asks whichever control is there. `tokens_stated(tokens)` hears what tokens may be used from now on."""
+    """Asks whichever control is there.
 
-    def __init__(self, tokens_stated: Callable[[list[messages.TokenKept]], None]) -> None:
+    `tokens_stated(tokens)` hears what tokens may be used from now on, `lost()` that control is gone.
+    """
+
+    def __init__(
+        self, tokens_stated: Callable[[list[messages.TokenKept]], None], lost: Callable[[], None]
+    ) -> None:
         self._tokens_stated = tokens_stated
+        self._lost = lost
         self._channel: Channel | None = None
         self._open: dict[int, asyncio.Future[bytes]] = {}
         self._number = 0
@@ -50,7 +56,6 @@ class ControlLink:
         self._dropped = 0
         self._pin = ""
         self.known = False  # whether the tokens were told on this link
-        self.lost: Callable[[], None] = lambda: None
 
     @property
     def connected(self) -> bool:
@@ -153,7 +158,7 @@ class ControlLink:
             self._channel, self.known = None, False
             _log.warning("no control", reason=reason)
             self._end("the appliance is being restarted: whether the request was carried out is not known")
-            self.lost()
+            self._lost()
 
     def _end(self, reason: str) -> None:
         for waiting in self._open.values():

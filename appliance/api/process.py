@@ -46,8 +46,7 @@ class _Api:
         self._settings = settings
         self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._doorkeeper = Doorkeeper(settings.api_limits.failures_per_minute)
-        self._control = ControlLink(self._doorkeeper.state)
-        self._control.lost = self._await_control
+        self._control = ControlLink(self._doorkeeper.state, self._await_control)
         self._journal = Journal(self._control.tell)
         self._stopping = asyncio.Event()
         self._given = asyncio.Event()

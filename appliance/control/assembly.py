@@ -1,7 +1,8 @@
 """Makes the parts of RVMaster and connects them.
 
 Each is made from those before it. What changes the graph returns what follows from it, and `Enactor` carries that
-out, so that no part calls one that is made after it; but for the faces, which serve calls and are closed by some.
+out, so that hardly any part calls one that is made after it. Those that do have a lambda here: the faces serve calls,
+and what is relayed and published depends on the specifications, whose relays must be there to take them.
 """
 
 import asyncio
@@ -10,15 +11,12 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import structlog
-
 from appliance.channel import messages
 from appliance.config import Settings
 from appliance.control.doors import Doors, value_limits
 from appliance.control.lifeline import ControlLifeline
-from appliance.hosts.hosts import Hosts
 from appliance.master import rosout
-from appliance.master.calls.call import Table, served
+from appliance.master.calls.call import served
 from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
@@ -32,6 +30,7 @@ from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.table import MASTER_CALLS, master_table
 from appliance.master.graph.delivery import Delivery
+from appliance.master.graph.effects import Effects
 from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.entries import Entries
 from appliance.master.graph.grants import Grants
@@ -64,17 +63,16 @@ from appliance.ros.standard import standard_definitions
 from appliance.rpc.bulk import bulk_turns
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
-from appliance.specifications.monitors import Monitors
+from appliance.specifications.allocation import Allocation
+from appliance.specifications.monitors import ALLOCATION, Monitors
 from appliance.store.state import StateStore
 
 RVMASTER, INNER = "rvmaster", "inner"
 
-_log = structlog.get_logger()
-
 
 @dataclass(frozen=True, slots=True)
 class Foundation:
-    """What is there before the parts: settings, durable state, policy, specifications, and the listeners.
+    """What is there before the parts: settings, durable state, policy, and the listeners.
 
     `parameters_dirty` is set when the mirror of the parameters has changed.
     """
@@ -84,8 +82,6 @@ class Foundation:
     store: StateStore
     recorder: Recorder
     policies: Policies
-    monitors: Monitors
-    hosts: Hosts
     registry: Registry
     standing: HostStanding
     doors: Doors
@@ -97,220 +93,265 @@ class Foundation:
         return int(self.sockets[name].getsockname()[1])
 
 
-@dataclass(frozen=True, slots=True)
 class Parts:
-    """The parts that control itself starts, asks, restores and ends; `table` is the Master API."""
+    """The parts of RVMaster; nothing serves yet. `table` is the Master API."""
 
-    registry: Registry
-    recorder: Recorder
-    monitors: Monitors
-    places: Places
-    delivery: Delivery
-    relay: RelayControl
-    revocation: Revocation
-    grants: Grants
-    mediation: Mediation
-    graph: Graph
-    enactor: Enactor
-    rosmaster: RosMaster
-    faces: Faces
-    parameters: ParameterMirror
-    liveness: Liveness
-    reminders: Reminders
-    reconciler: Reconciler
-    publisher: OwnPublisher
-    monitor_calls: MonitorCalls
-    table: Table
-    pipeline: Pipeline
-    inner: InnerFace
+    def __init__(self, base: Foundation) -> None:
+        self._base = base
+        self._limits = value_limits(base.settings)
+        self._offload = int(base.settings.limits.offload_bytes)
+        self.registry, self.recorder = base.registry, base.recorder
+        self._make_graph()
+        self._make_reach()
+        self._make_changers()
+        self._make_monitors()
+        self._make_calls()
 
+    def _make_graph(self) -> None:
+        """What decides, and touches nothing."""
+        base, settings = self._base, self._base.settings
+        self._carried = Carried(self.recorder, self.registry, settings.relays)
+        self.grants = Grants(self._carried.used)
+        self.mediation = Mediation(
+            self._policy,
+            lambda: self.monitors.checked,
+            relay_all=settings.relaying == "all",
+            stand_ins=settings.mediation == "full",
+        )
+        self._rights = ParameterRights(self._policy, self.recorder)
+        self.graph = Graph(self.registry, self.grants, self.mediation, may_be_told=self._rights.may_be_told)
+        host_limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
+        self._gate = Gate(self._policy, self.registry, host_limits)
+        self.parameters = _make_mirror(base)
+        self.revocation = Revocation(
+            self.registry, self.grants, self.graph, self._policy, lambda: self.parameters.tree
+        )
 
-def assemble(base: Foundation) -> Parts:
-    """All parts, each made from those before it; nothing serves yet."""
-    settings, registry, recorder = base.settings, base.registry, base.recorder
-    policies, monitors, values = base.policies, base.monitors, value_limits(base.settings)
-    port, offload = base.port(RVMASTER), int(base.settings.limits.offload_bytes)
-    # What decides, and touches nothing.
-    carried = Carried(recorder, registry, settings.relays)
-    grants = Grants(carried.used)
-    mediation = Mediation(
-        lambda: policies.current,
-        lambda: monitors.checked,
-        relay_all=settings.relaying == "all",
-        stand_ins=settings.mediation == "full",
-    )
-    rights = ParameterRights(lambda: policies.current, recorder)
-    graph = Graph(registry, grants, mediation, may_be_told=rights.may_be_told)
-    host_limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
-    gate = Gate(lambda: policies.current, registry, host_limits)
-    mirror = _make_mirror(base)
-    revocation = Revocation(registry, grants, graph, lambda: policies.current, lambda: mirror.tree)
-    # What nodes, relays and ROSMaster are reached by.
-    places = Places(
-        settings.listen_address[0],
-        policies.current.ports,
-        keep=base.lifeline.keep,
-        drop=base.lifeline.drop,
-        named_as=lambda host: policies.current.named_as(host),  # noqa: PLW0108 - the one in force then
-        relays=settings.relays,
-    )
-    addresses = Addresses(
-        [(one.network, one.address) for one in settings.advertise],
-        base.lifeline.route_to if settings.isolation == "netns" else None,
-        base.sockets[RVMASTER].getsockname()[0],
-    )
-    watchlist = Watchlist()
-    delivery = Delivery(
-        timeout=settings.limits.node_call_seconds,
-        limits=values,
-        troubled=watchlist.could_not_tell,
-        standing=base.standing,
-    )
-    relay = RelayControl(
-        registry,
-        grants,
-        places,
-        delivery,
-        carried,
-        allocation=monitors.allocation,
-        policy=lambda: policies.current,
-        broken=watchlist.look_at,
-    )
-    rosmaster = RosMaster(
-        settings.rosmaster_port,
-        limits=limits_of_answers(values, int(settings.limits.parameter_bytes)),
-        small={call.name for call in MASTER_CALLS.values() if call.small},
-    )
-    faces = Faces(
-        registry,
-        places,
-        inner_port=base.port(INNER),
-        serve=lambda incarnation: pipeline.handler(node_table, target=incarnation),
-        limits=base.doors.http,
-        visitors=base.doors.visitors,
-        turns=base.doors.turns,
-        refuse=base.doors.refuse,
-        troubled=base.doors.troubled,
-    )
-    entries = Entries(rosmaster, faces.inner_uri)
-    enactor = Enactor(
-        graph,
-        entries,
-        store=base.store,
-        recorder=recorder,
-        delivery=delivery,
-        relay=relay,
-        faces=faces,
-        places=places,
-    )
-    # What acts by itself.
-    liveness = Liveness(
-        registry,
-        graph,
-        revocation,
-        enactor,
-        watchlist,
-        settings=LivenessSettings(
-            settings.liveness.interval,
-            settings.liveness.silent,
-            settings.liveness.shadow,
-            settings.limits.node_call_seconds,
-        ),
-        limits=values,
-        standing=base.standing,
-    )
-    reconciler = Reconciler(
-        rosmaster,
-        entries,
-        registry,
-        faces,
-        graph,
-        revocation,
-        enactor,
-        mirror,
-        recorder,
-        own_parameters=own_parameters,
-    )
-    reminders = Reminders(registry, relay, graph, enactor)
-    # The calls, and what they are carried out with.
-    arrivals = Arrivals(registry, graph, enactor, liveness, places=places, faces=faces, addresses=addresses)
-    registration = RegistrationCalls(
-        rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
-    )
-    lookups = LookupCalls(
-        rosmaster,
-        registry,
-        graph,
-        enactor,
-        relay,
-        mediation,
-        addresses,
-        port,
-        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
-        unseen=settings.publish_as if settings.hide_publisher else None,
-    )
-    parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
-    search = ParameterSearch(rosmaster, mirror, rights)
-    monitor_calls = MonitorCalls(monitors, registry, relay, rosmaster.port, port)
-    node_calls = NodeCalls(registry, graph, enactor, relay, mediation, addresses, liveness, gate, port)
-    node_table = served(NODE_CALLS.values(), node_calls)
-    execution = Execution(
-        gate=gate,
-        policy=lambda: policies.current,
-        recorder=recorder,
-        registry=registry,
-        enactor=enactor,
-        liveness=liveness,
-        parameters=parameters,
-        redecide_for=lambda host, name: enactor.carry_out(revocation.redecide_for(host, name)),
-        large=offload,
-        standing=base.standing,
-    )
-    pipeline = Pipeline(
-        execution,
-        Multicall(execution, parameters, recorder, offload=offload),
-        addresses=addresses,
-        recorder=recorder,
-        limits=values,
-        offload=offload,
-        bulk=bulk_turns(base.standing),
-    )
-    publisher = OwnPublisher(
-        registry,
-        graph,
-        enactor,
-        entries,
-        name=settings.publish_as,
-        inner_port=base.port(INNER),
-        wanted=lambda: _published(base),
-        register=registration.register_publisher,
-    )
-    parts = Parts(
-        registry=registry,
-        recorder=recorder,
-        monitors=monitors,
-        places=places,
-        delivery=delivery,
-        relay=relay,
-        revocation=revocation,
-        grants=grants,
-        mediation=mediation,
-        graph=graph,
-        enactor=enactor,
-        rosmaster=rosmaster,
-        faces=faces,
-        parameters=mirror,
-        liveness=liveness,
-        reminders=reminders,
-        reconciler=reconciler,
-        publisher=publisher,
-        monitor_calls=monitor_calls,
-        table=master_table(registration, lookups, parameters, search, monitor_calls),
-        pipeline=pipeline,
-        inner=InnerFace(registry),
-    )
-    _connect(base, parts, revocation)
-    return parts
+    def _make_reach(self) -> None:
+        """What nodes, relays and ROSMaster are reached by, and what carries effects out to them."""
+        base, settings, policies = self._base, self._base.settings, self._base.policies
+        self.places = Places(
+            settings.listen_address[0],
+            policies.current.ports,
+            keep=base.lifeline.keep,
+            drop=base.lifeline.drop,
+            named_as=lambda host: policies.current.named_as(host),  # noqa: PLW0108 - the one in force then
+            relays=settings.relays,
+        )
+        self._addresses = Addresses(
+            [(one.network, one.address) for one in settings.advertise],
+            base.lifeline.route_to if settings.isolation == "netns" else None,
+            base.sockets[RVMASTER].getsockname()[0],
+        )
+        self._watchlist = Watchlist()
+        self.delivery = Delivery(
+            timeout=settings.limits.node_call_seconds,
+            limits=self._limits,
+            troubled=self._watchlist.could_not_tell,
+            standing=base.standing,
+        )
+        self._allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
+        self.relay = RelayControl(
+            self.registry,
+            self.grants,
+            self.places,
+            self.delivery,
+            self._carried,
+            allocation=self._allocation,
+            policy=self._policy,
+            broken=self._watchlist.look_at,
+            own_header=rosout.header(standard_definitions()) if settings.monitors_on_rosout else None,
+        )
+        self.rosmaster = RosMaster(
+            settings.rosmaster_port,
+            limits=limits_of_answers(self._limits, int(settings.limits.parameter_bytes)),
+            small={call.name for call in MASTER_CALLS.values() if call.small},
+        )
+        self.faces = Faces(
+            self.registry,
+            self.places,
+            inner_port=base.port(INNER),
+            serve=lambda incarnation: self.pipeline.handler(self._node_table, target=incarnation),
+            limits=base.doors.http,
+            visitors=base.doors.visitors,
+            turns=base.doors.turns,
+            refuse=base.doors.refuse,
+            troubled=base.doors.troubled,
+        )
+        self.inner = InnerFace(self.registry)
+        self._entries = Entries(self.rosmaster, self.faces.inner_uri)
+        self.enactor = Enactor(
+            self.graph,
+            self._entries,
+            store=base.store,
+            recorder=self.recorder,
+            delivery=self.delivery,
+            relay=self.relay,
+            faces=self.faces,
+            places=self.places,
+        )
+
+    def _make_changers(self) -> None:
+        """What changes the graph: by itself, and because a node asks for it."""
+        settings = self._base.settings
+        self.liveness = Liveness(
+            self.registry,
+            self.graph,
+            self.revocation,
+            self.enactor,
+            self._watchlist,
+            settings=LivenessSettings(
+                settings.liveness.interval,
+                settings.liveness.silent,
+                settings.liveness.shadow,
+                settings.limits.node_call_seconds,
+            ),
+            limits=self._limits,
+            standing=self._base.standing,
+        )
+        self.reconciler = Reconciler(
+            self.rosmaster,
+            self._entries,
+            self.registry,
+            self.faces,
+            self.graph,
+            self.revocation,
+            self.enactor,
+            self.parameters,
+            self.recorder,
+            own_parameters=own_parameters,
+        )
+        self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
+        arrivals = Arrivals(
+            self.registry,
+            self.graph,
+            self.enactor,
+            self.liveness,
+            places=self.places,
+            faces=self.faces,
+            addresses=self._addresses,
+        )
+        self._registration = RegistrationCalls(
+            self.rosmaster,
+            self.registry,
+            self.graph,
+            self.enactor,
+            self.faces,
+            arrivals,
+            self.relay,
+            self.mediation,
+            self._gate,
+            self._rights,
+        )
+
+    def _make_monitors(self) -> None:
+        """The specifications, and what is published in their name."""
+        base, settings = self._base, self._base.settings
+        told = rosout.Rosout(
+            settings.publish_as,
+            self.relay.publish,
+            lambda name: self.monitors.checked.monitors.get(name, ""),
+        )
+        self.publisher = OwnPublisher(
+            self.registry,
+            self.graph,
+            self.enactor,
+            self._entries,
+            name=settings.publish_as,
+            inner_port=base.port(INNER),
+            wanted=self._published,
+            register=self._registration.register_publisher,
+        )
+        self.monitors = Monitors(
+            settings.monitors,
+            settings.enable,
+            base.store,
+            self.recorder,
+            on_fault=settings.on_fault,
+            allocation=self._allocation,
+            relays=Moving(self.relay, self.graph, self.enactor, self.reminders),
+            published=self.publisher.wake,
+            told=[told.reported] if settings.monitors_on_rosout else [],
+        )
+
+    def _make_calls(self) -> None:
+        """The calls, and what they are carried out with."""
+        base, settings, port = self._base, self._base.settings, self._base.port(RVMASTER)
+        lookups = LookupCalls(
+            self.rosmaster,
+            self.registry,
+            self.graph,
+            self.enactor,
+            self.relay,
+            self.mediation,
+            self._addresses,
+            port,
+            stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
+            unseen=settings.publish_as if settings.hide_publisher else None,
+        )
+        parameters = ParameterCalls(
+            self.rosmaster, self.parameters, self.graph, self.enactor, self._rights, self._offload
+        )
+        search = ParameterSearch(self.rosmaster, self.parameters, self._rights)
+        self.monitor_calls = MonitorCalls(self.monitors, self.registry, self.relay, self.rosmaster.port, port)
+        node_calls = NodeCalls(
+            self.registry,
+            self.graph,
+            self.enactor,
+            self.relay,
+            self.mediation,
+            self._addresses,
+            self.liveness,
+            self._gate,
+            port,
+        )
+        self.table = master_table(self._registration, lookups, parameters, search, self.monitor_calls)
+        self._node_table = served(NODE_CALLS.values(), node_calls)
+        execution = Execution(
+            gate=self._gate,
+            policy=self._policy,
+            recorder=self.recorder,
+            registry=self.registry,
+            enactor=self.enactor,
+            liveness=self.liveness,
+            parameters=parameters,
+            redecide_for=lambda host, name: self.enactor.carry_out(self.revocation.redecide_for(host, name)),
+            large=self._offload,
+            standing=base.standing,
+        )
+        self.pipeline = Pipeline(
+            execution,
+            Multicall(execution, parameters, self.recorder, offload=self._offload),
+            addresses=self._addresses,
+            recorder=self.recorder,
+            limits=self._limits,
+            offload=self._offload,
+            bulk=bulk_turns(base.standing),
+        )
+
+    def policy_changed(self, before: Policy, policy: Policy) -> int:
+        """Another policy is in force: take back what it does not allow, and say how much that was."""
+        return self._take_back(self.revocation.policy_changed(before, policy))
+
+    def expel(self, host: Address, reason: str) -> int:
+        """Take back all that a host has, and say how much that was."""
+        return self._take_back(self.revocation.expel(host, reason))
+
+    def machines(self) -> dict[str, int]:
+        """The number of nodes by address."""
+        return Counter(str(one.host) for one in self.registry.all() if one.life is Life.LIVE and not one.own)
+
+    def _take_back(self, effects: Effects) -> int:
+        self.enactor.carry_out(effects)
+        return revoked(effects)
+
+    def _policy(self) -> Policy:
+        return self._base.policies.current
+
+    def _published(self) -> dict[str, str]:
+        """The topics that the appliance's own publisher has, and their types."""
+        own = {rosout.TOPIC: rosout.TYPE} if self._base.settings.monitors_on_rosout else {}
+        return own | self.monitors.checked.publications
 
 
 def _make_mirror(base: Foundation) -> ParameterMirror:
@@ -325,45 +366,3 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
         note=base.store.note_parameter,
         since=base.store.parameter_changes(),
     )
-
-
-def _connect(base: Foundation, parts: Parts, revocation: Revocation) -> None:
-    """What policy, hosts and specifications call when they change."""
-    relay, enactor = parts.relay, parts.enactor
-    base.monitors.connect(Moving(relay, parts.graph, enactor, parts.reminders))
-    relay.statement, relay.heard, relay.lost = (
-        base.monitors.statement, base.monitors.received, base.monitors.relay_lost,
-    )  # fmt: skip
-    base.monitors.published = parts.publisher.wake
-    if base.settings.monitors_on_rosout:
-        relay.own_header = rosout.header(standard_definitions())
-        said = rosout.Rosout(
-            base.settings.publish_as, relay.publish, lambda name: base.monitors.checked.monitors.get(name, "")
-        )
-        base.monitors.records.told = said.reported
-
-    def expel(host: Address, reason: str) -> int:
-        effects = revocation.expel(host, reason)
-        enactor.carry_out(effects)
-        return revoked(effects)
-
-    in_force = base.policies.current
-
-    def policy_changed(policy: Policy) -> int:
-        nonlocal in_force
-        before, in_force = in_force, policy
-        effects = revocation.policy_changed(before, policy)
-        enactor.carry_out(effects)
-        return revoked(effects)
-
-    base.hosts.changed, base.hosts.expel = base.policies.hosts_changed, expel
-    base.hosts.ports.machines = lambda: Counter(
-        str(one.host) for one in base.registry.all() if one.life is Life.LIVE and not one.own
-    )
-    base.policies.changed = policy_changed
-
-
-def _published(base: Foundation) -> dict[str, str]:
-    """The topics that the appliance's own publisher has, and their types."""
-    own = {rosout.TOPIC: rosout.TYPE} if base.settings.monitors_on_rosout else {}
-    return own | base.monitors.checked.publications

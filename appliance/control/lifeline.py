@@ -13,39 +13,45 @@ from appliance.control.surroundings import Surroundings
 
 ROUTES_AT_ONCE = 32  # strangers make control ask, and the supervisor takes only so many questions
 
+Heard = Callable[[Any, tuple[int, ...]], None]
+"""Is given a message of the supervisor and the descriptors that came with it."""
+
 _log = structlog.get_logger()
 
 
 class ControlLifeline:
-    """The lifeline; `links[role]` is called with the other end's index and each new link, `stopped()` at the end."""
+    """The lifeline. `stopping` is set at the end, `enclosed(answer)` hears whether tunnels are open.
 
-    def __init__(self, descriptor: int) -> None:
+    What else is for other parts of control is handed to them, in order, from `hear` on.
+    """
+
+    def __init__(
+        self, descriptor: int, stopping: asyncio.Event, enclosed: Callable[[messages.TunnelsEnclosed], None]
+    ) -> None:
+        self._stopping = stopping
+        self._enclosed = enclosed
         self._channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
-        self.announced = False  # whether whoever started the appliance knows what `Ready` said
-        self.was_announced: Callable[[], None] = lambda: None
-        self.links: dict[str, Callable[[int, int], None]] = {}
-        self.stopped: Callable[[], None] = lambda: None
-        self.processes_changed: Callable[[], None] = lambda: None
-        self.reload_requested: Callable[[], None] = lambda: None
-        self.probed: Callable[[str], None] = lambda reason: None  # noqa: ARG005 - set by control
-        self.tunnels_enclosed: Callable[[messages.TunnelsEnclosed], None] = lambda answer: None  # noqa: ARG005 - as above
+        self.announced = (
+            False  # whether whoever started the appliance knew what `Ready` said before this life
+        )
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # what is asked and not answered
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
-        self._early_links: list[tuple[str, int, int]] = []
+        self._early: list[tuple[Any, tuple[int, ...]]] = []
+        self._heard: Heard = lambda *said: self._early.append(said)
 
     def attach(self) -> None:
         """Begin to listen; `restored` is set when all kept sockets are here."""
         self._channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
-    def open_links(self) -> None:
-        """Hand out the links that came before control was ready for them."""
-        early, self._early_links = self._early_links, []
-        for role, index, descriptor in early:
-            self._open_link(role, index, descriptor)
+    def hear(self, heard: Heard) -> None:
+        """Hand out what came before control was ready for it, and from now on what comes."""
+        early, self._early, self._heard = self._early, [], heard
+        for said in early:
+            heard(*said)
 
     def say(self, message: messages.Message) -> None:
         """Tell the supervisor something."""
@@ -90,53 +96,43 @@ class ControlLifeline:
 
     def _closed(self) -> None:
         _log.warning("the supervisor is gone")
-        self.stopped()
+        self._stopping.set()
 
     def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
                 self.say(messages.Pong(number))
             case messages.Stop():
-                self.stopped()
+                self._stopping.set()
             case messages.SocketRestored(name):
                 self.sockets[name] = socket.socket(fileno=descriptors[0])
             case messages.SocketsRestored(_count, announced):
                 self.announced = announced
                 self.restored.set()
-            case messages.LinkOpened(role, index):
-                self._open_link(role, index, descriptors[0])
-            case _ if not descriptors:
-                self._learned(message)
+            case messages.FirewallReported():
+                self.surroundings.firewall = message
+            case messages.TunnelsEnclosed() | messages.EndpointFound() | messages.RouteFound():
+                self._answered(message)
             case _:
-                _not_for_us(message)
+                self._note(message)
+                self._heard(message, descriptors)
 
-    def _learned(self, message: Any) -> None:
-        """What only changes what control knows of its surroundings, or asks it to do something."""
+    def _note(self, message: Any) -> None:
         match message:
             case messages.ProcessesChanged(processes):
                 self.surroundings.processes = processes
-                self.processes_changed()
-            case messages.PolicyReloadRequested():
-                self.reload_requested()
-            case messages.Announced():
-                self.announced = True
-                self.was_announced()
-            case messages.FirewallReported():
-                self.surroundings.firewall = message
             case messages.ProbeFailed(reason):
                 self.surroundings.probe = reason
-                self.probed(reason)
             case messages.ProbePassed():
                 self.surroundings.probe = "passed"
-                self.probed("")
-            case _:
-                self._answered(message)
 
-    def _answered(self, message: Any) -> None:
+    def _answered(
+        self, message: messages.TunnelsEnclosed | messages.EndpointFound | messages.RouteFound
+    ) -> None:
         """What control has asked for."""
         match message:
             case messages.TunnelsEnclosed():
-                self.tunnels_enclosed(message)
+                self._enclosed(message)
             case messages.EndpointFound():
                 waiting, self._endpoints = self._endpoints, []
                 for one in waiting:
@@ -149,16 +145,3 @@ class ControlLifeline:
                 for future in futures or ():
                     if not future.done():
                         future.set_result(address)
-            case _:
-                _not_for_us(message)
-
-    def _open_link(self, role: str, index: int, descriptor: int) -> None:
-        serve = self.links.get(role)
-        if serve is not None:
-            serve(index, descriptor)
-        else:
-            self._early_links.append((role, index, descriptor))
-
-
-def _not_for_us(message: Any) -> None:
-    _log.error("the supervisor said something that is not for control", message=type(message).__name__)

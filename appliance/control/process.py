@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import structlog
 import uvloop
@@ -25,7 +26,7 @@ from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
 from appliance.control.admin import AdminServer
 from appliance.control.administration import Administration
-from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts, assemble
+from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts
 from appliance.control.doors import Doors
 from appliance.control.forwarded import Forwarded
 from appliance.control.host_orders import HostOrders
@@ -57,9 +58,8 @@ from appliance.ros.uris import node_uri
 from appliance.rpc.server import listen
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE
-from appliance.specifications.allocation import TOPIC, Allocation
+from appliance.specifications.allocation import TOPIC
 from appliance.specifications.files import SpecificationsRefusedError
-from appliance.specifications.monitors import ALLOCATION, Monitors
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 
@@ -86,8 +86,12 @@ class _Control:
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
-        self._lifeline = ControlLifeline(lifeline_fd)
         self._stopping = asyncio.Event()
+        self._lifeline = ControlLifeline(
+            lifeline_fd,
+            self._stopping,
+            lambda answer: self._tunnels.answered(answer),  # noqa: PLW0108 - made later
+        )
         self._tasks: list[asyncio.Task[None]] = []
         self._parameters_dirty = asyncio.Event()
         self._reloading: set[asyncio.Task[None]] = set()
@@ -95,7 +99,6 @@ class _Control:
 
     async def run(self) -> None:
         """Serve from start to end; a start that fails is told to the supervisor."""
-        self._lifeline.stopped = self._stopping.set
         self._lifeline.attach()
         try:
             await self._start()
@@ -111,11 +114,13 @@ class _Control:
     async def _start(self) -> None:
         await self._lifeline.restored.wait()
         restarted = RVMASTER in self._lifeline.sockets
-        base = await self._lay_foundation(restarted)
-        self._base, self._parts = base, assemble(base)
+        self._base = base = await self._lay_foundation(restarted)
+        self._parts = Parts(base)
+        self._parts.monitors.start(restarted=restarted)
+        self._hosts = self._make_hosts()
         await _restore(base, self._parts)
         await self._serve()
-        self._connect()
+        self._lifeline.hear(self._heard)
         self._run_tasks()
         await self._parts.reconciler.ready.wait()
         token = await self._tokens.first() if self._settings.api_address is not None else None
@@ -136,24 +141,25 @@ class _Control:
             self._settings.state / "control",
             failed=lambda reason: _log.error("state is not written", reason=reason),
         )
-        hosts = await self._make_hosts(store, recorder)
+        # Before the policy, which names them: their addresses count once clear text is kept out.
+        self._table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
+        self._tunnels = Tunnels(
+            self._table,
+            recorder,
+            self._authority,
+            listen=self._settings.listen_address,
+            say=self._lifeline.say,
+        )
+        await self._tunnels.start()
         policies = Policies(
             self._settings.policy,
             store,
             recorder,
             robot=robot_addresses(self._settings),
-            hosts=lambda: hosts.addresses,
+            hosts=lambda: self._tunnels.addresses,
+            changed=lambda before, policy: self._parts.policy_changed(before, policy),  # noqa: PLW0108 - made later
         )
         policies.start(restarted=restarted)
-        monitors = Monitors(
-            self._settings.monitors,
-            self._settings.enable,
-            store,
-            recorder,
-            on_fault=self._settings.on_fault,
-            allocation=Allocation(self._settings.relays, lambda text: store.save_setting(ALLOCATION, text)),
-        )
-        monitors.start(restarted=restarted)
         registry = Registry()
         self._standing = standing = HostStanding(lambda: policies.current, registry.registrations_of)
         return Foundation(
@@ -162,8 +168,6 @@ class _Control:
             store=store,
             recorder=recorder,
             policies=policies,
-            monitors=monitors,
-            hosts=hosts,
             registry=registry,
             standing=standing,
             doors=Doors(self._settings, recorder, lambda: policies.current, standing),
@@ -175,26 +179,23 @@ class _Control:
         """What is known of a host; until the policy has been read nobody is a stranger."""
         return Standing.NAMED if self._standing is None else self._standing.of_text(host)
 
-    async def _make_hosts(self, store: StateStore, recorder: Recorder) -> Hosts:
-        """Before the policy, which names them: their addresses count once clear text is kept out."""
-        table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
-        listen = self._settings.listen_address
-        self._tunnels = Tunnels(table, recorder, self._authority, listen=listen, say=self._lifeline.say)
-        certification = Certification(
-            store,
-            recorder,
+    def _make_hosts(self) -> Hosts:
+        self._certification = Certification(
+            self._base.store,
+            self._base.recorder,
             self._authority,
-            table,
+            self._table,
             self._tunnels,
-            master_port=listen[1],
+            master_port=self._settings.listen_address[1],
             rest=rest_place(self._settings),
+            changed=self._base.policies.hosts_changed,
         )
-        self._served = certification.served_by
-        configured = self._settings.ipsec.endpoint
-        hosts = Hosts(certification, partial(find_endpoint, configured, self._lifeline.endpoint))
-        self._lifeline.tunnels_enclosed = self._tunnels.answered
-        await hosts.start()
-        return hosts
+        return Hosts(
+            self._certification,
+            partial(find_endpoint, self._settings.ipsec.endpoint, self._lifeline.endpoint),
+            expel=self._parts.expel,
+            machines=self._parts.machines,
+        )
 
     def _take_sockets(self) -> dict[str, socket.socket]:
         host, port = self._settings.listen_address
@@ -217,15 +218,14 @@ class _Control:
         await doors.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
         await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
-        self._tokens = Tokens(base.store, base.recorder)
+        self._tokens = Tokens(base.store, base.recorder, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below
         if self._lifeline.announced:
             self._tokens.told()
-        self._lifeline.was_announced = self._tokens.told
         self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
         looks = Looks(
             parts,
             base.policies,
-            base.hosts,
+            self._hosts,
             self._lifeline.surroundings,
             audit=self._audit_state,
             queued_deliveries=lambda: parts.delivery.waiting,
@@ -235,13 +235,16 @@ class _Control:
             looks,
             PolicyOrders(base.policies, base.store),
             MonitorOrders(parts),
-            HostOrders(base.hosts),
+            HostOrders(self._hosts),
             TokenOrders(self._tokens),
         )
         self._rest = RestLink(
-            administration, self._tokens, base.recorder, require_proof=self._settings.api_require_proof
+            administration,
+            self._tokens,
+            base.recorder,
+            served=self._certification.served_by,
+            require_proof=self._settings.api_require_proof,
         )
-        self._rest.served = self._served
         if _ADMIN in sockets:
             self._admin = AdminServer(administration)
             await self._admin.start(sockets[_ADMIN].dup())
@@ -256,25 +259,6 @@ class _Control:
             forwarding=self._forwarded.status(),
         )
 
-    def _connect(self) -> None:
-        """From now on the supervisor's messages and links to other processes are taken."""
-        lifeline, base = self._lifeline, self._base
-        lifeline.links["relay"] = self._relay_link
-        lifeline.links["signer"] = lambda _index, descriptor: self._signing.attach(descriptor, self._audit)
-        lifeline.links["api"] = lambda _index, descriptor: self._rest.attach(
-            Channel(socket.socket(fileno=descriptor), messages.ApiLink, limit=16 << 20, longest=8 << 20)
-        )
-        lifeline.links["charon"] = lambda _index, descriptor: self._tunnels.attach(
-            Channel(socket.socket(fileno=descriptor), messages.TunnelLink)
-        )
-        lifeline.links["syslog"] = lambda _index, descriptor: self._forwarded.attach(
-            Channel(socket.socket(fileno=descriptor), messages.ForwardingLink)
-        )
-        lifeline.probed = base.doors.probed
-        lifeline.processes_changed = self._parts.reconciler.wake
-        lifeline.reload_requested = self._reload_on_signal
-        lifeline.open_links()
-
     def _run_tasks(self) -> None:
         base, parts = self._base, self._parts
         for work in (
@@ -283,7 +267,7 @@ class _Control:
             base.doors.visitors.sweep(),
             SpareMemory().watch(),
             self._save_parameters(),
-            self._tunnels.run(),
+            self._tunnels.run(self._certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),
         ):
             self._tasks.append(asyncio.get_running_loop().create_task(work))
@@ -338,6 +322,42 @@ class _Control:
 
     # --- what the supervisor says ---
 
+    def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case messages.LinkOpened(role, index):
+                self._link(role, index, socket.socket(fileno=descriptors[0]))
+            case messages.ProcessesChanged():
+                self._parts.reconciler.wake()
+            case messages.PolicyReloadRequested():
+                self._reload_on_signal()
+            case messages.Announced():
+                self._tokens.told()
+            case messages.ProbeFailed(reason):
+                self._base.doors.probed(reason)
+            case messages.ProbePassed():
+                self._base.doors.probed("")
+            case _:
+                _log.error(
+                    "the supervisor said something that is not for control", message=type(message).__name__
+                )
+
+    def _link(self, role: str, index: int, sock: socket.socket) -> None:
+        """To another process."""
+        match role:
+            case "relay":
+                self._relay_link(index, Channel(sock, messages.RelayLink))
+            case "signer":
+                self._signing.attach(Channel(sock, messages.SignerLink), self._audit)
+            case "api":
+                self._rest.attach(Channel(sock, messages.ApiLink, limit=16 << 20, longest=8 << 20))
+            case "charon":
+                self._tunnels.attach(Channel(sock, messages.TunnelLink))
+            case "syslog":
+                self._forwarded.attach(Channel(sock, messages.ForwardingLink))
+            case _:
+                _log.error("a link leads to a process that control does not know", role=role)
+                sock.close()
+
     def _reload_on_signal(self) -> None:
         task = asyncio.get_running_loop().create_task(self._reload())
         self._reloading.add(task)  # held until it is done
@@ -355,13 +375,13 @@ class _Control:
 
     async def _reload_hosts(self) -> None:
         try:
-            await self._base.hosts.reload("disk")
+            await self._hosts.reload("disk")
         except HostRefusedError as error:
             _log.error("hosts.yaml was refused", reason=str(error))
 
-    def _relay_link(self, index: int, descriptor: int) -> None:
+    def _relay_link(self, index: int, channel: Channel) -> None:
         relay = self._parts.relay
-        relay.attach(index, Channel(socket.socket(fileno=descriptor), messages.RelayLink))
+        relay.attach(index, channel, self._parts.monitors)
         told = self._parts.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
         self._parts.enactor.carry_out(told)
         self._parts.reminders.begin()
@@ -432,4 +452,4 @@ async def _restore(base: Foundation, parts: Parts) -> None:
         claimed |= set(incarnation.ports)
     places.close_unclaimed(claimed)
     # The file was changed while the appliance was down, or control died while it carried out a change.
-    base.policies.changed(base.policies.current)
+    parts.policy_changed(base.policies.current, base.policies.current)

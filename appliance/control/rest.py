@@ -49,12 +49,21 @@ _MOST_SLOW = 16
 
 
 class RestLink:
-    """Serves whichever api is there."""
+    """Serves whichever api is there.
+
+    `served(pin)` hears by what hosts recognise it. `require_proof`: a change is made for a signed request only, not for
+    a bare token.
+    """
 
     def __init__(
-        self, administration: Administration, tokens: Tokens, recorder: Recorder, *, require_proof: bool
+        self,
+        administration: Administration,
+        tokens: Tokens,
+        recorder: Recorder,
+        *,
+        served: Callable[[str], None],
+        require_proof: bool,
     ) -> None:
-        """`require_proof`: a change is made for a signed request only, not for a bare token."""
         self._administration = administration
         self._tokens = tokens
         self._askers = Askers(tokens, require_proof=require_proof)
@@ -64,8 +73,7 @@ class RestLink:
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._slow: set[asyncio.Task[None]] = set()
         self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
-        self.served: Callable[[str], None] = lambda pin: None  # noqa: ARG005 - set by control
-        tokens.changed = self._state_tokens
+        self._served = served
 
     def attach(self, channel: Channel) -> None:
         """An api is there: serve it, and tell it the tokens."""
@@ -79,7 +87,7 @@ class RestLink:
             lambda: self._lost(channel, None),
             lambda reason: self._lost(channel, reason),
         )
-        self._state_tokens()
+        self.state_tokens()
 
     def _received(self, channel: Channel, message: object) -> None:
         if channel is not self._channel:
@@ -98,7 +106,7 @@ class RestLink:
             case messages.RestCalled():
                 self._record(message)
             case messages.RestServed(pin):
-                self.served(pin)
+                self._served(pin)
             case _:
                 channel.close()
                 self._lost(channel, f"it sent {type(message).__name__}")
@@ -174,7 +182,8 @@ class RestLink:
             count=call.count,
         )
 
-    def _state_tokens(self) -> None:
+    def state_tokens(self) -> None:
+        """Tell the api what tokens may be used."""
         self._send(messages.TokensStated(self._tokens.usable()))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:

@@ -4,7 +4,6 @@ Unsigned checkpoints are asked for again whenever a signer appears.
 """
 
 import asyncio
-import socket
 
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
@@ -35,9 +34,8 @@ class Signing:
 
         self._loop.call_soon_threadsafe(ask)
 
-    def attach(self, descriptor: int, audit: AuditLog) -> None:
+    def attach(self, channel: Channel, audit: AuditLog) -> None:
         """A signer is there."""
-        channel = Channel(socket.socket(fileno=descriptor), messages.SignerLink)
         self._channel = channel
         self._authority.attach(channel)
 

@@ -27,12 +27,12 @@ class TokenRefusedError(Exception):
 class Tokens:
     """All tokens. `changed()` is called when what may be used has changed."""
 
-    def __init__(self, store: StateStore, recorder: Recorder) -> None:
+    def __init__(self, store: StateStore, recorder: Recorder, changed: Callable[[], None]) -> None:
         self._store = store
         self._recorder = recorder
         self._rows = {row.id: row for row in store.tokens()}
         self._untold = bool(store.settings().get(_UNTOLD))
-        self.changed: Callable[[], None] = lambda: None
+        self._changed = changed
 
     def rows(self) -> list[TokenRow]:
         """Every token that was made, the oldest first."""
@@ -136,4 +136,4 @@ class Tokens:
     def _keep(self, row: TokenRow) -> None:
         self._rows[row.id] = row
         self._store.save_token(row)
-        self.changed()
+        self._changed()

@@ -32,7 +32,7 @@ _SERVED_SECONDS = 10.0
 class Certification:
     """What enrolment by an operator and by a host itself have in common.
 
-    `changed()` is called when it has changed who is enrolled.
+    `changed()` is called when it has changed who is enrolled, and says how much was taken back for that.
     """
 
     def __init__(
@@ -45,6 +45,7 @@ class Certification:
         *,
         master_port: int,
         rest: RestPlace,
+        changed: Callable[[], int],
     ) -> None:
         self.store = store
         self.recorder = recorder
@@ -53,14 +54,13 @@ class Certification:
         self.rest = rest
         self.awaited = Awaited(store.hosts)
         self.changing = asyncio.Lock()
-        self.changed: Callable[[], int] = lambda: 0
+        self.changed = changed
         self._authority = authority
         self._master_port = master_port
         self._revocations: Counter[str] = Counter()  # of each name, in this life
         self._warned: set[str] = set()  # serials
         self.pin = ""
         self._served = asyncio.Event()
-        tunnels.each_hour = self._each_hour
 
     def served_by(self, pin: str) -> None:
         """The api says by what hosts recognise it."""
@@ -184,7 +184,7 @@ class Certification:
             return False
         return True
 
-    def _each_hour(self) -> None:
+    def each_hour(self) -> None:
         """Certificates that follow ended ones count; those that end soon are recorded, once each."""
         now = time.time()
         self.table.revoked.forget_ended()

@@ -18,13 +18,15 @@ _MOST_PORTS = 100
 class CheckedPorts:
     """What was told of ports; `machines()` is the number of nodes by address."""
 
-    def __init__(self, certification: Certification, view: HostView) -> None:
+    def __init__(
+        self, certification: Certification, view: HostView, machines: Callable[[], dict[str, int]]
+    ) -> None:
         self._certification = certification
         self._table = certification.table
         self._tunnels = certification.tunnels
         self._recorder = certification.recorder
         self._view = view
-        self.machines: Callable[[], dict[str, int]] = dict
+        self._machines = machines
 
     async def tell(
         self,
@@ -62,7 +64,7 @@ class CheckedPorts:
         pool = self._table.pool
         return {
             address: nodes
-            for address, nodes in self.machines().items()
+            for address, nodes in self._machines().items()
             if not (one := ipaddress.ip_address(address)).is_loopback and one not in pool
         }
 

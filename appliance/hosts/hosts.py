@@ -2,18 +2,14 @@
 
 Invariants:
 
-1. `addresses` (what `host:NAME` means in the policy) is empty until the supervisor has said that these addresses
-   are taken through IPsec only: where clear text is not kept out, they stand for nobody.
-2. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
-3. No answer but the one to `token` has a token in it, and no answer has a private key.
+1. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
+2. No answer but the one to `token` has a token in it, and no answer has a private key.
 """
 
 import hashlib
 import ipaddress
 import ssl
 from collections.abc import Awaitable, Callable
-
-import structlog
 
 from appliance.audit.record import Severity
 from appliance.channel.answers import hosts as answers
@@ -29,18 +25,21 @@ from appliance.ipsec.enrolment import Enrolment
 from appliance.policy.model import Address
 from appliance.store.hosts import AwaitedRow
 
-_log = structlog.get_logger()
-
 
 class Hosts:
     """All hosts; `itself` is what they do themselves.
 
-    `changed()` is called when `addresses` has changed, `expel(address, reason)` takes back what a host has; both
-    say how much that was. `endpoint()` finds where hosts reach the appliance, as `appliance.hosts.endpoint` has it.
+    `expel(address, reason)` takes back what a host has, and says how much that was. `endpoint()` finds where hosts
+    reach the appliance, as `appliance.hosts.endpoint` has it; `machines()` is the number of nodes by address.
     """
 
     def __init__(
-        self, certification: Certification, endpoint: Callable[[], Awaitable[answers.Endpoint]]
+        self,
+        certification: Certification,
+        endpoint: Callable[[], Awaitable[answers.Endpoint]],
+        *,
+        expel: Callable[[Address, str], int],
+        machines: Callable[[], dict[str, int]],
     ) -> None:
         self._certification = certification
         self._store = certification.store
@@ -52,20 +51,11 @@ class Hosts:
         self.itself = SelfService(certification)
         self.revocations = certification.revocations
         self.authority = certification.authority
-        self.ports = CheckedPorts(certification, self._view)
-        self.changed: Callable[[], int] = lambda: 0
-        self.expel: Callable[[Address, str], int] = lambda address, reason: 0  # noqa: ARG005 - set by control
+        self.ports = CheckedPorts(certification, self._view, machines)
         self.endpoint = endpoint
-        certification.changed = lambda: self.changed()  # noqa: PLW0108  it is set later
+        self._expel = expel
 
     # --- what others ask ---
-
-    @property
-    def addresses(self) -> dict[str, Address]:
-        """What `host:NAME` means now."""
-        if not self._tunnels.enclosed:
-            return {}
-        return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
 
     def overview(self) -> answers.Hosts:
         """Every host and machine, and how the tunnels stand."""
@@ -85,15 +75,6 @@ class Hosts:
     def rows(self) -> list[answers.Host]:
         """Every host, enrolled, awaited or declared."""
         return self._view.rows()
-
-    async def start(self) -> None:
-        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
-        if not self._table.admitted():
-            return
-        try:
-            await self._tunnels.open()
-        except HostRefusedError as error:
-            _log.error("enrolled hosts stay outside", reason=str(error))
 
     # --- what operators do ---
 
@@ -216,8 +197,8 @@ class Hosts:
             return await self._await_no_longer(awaited, who)
         row = self._table.revoke(name)
         self._tunnels.state_anew()
-        taken = self.changed()
-        taken += self.expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
+        taken = self._certification.changed()
+        taken += self._expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
         self._recorder.happened(
             "host revoked",
             f"{name} ({row.address}) may no longer come; {taken} registrations and grants were taken back",
@@ -243,15 +224,15 @@ class Hosts:
         self._table.changed()
         taken = 0
         if before != after:
-            taken = self.changed()
+            taken = self._certification.changed()
             self._tunnels.state_anew()
         for name in sorted(before - after):
             address = ipaddress.ip_address(self._table.rows[name].address)
-            taken += self.expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
-        meant = self.addresses
-        await self.start()
-        if self.addresses != meant:  # the first tunnel of all: only now is clear text kept out
-            taken += self.changed()
+            taken += self._expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
+        meant = self._tunnels.addresses
+        await self._tunnels.start()
+        if self._tunnels.addresses != meant:  # the first tunnel of all: only now is clear text kept out
+            taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._recorder.happened(
             "hosts reloaded",

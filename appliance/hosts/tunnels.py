@@ -3,7 +3,7 @@
 Invariants:
 
 1. `open` first has the supervisor take the pool's addresses through IPsec only; before that, `enclosed` is False
-   and no address of a host counts.
+   and `addresses` is empty: where clear text is not kept out, they stand for nobody.
 2. What charon is to have is stated whole each time, in the order in which it came about.
 3. Every tunnel that comes up, moves, goes down or is refused is recorded; packets that charon dropped are counted.
 4. A certificate's end is the end of its tunnel.
@@ -11,6 +11,7 @@ Invariants:
 
 import asyncio
 import contextlib
+import ipaddress
 import time
 from collections.abc import Callable
 
@@ -22,6 +23,7 @@ from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.revocation_list import RevocationList
 from appliance.hosts.table import HostRefusedError, HostTable
+from appliance.policy.model import Address
 from appliance.recorder import Recorder
 
 _log = structlog.get_logger()
@@ -34,7 +36,7 @@ _JUST_AFTER_SECONDS = 0.1
 
 
 class Tunnels:
-    """All tunnels. `each_hour()` is called before what is to be is stated without a change."""
+    """All tunnels."""
 
     def __init__(
         self,
@@ -54,7 +56,6 @@ class Tunnels:
         self.seen: dict[str, messages.TunnelSeen] = {}
         self.last: dict[str, float] = {}
         self.charon: messages.CharonStarted | None = None
-        self.each_hour: Callable[[], None] = lambda: None
         self._enclosed: messages.TunnelsEnclosed | None = None
         self._answered = asyncio.Event()
         self._opening = asyncio.Lock()
@@ -85,6 +86,22 @@ class Tunnels:
     def obstacle(self) -> str:
         """Why no tunnels are open."""
         return self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
+
+    @property
+    def addresses(self) -> dict[str, Address]:
+        """What `host:NAME` means in the policy now."""
+        if not self.enclosed:
+            return {}
+        return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
+
+    async def start(self) -> None:
+        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
+        if not self._table.admitted():
+            return
+        try:
+            await self.open()
+        except HostRefusedError as error:
+            _log.error("enrolled hosts stay outside", reason=str(error))
 
     def answered(self, message: messages.TunnelsEnclosed) -> None:
         """The supervisor's answer to `open`."""
@@ -129,12 +146,15 @@ class Tunnels:
         self._changes += 1
         self._dirty.set()
 
-    async def run(self) -> None:
-        """State what charon is to have: when it changes, when a certificate ends, every hour (the list's age)."""
+    async def run(self, each_hour: Callable[[], None]) -> None:
+        """State what charon is to have: when it changes, when a certificate ends, every hour (the list's age).
+
+        `each_hour()` is called before that.
+        """
         while True:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._dirty.wait(), self._until_it_changes())
-            self.each_hour()
+            each_hour()
             self._dirty.clear()
             try:
                 await self._state()

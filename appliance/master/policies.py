@@ -59,10 +59,7 @@ class Loaded:
 
 
 class Policies:
-    """Keeps the policy in force. `redecide()` decides again what is live and returns how much was revoked.
-
-    Changes are made one at a time by whoever calls (`Administration` has the lock).
-    """
+    """Keeps the policy in force. Changes are made one at a time by whoever calls (`Administration` has the lock)."""
 
     def __init__(
         self,
@@ -71,19 +68,23 @@ class Policies:
         recorder: Recorder,
         *,
         robot: Collection[Address | Network],
-        hosts: Callable[[], Mapping[str, Address]] = dict,
+        hosts: Callable[[], Mapping[str, Address]],
+        changed: Callable[[Policy, Policy], int],
     ) -> None:
-        """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing."""
+        """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing.
+
+        `changed(before, policy)` decides again what is live, and says how much was revoked.
+        """
         self.file = file
         self._store = store
         self._recorder = recorder
         self._robot = robot
         self._hosts = hosts
+        self._changed = changed
         self._current: Policy | None = None
         self._trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
         self.revision = 0
         self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
-        self.changed: Callable[[Policy], int] = lambda policy: 0  # noqa: ARG005 - set by control when it is wired
 
     @property
     def current(self) -> Policy:
@@ -153,14 +154,13 @@ class Policies:
 
     def hosts_changed(self) -> int:
         """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
-        if self._current is None:
-            return 0
+        before = self.current
         try:
-            self._current = self._judged(self._current.text, self._current.file, self.known)
+            self._current = self._judged(before.text, before.file, self.known)
         except PolicyRefusedError as error:  # the same text: only a defect could make it wrong
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
-        return self.changed(self._current)
+        return self._changed(before, self._current)
 
     def rollback(self, revision: int | None, *, who: str) -> Loaded:
         """Bring a kept revision into force (None: the one before this). Raises `PolicyRefusedError`."""
@@ -270,9 +270,9 @@ class Policies:
         return revoked
 
     def _enforce(self, policy: Policy, row: RevisionRow) -> int:
-        self._current, self.in_force = policy, row
+        before, self._current, self.in_force = self._current, policy, row
         self.revision = self._recorder.revision = row.revision
-        return self.changed(policy)
+        return 0 if before is None else self._changed(before, policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
         self._trial.changed(before, confirm_within)

@@ -50,9 +50,12 @@ class Engine:
         self._limits = limits
         self._reporter = Reporter(limits)
         scratch = memoryview(bytearray(SCRATCH))
-        self._middle = Middle(loop, self._reporter)
-        self._middle.publish = lambda published: self._publish(published.topic, published.data)
-        self._middle.changed = self._monitors_changed
+        self._middle = Middle(
+            loop,
+            self._reporter,
+            publish=lambda published: self._publish(published.topic, published.data),
+            changed=self._monitors_changed,
+        )
         self._table = StatedTable()
         self._memory = Memory.of(limits, self._table.standing)
         self._context = RelayContext(loop, limits, self._reporter, self._memory, scratch, self._middle)

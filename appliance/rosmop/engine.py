@@ -38,6 +38,7 @@ from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.walking import Walker, walkers
 
 OnFault = Literal["drop", "pass"]
+Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
 """Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
@@ -56,12 +57,15 @@ def _come_home(monitor: Monitor) -> None:
 class MonitorSet:
     """Specifications in force together."""
 
-    def __init__(self, compiled: Compiled, files: Sequence[tree.File], on_fault: OnFault = "drop") -> None:
+    def __init__(
+        self, compiled: Compiled, files: Sequence[tree.File], on_fault: OnFault, patience: Patience
+    ) -> None:
         self.files = tuple(files)
         self.warnings: tuple[Finding, ...] = compiled.warnings
         self._compiled = compiled
         self._turn = compiled.turn
-        self._on_fault = on_fault
+        self._on_fault: OnFault = on_fault
+        self._patience = patience
         nodes = [node for file in files for node in file.specifications]
         self._monitors = monitors_of(compiled, nodes, 0)
         self._steps: dict[str, tuple[Step, ...]] = {}
@@ -72,15 +76,20 @@ class MonitorSet:
         self._timed = False
         self._walkers: Mapping[str, Walker] = {}
         self._broken = False
-        self.patience: Callable[[], Callable[[], bool]] = lambda: _never
-        """Asked when something is due: what says whether that has taken too long."""
         self._index()
 
     @classmethod
     def load(
-        cls, sources: Mapping[str, str], definitions: Definitions, on_fault: OnFault = "drop"
+        cls,
+        sources: Mapping[str, str],
+        definitions: Definitions,
+        on_fault: OnFault = "drop",
+        patience: Patience = lambda: _never,
     ) -> "MonitorSet":
-        """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong."""
+        """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
+
+        `patience()` is asked when something is due: what says whether that has taken too long.
+        """
         files: list[tree.File] = []
         findings: list[Finding] = []
         for name, text in sources.items():
@@ -90,7 +99,7 @@ class MonitorSet:
                 findings += error.findings
         if findings:
             raise SpecificationError([*findings, *findings_of(files, definitions)])
-        return cls(compile_files(files, definitions), files, on_fault)
+        return cls(compile_files(files, definitions), files, on_fault, patience)
 
     # What there is
 
@@ -228,7 +237,7 @@ class MonitorSet:
         another definition now. One that begins anew goes on holding its topics if it did and is still declared
         `hold`. Raises `SpecificationError`, and nothing changed.
         """
-        following = MonitorSet.load(sources, definitions, self._on_fault)
+        following = MonitorSet.load(sources, definitions, self._on_fault, self._patience)
         return following, following.succeed(self, time_ns)
 
     def succeed(self, before: "MonitorSet", time_ns: int) -> Outcome:
@@ -303,7 +312,7 @@ class MonitorSet:
         """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
-        over = self.patience()
+        over = self._patience()
         while self._due is not None and self._due <= time_ns:
             timer = self._next_timer()
             deadline = self._next_deadline()

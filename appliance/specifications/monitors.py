@@ -20,7 +20,7 @@ a change that is meant for another tag than the present one is refused.
 import asyncio
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -101,7 +101,8 @@ class Kept(Sources, frozen=True):
 class Monitors:
     """Keeps specifications and switches.
 
-    `published()` is called when monitors may publish other topics. Changes are made one at a time.
+    `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
+    reports. Changes are made one at a time.
     """
 
     def __init__(
@@ -111,16 +112,18 @@ class Monitors:
         store: StateStore,
         recorder: Recorder,
         *,
-        on_fault: Literal["drop", "pass"] = "drop",
-        allocation: Allocation | None = None,
+        on_fault: Literal["drop", "pass"],
+        allocation: Allocation,
+        relays: Relays,
+        published: Callable[[], None],
+        told: Collection[Callable[[messages.MonitorEvent], None]],
     ) -> None:
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self._enable = enable
         self._store = store
         self._recorder = recorder
-        self.allocation = allocation or Allocation(1)
-        self._stating = Stating(self.allocation, recorder, on_fault, self.enabled)
+        self._stating = Stating(allocation, recorder, on_fault, self.enabled, relays)
         self._switches: dict[str, bool] = {}
         self._acts = 0  # switches and resumptions, ever
         self._changing = asyncio.Lock()
@@ -132,8 +135,8 @@ class Monitors:
         self.sources = Sources()
         self.checked = Checked()
         self.who, self.note, self.loaded = _DISK, "", 0.0
-        self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data))  # noqa: PLW0108 - of whatever is in force then
-        self.published: Callable[[], None] = lambda: None
+        self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
+        self._published = published
 
     # --- start ---
 
@@ -170,10 +173,6 @@ class Monitors:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
         if unknown:  # it was removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
-
-    def connect(self, relays: Relays) -> None:
-        """These are the relays."""
-        self._stating.relays = relays
 
     # --- looking ---
 
@@ -475,7 +474,7 @@ class Monitors:
         self._trial.changed(before, confirm_within)
         await self._store.settled()
         await self._stating.all_taken()
-        self.published()
+        self._published()
         added, changed, removed = sources.difference(previous)
         began = self._stating.began(checked.monitors)  # by those that have it only now, too
         warnings = list(checked.warnings)

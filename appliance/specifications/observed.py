@@ -2,7 +2,7 @@
 
 import datetime
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from appliance.audit.record import Severity
@@ -26,19 +26,20 @@ class MonitorRecords:
 
     `counts` has how often each kind happened, by monitor: a change that several made, for each of them. `at` has how
     often messages of a topic were dropped or changed.
-    `told(event)` hears of every event.
+    Each of `told` hears of every event.
     """
 
     def __init__(
         self,
         recorder: Recorder,
-        fields: Callable[[str, bytes], dict[str, Any] | None] = lambda _topic, _data: None,
+        fields: Callable[[str, bytes], dict[str, Any] | None],
+        told: Collection[Callable[[MonitorEvent], None]],
     ) -> None:
         self._recorder = recorder
         self._fields = fields
         self.counts: Counter[tuple[str, str]] = Counter()
         self.at: Counter[tuple[str, str]] = Counter()
-        self.told: Callable[[MonitorEvent], None] = lambda event: None  # noqa: ARG005 - set when wired
+        self._told = told
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
         """A batch of the relay."""
@@ -48,7 +49,8 @@ class MonitorRecords:
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
-            self.told(event)
+            for tell in self._told:
+                tell(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"
             self._recorder.happened("records lost", text, severity=Severity.ALARM, lost=lost)

@@ -21,21 +21,3 @@ class Relays(Protocol):
 
     def place(self, moves: Sequence[Move]) -> None:
         """After it was adopted: these are carried where they belong now."""
-
-
-class NoRelays:
-    """Before control is assembled: there is nobody to tell."""
-
-    def send(self, message: Message, relay: int) -> bool:  # noqa: ARG002 - as `Relays`
-        """Nobody is there."""
-        return False
-
-    def carried_now(self) -> set[Resource]:
-        """Nothing is carried."""
-        return set()
-
-    def withdraw(self, moves: Sequence[Move]) -> None:
-        """Nothing is carried."""
-
-    def place(self, moves: Sequence[Move]) -> None:
-        """Nothing is carried."""

@@ -20,7 +20,7 @@ from appliance.channel import messages
 from appliance.recorder import Recorder
 from appliance.specifications.allocation import Allocation, Plan
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
-from appliance.specifications.relays import NoRelays, Relays
+from appliance.specifications.relays import Relays
 
 _RELAY_SECONDS = 15.0
 _TRIES = 5  # while nodes that are affected register and go
@@ -48,9 +48,10 @@ class Stating:
         recorder: Recorder,
         on_fault: Literal["drop", "pass"],
         enabled: Callable[[str], bool],
+        relays: Relays,
     ) -> None:
         self.allocation = allocation
-        self.relays: Relays = NoRelays()
+        self._relays = relays
         self._recorder = recorder
         self._on_fault: Literal["drop", "pass"] = on_fault
         self._enabled = enabled
@@ -105,7 +106,7 @@ class Stating:
 
     def tell(self, monitor: str, message: messages.Message) -> bool:
         """Tell the relay that has a monitor; False when it is not there."""
-        return self.relays.send(message, self.relay_of(monitor))
+        return self._relays.send(message, self.relay_of(monitor))
 
     def resumed(self, monitor: str) -> None:
         """A monitor holds its topics no longer."""
@@ -123,15 +124,15 @@ class Stating:
 
         Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
         """
-        plan = self.allocation.plan(coming.checked, self.relays.carried_now())
+        plan = self.allocation.plan(coming.checked, self._relays.carried_now())
         self._began = set()
         for _ in range(_TRIES):
             await self._try(coming, plan)
-            tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
+            tried, plan = plan, self.allocation.plan(coming.checked, self._relays.carried_now())
             if plan == tried:
                 return self._settle(coming, plan)
             for relay in plan.losing - tried.losing:
-                self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+                self._relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
         self._restate()
         raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
 
@@ -170,7 +171,7 @@ class Stating:
         answers: dict[int, asyncio.Future[list[str]]],
     ) -> None:
         """Tell a relay, and have its answer among these if it is there."""
-        if self.relays.send(statement, relay):
+        if self._relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
             self._waiting[relay, statement.statement] = answers[relay]
 
@@ -187,15 +188,15 @@ class Stating:
         Those that have it already say so again.
         """
         self._now = coming
-        self.relays.withdraw(plan.moves)
+        self._relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
         for relay in range(self.allocation.relays):
             statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
             if relay in plan.losing:
                 self._ask(relay, statement, self._answers)
             else:
-                self.relays.send(statement, relay)
-        self.relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
+                self._relays.send(statement, relay)
+        self._relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
         self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:
@@ -226,7 +227,7 @@ class Stating:
 
     def _restate(self) -> None:
         for relay in range(self.allocation.relays):
-            self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+            self._relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     def _statement(
         self,

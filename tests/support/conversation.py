@@ -146,8 +146,9 @@ class Conversation:
             allocation=Allocation(1),
             policy=lambda: parts.current,
             broken=lambda _node: None,
+            own_header=None,
         )
-        relay.attach(0, cast(Any, link))
+        relay.attach(0, cast(Any, link), cast(Any, _Monitors()))
         parts.enactor.carry_out(parts.graph.tell_everybody(lambda _topic: True))
         return [self._stated(message) for message in link.told]
 
@@ -211,6 +212,14 @@ class _Ports:
         return self._port
 
 
+class _Monitors:
+    """No specifications are in force."""
+
+    def statement(self, _relay: int) -> messages.SpecificationsStated:
+        """As `Monitors`."""
+        return messages.SpecificationsStated(0, [], {}, {}, restarted=False)
+
+
 class _Link:
     """As the channel to a relay: what it was told."""
 
@@ -222,7 +231,7 @@ class _Link:
 
     def send(self, message: messages.Message, _descriptors: tuple[int, ...] = ()) -> None:
         """As `Channel`."""
-        if not isinstance(message, messages.StateBegan | messages.StateEnded):
+        if not isinstance(message, messages.StateBegan | messages.StateEnded | messages.SpecificationsStated):
             self.told.append(message)
 
 

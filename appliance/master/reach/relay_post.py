@@ -27,9 +27,9 @@ class RelayPost:
         self,
         channel: Channel,
         received: Callable[[Any, tuple[int, ...]], None],
-        lost: Callable[["RelayPost"], None],
+        lost: Callable[[], None],
     ) -> None:
-        """Serve this link from now on; `lost(post)` is called when it ends before another takes its place."""
+        """Serve this link from now on; `lost()` is called when it ends before another takes its place."""
         before, self._channel = self._channel, channel
         if before is not None:
             before.close()
@@ -38,7 +38,7 @@ class RelayPost:
         def closed() -> None:
             if self._channel is channel:
                 self._channel = None
-                lost(self)
+                lost()
 
         channel.attach(asyncio.get_running_loop(), received, closed)
 

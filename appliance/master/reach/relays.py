@@ -23,6 +23,7 @@ from appliance.policy.limits import Part, Rate
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
+from appliance.specifications.monitors import Monitors
 from appliance.store.state import PermissionRow
 
 RELAY_NAME = "/rosrv"
@@ -31,7 +32,10 @@ _WORDS = {kind: word for word, kind in _KINDS.items()}
 
 
 class RelayControl:
-    """What control knows and wants of the relays. `broken(incarnation)` hears of lost upstreams."""
+    """What control knows and wants of the relays.
+
+    `broken(incarnation)` hears of lost upstreams, `own_header` is of what control publishes itself.
+    """
 
     def __init__(
         self,
@@ -44,6 +48,7 @@ class RelayControl:
         allocation: Allocation,
         policy: Callable[[], Policy],
         broken: Callable[[Incarnation], None],
+        own_header: messages.OwnHeaderStated | None,
     ) -> None:
         self._registry = registry
         self._grants = grants
@@ -55,10 +60,7 @@ class RelayControl:
         self._policy = policy
         self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
         self._asking: set[asyncio.Task[None]] = set()
-        self.statement: Callable[[int], messages.Message | None] = lambda relay: None  # noqa: ARG005 - set when wired
-        self.heard: Callable[[messages.Message, int], None] = lambda message, relay: None  # noqa: ARG005 - the same
-        self.lost: Callable[[int], None] = lambda relay: None  # noqa: ARG005 - the same
-        self.own_header: messages.OwnHeaderStated | None = None  # of what control publishes itself
+        self._own_header = own_header
 
     @property
     def presence(self) -> str:
@@ -88,23 +90,25 @@ class RelayControl:
 
     # --- the links ---
 
-    def attach(self, index: int, channel: Channel) -> None:
+    def attach(self, index: int, channel: Channel, monitors: Monitors) -> None:
         """A relay is there: serve its link and state everything that it is to carry."""
         post = self._posts[index]
         self.carried.lost(index)
-        post.attach(channel, lambda message, _descriptors: self._received(post, message), self._lost)
-        specifications = self.statement(index)  # before anything is placed: nothing goes past the monitors
-        if specifications is not None:
-            post.send(specifications)
-        if self.own_header is not None:
-            post.send(self.own_header)
+        post.attach(
+            channel,
+            lambda message, _descriptors: self._received(post, message, monitors),
+            lambda: self._lost(index, monitors),
+        )
+        post.send(monitors.statement(index))  # before anything is placed: nothing goes past the monitors
+        if self._own_header is not None:
+            post.send(self._own_header)
         with post.restating():
             for incarnation in self._registry.live():
                 self._place(post, incarnation)
 
-    def _lost(self, post: RelayPost) -> None:
-        self.carried.lost(post.index)
-        self.lost(post.index)
+    def _lost(self, index: int, monitors: Monitors) -> None:
+        self.carried.lost(index)
+        monitors.relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
         """Tell a relay; False when it is not there."""
@@ -242,7 +246,7 @@ class RelayControl:
 
     # --- what the relays say ---
 
-    def _received(self, post: RelayPost, message: messages.Message) -> None:
+    def _received(self, post: RelayPost, message: messages.Message, monitors: Monitors) -> None:
         match message:
             case messages.UpstreamWanted():
                 work = self._find_upstream(post, message.key, message.topic)
@@ -269,7 +273,7 @@ class RelayControl:
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:
-                self.heard(message, post.index)
+                monitors.received(message, post.index)
 
     def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
         """Messages were not kept or not passed on."""

@@ -7,6 +7,7 @@ One statement at a time, in the order they came; `done` is called by the loop. O
 import os
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -19,6 +20,7 @@ from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
 
 _SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the compiler
+_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
 
 Result = MonitorSet | list[str]
 """The monitors, or what is wrong with the specifications."""
@@ -85,11 +87,11 @@ class Compiler:
     def _compile(self, message: SpecificationsStated) -> Result:
         try:
             if not message.files:
-                return MonitorSet.load({}, Definitions({}), message.on_fault)
+                return MonitorSet.load({}, Definitions({}), message.on_fault, _patience)
             if self._standard is None:
                 self._standard = standard_definitions()
             definitions = self._standard.extended(Definitions.from_files(message.definitions))
-            monitors = MonitorSet.load(dict(message.files), definitions, message.on_fault)
+            monitors = MonitorSet.load(dict(message.files), definitions, message.on_fault, _patience)
             monitors.write_module()
             return monitors
         except SpecificationError as error:
@@ -98,3 +100,8 @@ class Compiler:
             return [str(error)]
         except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
+
+
+def _patience() -> Callable[[], bool]:
+    ends = time.thread_time() + _TICKS_SECONDS
+    return lambda: time.thread_time() > ends

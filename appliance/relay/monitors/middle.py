@@ -37,7 +37,6 @@ from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
 
 _AFTER_DEFECT = 1.0
-_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,14 @@ class Middle:
     with those whose messages may fare otherwise now (None: all).
     """
 
-    def __init__(self, loop: Loop, reporter: Reporter) -> None:
+    def __init__(
+        self,
+        loop: Loop,
+        reporter: Reporter,
+        *,
+        publish: Callable[[Published], None],
+        changed: Callable[[frozenset[str] | None], None],
+    ) -> None:
         self._loop = loop
         self._reporter = reporter
         self._offset = time.time_ns() - time.monotonic_ns()
@@ -70,9 +76,8 @@ class Middle:
         self._due: int | None = None
         self._compiler = Compiler(loop, self._compiled)
         self.observations = Observations(loop, reporter, self._rows)
-        self.publish: Callable[[Published], None] = lambda published: None  # noqa: ARG005 - set by the engine
-        self.changed: Callable[[frozenset[str] | None], None] = lambda topics: None  # noqa: ARG005 - set by the engine
-        self.telling = Telling(self.observations, lambda published: self.publish(published))  # noqa: PLW0108 - set later
+        self._changed = changed
+        self.telling = Telling(self.observations, publish)
 
     # --- what control states ---
 
@@ -101,7 +106,6 @@ class Middle:
         outcome = (
             result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
         )
-        result.patience = _patience
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
         for monitor in result.monitors:
@@ -122,7 +126,7 @@ class Middle:
             anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
         self.schedule()
-        self.changed(anew)
+        self._changed(anew)
         self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
@@ -130,7 +134,7 @@ class Middle:
         if self.monitors is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
-        self.changed(None if self.monitors is None else frozenset())
+        self._changed(None if self.monitors is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
@@ -141,7 +145,7 @@ class Middle:
             switched = self.monitors.switch({name: enabled}, self.now())
             if switched:
                 self.schedule()
-                self.changed(_topics(switched))
+                self._changed(_topics(switched))
 
     def resume(self, name: str) -> frozenset[str]:
         """Let the topics of a monitor that holds them go on; they."""
@@ -289,11 +293,6 @@ class Middle:
             return
         self.spent += time.thread_time() - began
         self.schedule()
-
-
-def _patience() -> Callable[[], bool]:
-    ends = time.thread_time() + _TICKS_SECONDS
-    return lambda: time.thread_time() > ends
 
 
 def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:

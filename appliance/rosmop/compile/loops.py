@@ -45,12 +45,10 @@ def weight(node: tree.Node) -> int:
 def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
     """`while` and `do … while`."""
     assert isinstance(node, tree.While)  # so says the table in statements.py
-    _enter(scope, node, Loop(False))
+    _enter(scope, node, Loop((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
     with scope.nested() as statements:
         charge(scope, node)
-        if node.at_end:
-            scope.loops[-1].step = lambda: _leave_unless(scope, node.condition)
-        else:
+        if not node.at_end:
             _leave_unless(scope, node.condition)
         _block(scope, [node.body], write)
         if node.at_end:
@@ -66,7 +64,7 @@ def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
         if node.start is not None:
             write(scope, node.start)
         step = tree.Evaluate(node.step.position, node.step) if node.step is not None else None
-        _enter(scope, node, Loop(False, (lambda: write(scope, step)) if step is not None else None))
+        _enter(scope, node, Loop((lambda: write(scope, step)) if step is not None else None))
         with scope.nested() as statements:
             charge(scope, node)
             if node.condition is not None:
@@ -86,7 +84,7 @@ def write_range_for(scope: Scope, node: tree.Statement, write: Write) -> None:
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
     element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
-    _enter(scope, node, Loop(False))
+    _enter(scope, node, Loop(None))
     each = None if node.type.reference and not node.type.constant else scope.temporary()
     index = "" if each is not None else _first_index(scope, node, values, kind)
     with scope.block(), scope.nested() as statements:
@@ -151,7 +149,7 @@ def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
     nothing = form.Literal(kinds.BOOL, False)
     scope.evaluate(form.Assign(kinds.BOOL, flag, nothing))
     scope.add(form.Select(site, start, number(value.form, kind), table, default))
-    _enter(scope, node, Loop(True, continued=flag))
+    _enter(scope, node, Loop(None, flag=flag))
     with scope.block() as names, scope.nested() as statements:
         for index, case in enumerate(node.cases):
             if case.statements:
@@ -166,7 +164,7 @@ def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
         scope.evaluate(form.Assign(variable.type, variable.code, form.Zero(variable.type)))
     scope.add(form.Loop(site, tuple(statements)))
     loop = scope.loops.pop()
-    if loop.step is not None:
+    if loop.continued:
         with scope.nested() as going_on:
             write_continue(scope, node.position)
         scope.add(form.If(site, form.Read(kinds.BOOL, flag), tuple(going_on), ()))
@@ -199,13 +197,12 @@ def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[tuple[
 
 def write_continue(scope: Scope, position: Position) -> None:
     """`continue`: the step of the innermost loop, then its next iteration."""
-    if not any(not loop.is_switch for loop in scope.loops):
+    if all(loop.flag is not None for loop in scope.loops):
         raise SpecificationError.at(position, "`continue` stands in a loop")
     loop = scope.loops[-1]
-    if loop.is_switch:
-        loop.step = lambda: None
-        assert loop.continued is not None  # a `switch` has it
-        scope.evaluate(form.Assign(kinds.BOOL, loop.continued, form.Literal(kinds.BOOL, True)))
+    if loop.flag is not None:
+        loop.continued = True
+        scope.evaluate(form.Assign(kinds.BOOL, loop.flag, form.Literal(kinds.BOOL, True)))
         scope.add(form.Break(scope.lines.site))
         return
     if loop.step is not None:

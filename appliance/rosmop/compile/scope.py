@@ -61,10 +61,10 @@ class Loop:
     `blocks` are the names that the step sees: those around the loop, not those around the `continue`.
     """
 
-    is_switch: bool
-    step: Callable[[], None] | None = None
+    step: Callable[[], None] | None
     blocks: list[dict[str, Variable]] = field(default_factory=list)
-    continued: str | None = None  # of a switch: the flag that tells the loop around it to continue
+    flag: str | None = None  # of a switch: tells the loop around it to continue
+    continued: bool = False  # of a switch: whether a `continue` in it sets the flag
 
 
 @dataclass(frozen=True)

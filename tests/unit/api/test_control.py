@@ -40,7 +40,7 @@ def run(play: Callable[[ControlLink, Callable[[], Control], list[TokenKept]], Aw
     async def whole() -> None:
         ends: list[Channel] = []
         tokens: list[TokenKept] = []
-        link = ControlLink(tokens.extend)
+        link = ControlLink(tokens.extend, lambda: None)
         try:
             await play(link, lambda: Control(link, ends), tokens)
         finally:

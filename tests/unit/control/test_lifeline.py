@@ -6,7 +6,17 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Lifeline, RouteFound, RouteWanted
+from appliance.channel.messages import (
+    Announced,
+    Lifeline,
+    Message,
+    PolicyReloadRequested,
+    ProbePassed,
+    RouteFound,
+    RouteWanted,
+    SocketsRestored,
+    TunnelsEnclosed,
+)
 from appliance.control.lifeline import ROUTES_AT_ONCE, ControlLifeline
 
 _LIMIT_SECONDS = 30
@@ -35,19 +45,27 @@ class Supervisor:
 
     def answer(self, host: str) -> None:
         """The way to a host."""
-        self._channel.send(RouteFound(host, f"way to {host}"))
+        self.say(RouteFound(host, f"way to {host}"))
+
+    def say(self, message: Message) -> None:
+        """Tell control something."""
+        self._channel.send(message)
 
     def close(self) -> None:
         """End it."""
         self._channel.close()
 
 
-def run(work: Callable[[ControlLifeline, Supervisor], Coroutine[Any, Any, None]]) -> None:
+def run(
+    work: Callable[[ControlLifeline, Supervisor], Coroutine[Any, Any, None]],
+    enclosed: Callable[[TunnelsEnclosed], None] = print,
+) -> None:
     """A test's work on both ends."""
 
     async def inside() -> None:
         ours, theirs = socket.socketpair()
-        lifeline, supervisor = ControlLifeline(theirs.detach()), Supervisor(ours)
+        stopping = asyncio.Event()
+        lifeline, supervisor = ControlLifeline(theirs.detach(), stopping, enclosed), Supervisor(ours)
         lifeline.attach()
         try:
             await work(lifeline, supervisor)
@@ -96,3 +114,31 @@ def test_many_strangers_are_asked_for_in_turns() -> None:
         assert hosts[-1] not in supervisor.asked
 
     run(work)
+
+
+def test_nothing_that_comes_early_is_lost() -> None:
+    """What other parts of control are to hear waits for them, in order; an answer that one waits for does not."""
+    answers: list[TunnelsEnclosed] = []
+
+    async def work(lifeline: ControlLifeline, supervisor: Supervisor) -> None:
+        for message in (Announced(), PolicyReloadRequested(), TunnelsEnclosed("kernel"), SocketsRestored(0)):
+            supervisor.say(message)
+        await lifeline.restored.wait()
+        assert answers == [TunnelsEnclosed("kernel")]
+        heard: list[Any] = []
+        more = asyncio.Event()
+
+        def hear(message: Any, descriptors: tuple[int, ...]) -> None:
+            assert not descriptors
+            heard.append(message)
+            more.set()
+
+        lifeline.hear(hear)
+        assert heard == [Announced(), PolicyReloadRequested()]
+        more.clear()
+        supervisor.say(ProbePassed())
+        await more.wait()
+        assert heard[2:] == [ProbePassed()]
+        assert lifeline.surroundings.probe == "passed"
+
+    run(work, answers.append)

@@ -44,13 +44,18 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
     registry = Registry()
     decided: list[tuple[object, list[str]]] = []
 
-    def changed(policy: object) -> int:
+    def changed(_before: object, policy: object) -> int:
         decided.append((policy, [resource.resource for _node, resource in registry.in_order()]))
         return 1
 
-    policies = SimpleNamespace(current="the new policy", changed=changed)
+    policies = SimpleNamespace(current="the new policy")
     parts = SimpleNamespace(
-        registry=registry, grants=Nothing(), enactor=Nothing(), faces=Ports(), places=Nothing()
+        registry=registry,
+        grants=Nothing(),
+        enactor=Nothing(),
+        faces=Ports(),
+        places=Nothing(),
+        policy_changed=changed,
     )
     base = SimpleNamespace(sockets={}, store=store, policies=policies)
     await _restore(cast(Any, base), cast(Any, parts))

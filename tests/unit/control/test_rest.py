@@ -41,7 +41,6 @@ class Everything:
         self.asked: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
-        self.changed: Callable[[], None] = lambda: None
         self.ends: list[Channel] = []  # closed after the play
         self.only_slow = False  # whether only others than the status wait for `go`
         self.go = asyncio.Event()
@@ -89,12 +88,14 @@ class Api:
         return await self._ear.until(count)
 
 
-def run(play: Callable[[Everything, RestLink], Awaitable[None]]) -> None:
+def run(
+    play: Callable[[Everything, RestLink], Awaitable[None]], served: Callable[[str], None] = print
+) -> None:
     """Play one conversation."""
 
     async def whole() -> None:
         world = Everything()
-        link = RestLink(world, world, world, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
+        link = RestLink(world, world, world, served=served, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
         try:
             await play(world, link)
         finally:
@@ -115,7 +116,7 @@ def test_tokens_are_told_at_once_and_after_every_change() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
         assert await api.until(1) == [messages.TokensStated([kept(VIEWER), kept(ADMIN)])]
-        world.changed()
+        link.state_tokens()
         assert len(await api.until(2)) == 2
 
     run(play)
@@ -143,9 +144,9 @@ def test_enrolments_hold_nobody_up() -> None:
 def test_what_it_is_recognised_by_is_passed_on() -> None:
     """The api says the pin of its key; anything but one ends the link."""
 
+    pins: list[str] = []
+
     async def play(world: Everything, link: RestLink) -> None:
-        pins: list[str] = []
-        link.served = pins.append
         api = Api(world, link)
         pin = "sha256//" + "A" * 43 + "="
         api.channel.send(messages.RestServed(pin))
@@ -157,7 +158,7 @@ def test_what_it_is_recognised_by_is_passed_on() -> None:
             await api.closed.wait()
         assert pins == [pin]
 
-    run(play)
+    run(play, pins.append)
 
 
 def test_answers_bear_their_numbers_in_order() -> None:
@@ -293,7 +294,7 @@ def test_an_api_that_does_not_read_loses_its_link() -> None:
         control = Channel(here, messages.ApiLink, limit=100_000)
         link.attach(control)
         for _ in range(5000):
-            world.changed()
+            link.state_tokens()
         peer = Channel(there, messages.ApiLink)
         world.ends += [control, peer]
         heard = 0

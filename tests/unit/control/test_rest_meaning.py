@@ -87,7 +87,7 @@ class Listening(ControlLink):
     """Control, as far as the api can tell: answers what only looks, notes the orders and refuses them."""
 
     def __init__(self) -> None:
-        super().__init__(lambda _tokens: None)
+        super().__init__(lambda _tokens: None, lambda: None)
         self.orders: list[messages.RequestMade] = []
 
     async def ask(

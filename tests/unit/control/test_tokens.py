@@ -28,7 +28,7 @@ class Lives:
         if self.store is not None:
             self.store.close()
         self.store = StateStore(self.home, failed=pytest.fail)
-        return Tokens(self.store, self.recorder)
+        return Tokens(self.store, self.recorder, lambda: None)
 
 
 @pytest.fixture

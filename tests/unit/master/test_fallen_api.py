@@ -35,13 +35,16 @@ class World:
         self.done: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
-        self.tokens = Tokens(self.store, self)  # type: ignore[arg-type]  # stands in for the recorder
+        self.tokens = Tokens(self.store, self, self.token_changed)  # type: ignore[arg-type]  # stands in for the recorder
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
         """A new life of control, with the tokens it kept."""
-        self.tokens = Tokens(self.store, self)  # type: ignore[arg-type]  # as above
-        self.link = RestLink(self, self.tokens, self, require_proof=require_proof)  # type: ignore[arg-type]  # as above
+        self.tokens = Tokens(self.store, self, self.token_changed)  # type: ignore[arg-type]  # as above
+        self.link = RestLink(self, self.tokens, self, served=print, require_proof=require_proof)  # type: ignore[arg-type]  # as above
+
+    def token_changed(self) -> None:
+        """Nobody is told."""
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
         """Note what would be done."""

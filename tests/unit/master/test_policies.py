@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.policies import Policies, RevisionChangedError
-from appliance.policy import judging
+from appliance.policy import Policy, judging
 from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
@@ -37,12 +37,16 @@ class Appliance:
 
     @contextlib.contextmanager
     def started(
-        self, *, restarted: bool = False, hosts: Callable[[], Mapping[str, Address]] = dict
+        self,
+        *,
+        restarted: bool = False,
+        hosts: Callable[[], Mapping[str, Address]] = dict,
+        changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
     ) -> Iterator[Policies]:
         """The policies of a control that has started; it dies at the end."""
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
-        policies = Policies(self.file, store, records, robot=(), hosts=hosts)
+        policies = Policies(self.file, store, records, robot=(), hosts=hosts, changed=changed)
         policies.start(restarted=restarted)
         try:
             yield policies
@@ -187,12 +191,11 @@ async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_i
     """Whoever may lock himself out is safe from the moment on in which the new revision is the one in force."""
     appliance = Appliance(tmp_path)
 
-    def die(_policy: object) -> int:
+    def die(_before: object, _policy: object) -> int:
         raise DiedError
 
-    with appliance.started() as policies:
+    with appliance.started(changed=die) as policies:
         appliance.file.write_text(OTHER)
-        policies.changed = die
         with pytest.raises(DiedError):
             await policies.reload(confirm_within=1.0)
     with appliance.started(restarted=True) as policies:

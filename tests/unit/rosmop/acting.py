@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.engine import MonitorSet, OnFault, Patience
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -80,10 +80,12 @@ def _value(kind: str, given: object) -> Any:
     return STORE.types[kind](**parts)
 
 
-def load(text: str, on_fault: OnFault = "drop", **others: str) -> MonitorSet:
+def load(
+    text: str, on_fault: OnFault = "drop", patience: Patience = lambda: lambda: False, **others: str
+) -> MonitorSet:
     """The monitors of a text (and of other files by name), started at time 0."""
     monitors = MonitorSet.load({"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}},
-                               definitions(), on_fault)  # fmt: skip
+                               definitions(), on_fault, patience)  # fmt: skip
     monitors.start(0)
     return monitors
 

@@ -25,7 +25,7 @@ def interpreted(compiled: Compiled) -> Compiled:
 
 def beside(monitors: MonitorSet) -> MonitorSet:
     """The set of the interpreter that belongs to one of generated code; not started."""
-    return MonitorSet(interpreted(monitors._compiled), monitors.files, monitors._on_fault)
+    return MonitorSet(interpreted(monitors._compiled), monitors.files, monitors._on_fault, monitors._patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:

@@ -390,10 +390,9 @@ def test_ticks_that_take_too_long_are_left_out_and_deadlines_wait() -> None:
     text = """a() { int n; event e() /t std_msgs/Bool '{}' { } event tick() every 1ms { n++; ROS_INFO("%d", n); } }
     b() { event x() /t std_msgs/Bool '{}' { }
         tfsm: s [ x -> s, timeout 1ms -> late ] late [ ] @timeout { ROS_WARN("late"); } }"""
-    monitors = load(text)
-    monitors.process("/t", number(0), 0)
     answers = iter([False, False, True])
-    monitors.patience = lambda: lambda: next(answers)
+    monitors = load(text, patience=lambda: lambda: next(answers))
+    monitors.process("/t", number(0), 0)
     outcomes = monitors.advance(SECOND)
     lines = [line.text for outcome in outcomes for line in outcome.log]
     assert lines == ["1", "late", "2", "998 ticks of a.tick are left out: they take too long"]

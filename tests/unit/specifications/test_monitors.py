@@ -1,7 +1,7 @@
 """The specifications in force: revisions, switches, what the relay is told and what it says."""
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.recorder import Recorder
+from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
-from appliance.specifications.relays import NoRelays
 from appliance.store.state import StateStore
 
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
@@ -43,23 +43,38 @@ class Desk:
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
         self.began: list[str] = []
+        self.away = False
 
     def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
         """A control starts."""
-        monitors = Monitors(self.folder if folder else None, enable, self.store, self.recorder)
-        monitors.connect(Taking(self, monitors))
-        monitors.start(restarted=restarted)
-        return monitors
+        relay = Taking(self)
+        relay.monitors = Monitors(
+            self.folder if folder else None,
+            enable,
+            self.store,
+            self.recorder,
+            on_fault="drop",
+            allocation=Allocation(1),
+            relays=relay,
+            published=lambda: None,
+            told=[],
+        )
+        relay.monitors.start(restarted=restarted)
+        return relay.monitors
 
 
-class Taking(NoRelays):
-    """One relay, which takes everything, or refuses it with the findings of the desk."""
+class Taking:
+    """One relay, which takes everything, or refuses it with the findings of the desk; or is away."""
 
-    def __init__(self, desk: Desk, monitors: Monitors) -> None:
-        self.desk, self.monitors = desk, monitors
+    monitors: Monitors
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
 
     def send(self, message: messages.Message, relay: int) -> bool:
         """It answers in the next turn of the loop."""
+        if self.desk.away:
+            return False
         self.desk.sent.append(message)
         if isinstance(message, messages.SpecificationsStated):
             answer: messages.Message = messages.SpecificationsTaken(
@@ -71,6 +86,16 @@ class Taking(NoRelays):
                 )
             asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
         return True
+
+    def carried_now(self) -> set[Resource]:
+        """Nothing is carried."""
+        return set()
+
+    def withdraw(self, moves: Sequence[Move]) -> None:
+        """Nothing is carried."""
+
+    def place(self, moves: Sequence[Move]) -> None:
+        """Nothing is carried."""
 
 
 pytestmark = pytest.mark.anyio
@@ -350,7 +375,7 @@ async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> N
     (desk.folder / "b.rv").write_text(B)
     monitors = desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
-    monitors.connect(NoRelays())
+    desk.away = True
     with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
         await monitors.resume(["b"], who="eve")
     assert "monitor resumed" not in [event for event, _ in desk.events]

@@ -19,7 +19,9 @@ NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", 
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     """A verdict has a category of its own, and a robot's names are not ours to choose."""
     log = AuditLog(tmp_path / "audit.db")
-    records = MonitorRecords(Recorder(log, strict=False, deny_when_failed=False))
+    records = MonitorRecords(
+        Recorder(log, strict=False, deny_when_failed=False), lambda _topic, _data: None, []
+    )
     detail = {"logic": "fsm", **{name: f"its {name}" for name in NAMES}}
     event = MonitorEvent(
         kind, "gun", "key", "/trigger", 10**18, "told", detail, host="10.0.0.7", caller_id="/joystick"

@@ -39,8 +39,8 @@ def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTa
 class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
-    def __init__(self, stating: Stating) -> None:
-        self.stating = stating
+    def __init__(self, recorder: Recorder) -> None:
+        self.stating = Stating(Allocation(2), recorder, "drop", lambda _name: True, self)
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()
@@ -94,11 +94,10 @@ class World:
             return happened(event, reason, **fields)
 
         self.recorder.happened = noted  # type: ignore[method-assign]  # listens in
-        self.stating = Stating(Allocation(2), self.recorder, "drop", lambda _name: True)
-        self.fleet = Fleet(self.stating)
+        self.fleet = Fleet(self.recorder)
+        self.stating = self.fleet.stating
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
         self.stating.start(revision(1, **self.files), restarted=False, kept="")
-        self.stating.relays = self.fleet
         self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
 
 
@@ -293,7 +292,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
     log = AuditLog(tmp_path / "other.db")
     recorder = Recorder(log, strict=False, deny_when_failed=False)
-    after = Stating(Allocation(2), recorder, "drop", lambda _name: True)
+    after = Fleet(recorder).stating
     after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
@@ -311,7 +310,7 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    after = Stating(Allocation(2), world.recorder, "drop", lambda _name: True)
+    after = Fleet(world.recorder).stating
     after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)

@@ -96,6 +96,7 @@ class World:
 
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
+        self.lost: list[int] = []
         self.registry = Registry()
         self.allocation = Allocation(2)
         self.policy = policy()
@@ -112,6 +113,7 @@ class World:
             allocation=self.allocation,
             policy=lambda: self.policy,
             broken=lambda _incarnation: None,
+            own_header=None,
         )
         self.graph = Graph(
             self.registry, self.grants, cast(Any, _UNUSED), may_be_told=lambda _node, _key, _value: True
@@ -133,7 +135,7 @@ class World:
         self.registry.add(self.node)
         self.links = [Link(), Link()]
         for index, link in enumerate(self.links):
-            self.relay.attach(index, cast(Channel, link))
+            self.relay.attach(index, cast(Channel, link), cast(Any, self))
         for kind, name, detail in (
             (Kind.PUBLICATION, "/left", "std_msgs/String"),
             (Kind.PUBLICATION, "/right", "std_msgs/String"),
@@ -141,6 +143,14 @@ class World:
         ):
             self.registry.register(self.node, kind, name, detail)
             self.relay.place(self.node, kind, name, detail)
+
+    def statement(self, _relay: int) -> messages.SpecificationsStated:
+        """As `Monitors`."""
+        return messages.SpecificationsStated(1, [], {}, {}, restarted=False)
+
+    def relay_lost(self, relay: int) -> None:
+        """As `Monitors`."""
+        self.lost.append(relay)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
         """As `Recorder`."""
@@ -181,9 +191,10 @@ async def test_each_relay_is_told_what_it_carries() -> None:
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
     assert (first.heard(), second.heard()) == ([], [grant])
     again = Link()
-    relay.attach(1, cast(Channel, again))
+    relay.attach(1, cast(Channel, again), cast(Any, world))
     assert again.heard() == [
-        messages.StateBegan(2), placed, messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
+        world.statement(1), messages.StateBegan(2), placed,
+        messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
         messages.StateEnded(2),
     ]  # fmt: skip
     relay.withdraw(node, Kind.PUBLICATION, "/left")
@@ -244,11 +255,9 @@ async def test_one_relay_goes_and_its_connections_with_it() -> None:
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
     assert len({one.number for one in relay.connections.values()}) == 2
-    lost: list[int] = []
-    relay.lost = lost.append
     second.end()
     assert [one.resource for one in relay.connections.values()] == ["/left"]
-    assert (lost, relay.presence) == ([1], "1 of 2 are away")
+    assert (world.lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"
     world.close()
@@ -300,7 +309,7 @@ async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change
     assert (first.heard(), second.heard()) == ([], [placed, grant])
     world.limits_changed(world.policy, policy(line))
     assert second.heard() == []
-    relay.attach(1, cast(Channel, second))
+    relay.attach(1, cast(Channel, second), cast(Any, world))
     told = second.heard()
     assert placed in told
     assert grant in told

@@ -35,6 +35,10 @@ def publisher() -> Iterator[socket.socket]:
         yield sock
 
 
+def _nothing(_what: object) -> None:
+    """Nobody publishes, and no monitor comes."""
+
+
 @pytest.fixture
 def presences(loop: Loop) -> Iterator[Presences]:
     """The presences of one topic."""
@@ -42,7 +46,9 @@ def presences(loop: Loop) -> Iterator[Presences]:
     reporter = Reporter(limits)
     memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
     scratch = memoryview(bytearray(64))
-    context = RelayContext(loop, limits, reporter, memory, scratch, Middle(loop, reporter))
+    context = RelayContext(
+        loop, limits, reporter, memory, scratch, Middle(loop, reporter, publish=_nothing, changed=_nothing)
+    )
     presences = Presences(context, TOPIC)
     yield presences
     presences.close()

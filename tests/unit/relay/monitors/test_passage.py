@@ -56,7 +56,12 @@ class Monitored:
         self.heard = Heard()
         self.time = 1_000_000_000
         self._loop = Loop()
-        self.middle = Middle(self._loop, self.heard)
+        self.middle = Middle(
+            self._loop,
+            self.heard,
+            publish=lambda _published: None,
+            changed=lambda _topics: None,
+        )
         self.middle.now = lambda: self.time  # type: ignore[method-assign]
         self._lanes: dict[str, Lane] = {}
         self.set = MonitorSet.load(texts, known, on_fault)
