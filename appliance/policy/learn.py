@@ -8,10 +8,12 @@ run would not get by with less:
 2. A parameter's key stands for what is below it as well (`/arm` becomes `/arm/**`), because a call on a namespace needs
    the right on everything in it. So a host that may touch a namespace may touch the narrower keys in it, too.
 
-The result is for an engineer to read: every line says which nodes used the right.
+The result is for an engineer to read: every line says which nodes used the right and how often, hosts that are named
+together on several lines are a group, and a parameter's key that says what the one above it says is left out.
 """
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -41,6 +43,7 @@ class Observation:
 class _Right:
     hosts: set[Address] = field(default_factory=set)
     nodes: set[str] = field(default_factory=set)
+    used: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +68,12 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
         requests += 1
         for request in needed:
             right = rights.setdefault((request.category, _key(request)), _Right())
+            right.used += 1
             right.hosts.add(canonical_address(request.host))
             if is_global_name(request.caller_id):
                 right.nodes.add(_without_numbers(request.caller_id))
     _hand_down(rights)
-    return Learned("".join(_text(rights, robot)), requests, left_out)
+    return Learned("".join(_text(_needful(rights), robot)), requests, left_out)
 
 
 def _needed(observation: Observation) -> Iterator[Request]:
@@ -102,28 +106,48 @@ def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
                     right.hosts |= above.hosts
 
 
+def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category, str], _Right]:
+    """Without the keys of parameters that have the same hosts as the nearest key above them."""
+    left = dict(rights)
+    for (category, key), right in rights.items():
+        levels = key.removesuffix("/**").split("/") if category in PARAMETERS else []
+        above = (
+            rights.get((category, "/".join(levels[:length]) + "/**"))
+            for length in range(len(levels) - 1, 0, -1)
+        )
+        nearest = next(filter(None, above), None)
+        if nearest is not None and nearest.hosts == right.hosts:
+            del left[category, key]
+    return left
+
+
 def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address | Network]) -> Iterator[str]:
-    yield "# Learned from what was seen to be done: read it, name the hosts in [Groups], add its tests.\n"
+    yield "# Learned from what was seen to be done: read it, give the groups their names, add its tests.\n"
+    hosts = {named: _hosts(right.hosts, robot) for named, right in rights.items()}
+    lines = Counter(others for _known, others in hosts.values())
+    shared = sorted(others for others, used in lines.items() if used > 1 and " " in others)
+    groups = {others: f"hosts-{number}" for number, others in enumerate(shared, start=1)}
+    if groups:
+        yield "\n[Groups]\n"
+        yield from (f"{name} = {others}\n" for others, name in groups.items())
     for section in DECIDERS:
         yield f"\n[{section.name}]\n"
         for category in section.categories:
-            lines = sorted(
-                ((key, right) for (one, key), right in rights.items() if one is category),
-                key=lambda line: line[0],
-            )
-            width = max((len(key) for key, _right in lines), default=0)
+            keys = sorted(key for one, key in rights if one is category)
+            width = max(map(len, keys), default=0)
             verb = f"{category.value} " if category in PARAMETERS else ""
-            for key, right in lines:
-                comment = (
-                    f"  # {_nodes(right.nodes)}" if right.nodes and category is not Category.NODE else ""
-                )
-                yield f"{verb}{key:<{width}} = {_hosts(right.hosts, robot)}{comment}\n"
+            for key in keys:
+                right, (known, others) = rights[category, key], hosts[category, key]
+                who = " ".join(filter(None, [known, groups.get(others, others)]))
+                nodes = "" if category is Category.NODE else f"{_nodes(right.nodes)} "
+                yield f"{verb}{key:<{width}} = {who}  # {nodes.lstrip()}({right.used}x)\n"
 
 
-def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> str:
+def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> tuple[str, str]:
+    """The group of the robot, if it is among them, and the addresses of the others."""
     known = {host for host in hosts if any(_within(host, one) for one in robot)}
     rest = sorted(hosts - known, key=lambda host: (host.version, int(host)))
-    return " ".join((["robot"] if known else []) + [str(host) for host in rest])
+    return "robot" if known else "", " ".join(map(str, rest))
 
 
 def _within(host: Address, place: Address | Network) -> bool:

@@ -93,6 +93,32 @@ def test_the_robot_is_called_robot() -> None:
     assert "192.0.2.10" not in learned.text
 
 
+def test_hosts_that_are_named_together_are_a_group() -> None:
+    """Where several lines have the same hosts; each line says how often it was used, and by which nodes."""
+    learned = learn([
+        seen(host, Category.PUBLISH, topic, node="/joy")
+        for host in ("10.0.0.1", "10.0.0.2") for topic in ("/a", "/b", "/a")
+    ] + [seen("10.0.0.1", Category.SUBSCRIBE, "/c", node="/joy")], [ROBOT])  # fmt: skip
+    lines = learned.text.splitlines()
+    assert lines[lines.index("[Groups]") + 1] == "hosts-1 = 10.0.0.1 10.0.0.2"
+    assert "/a = hosts-1  # /joy (4x)" in lines
+    assert "/b = hosts-1  # /joy (2x)" in lines
+    assert "/c = 10.0.0.1  # /joy (1x)" in lines
+    policy = compiled(learned)
+    assert policy.decide(Request(HOSTS[1], "/joy", Category.PUBLISH, "/b")).allowed
+    assert not policy.decide(Request(HOSTS[1], "/joy", Category.SUBSCRIBE, "/c")).allowed
+
+
+def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
+    """For the same hosts; another host's own key stays."""
+    learned = learn([
+        seen(host, Category.COMMAND, "getParam", call="getParam", key=key)
+        for host, key in (("10.0.0.1", "/arm"), ("10.0.0.1", "/arm/max"), ("10.0.0.2", "/arm/min"))
+    ])  # fmt: skip
+    keys = [line.split()[1] for line in learned.text.splitlines() if line.startswith("read ")]
+    assert keys == ["/arm/**", "/arm/min/**"]
+
+
 @pytest.mark.parametrize(
     ("category", "resource"),
     [(Category.COMMAND, "noSuchCall"), (Category.COMMAND, "registerPublisher"), (Category.PUBLISH, "no slash"),
