@@ -15,7 +15,7 @@ import typer
 from appliance.cli.up_inputs import read_inputs
 from appliance.config import Settings
 from appliance.config_sources import resolve
-from appliance.master.robot import own_address
+from appliance.control.robot import own_address
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import roles_of

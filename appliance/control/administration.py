@@ -16,6 +16,7 @@ from appliance.control.errors import UnknownThingError
 from appliance.control.host_orders import HostOrders
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
+from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
 from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import TokenRefusedError
@@ -25,7 +26,6 @@ from appliance.hosts.table import (
     HostsChangedError,
     UnknownHostError,
 )
-from appliance.master.policies import PolicyRefusedError, RevisionChangedError
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import MonitorsChangedError, UnknownMonitorError
 

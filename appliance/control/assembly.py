@@ -15,6 +15,8 @@ from appliance.channel import messages
 from appliance.config import Settings
 from appliance.control.doors import Doors, value_limits
 from appliance.control.lifeline import ControlLifeline
+from appliance.control.policies import Policies
+from appliance.control.standing import HostStanding
 from appliance.master import rosout
 from appliance.master.calls.call import served
 from appliance.master.calls.execution import Execution
@@ -24,38 +26,32 @@ from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.calls.parameter_search import ParameterSearch
-from appliance.master.calls.parameters import ParameterCalls
+from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.table import MASTER_CALLS, master_table
-from appliance.master.graph.delivery import Delivery
 from appliance.master.graph.effects import Effects
-from appliance.master.graph.enactor import Enactor
-from appliance.master.graph.entries import Entries
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness, LivenessSettings, Watchlist
-from appliance.master.graph.publisher import OwnPublisher
-from appliance.master.graph.reconcile import Reconciler
+from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Life, Registry
-from appliance.master.graph.reminders import Reminders
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.policies import Policies
-from appliance.master.reach.addresses import Addresses
-from appliance.master.reach.arrivals import Arrivals
 from appliance.master.reach.carried import Carried
-from appliance.master.reach.faces import Faces
-from appliance.master.reach.inner import InnerFace
-from appliance.master.reach.mediation import Mediation
-from appliance.master.reach.moving import Moving
-from appliance.master.reach.places import Places
+from appliance.master.reach.delivery import Delivery
+from appliance.master.reach.faces import Faces, InnerFace
+from appliance.master.reach.places import Addresses, Places
 from appliance.master.reach.relays import RelayControl
-from appliance.master.roscore import own_parameters
-from appliance.master.rosmaster import RosMaster, limits_of_answers
-from appliance.master.standing import HostStanding
+from appliance.master.rosmaster import RosMaster, limits_of_answers, own_parameters
+from appliance.master.upkeep.arrivals import Arrivals
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.entries import Entries
+from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
+from appliance.master.upkeep.moving import Moving
+from appliance.master.upkeep.publisher import OwnPublisher
+from appliance.master.upkeep.reconcile import Reconciler
+from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.recorder import Recorder

@@ -17,11 +17,11 @@ from appliance.control.assembly import Parts
 from appliance.control.measures import measures_of
 from appliance.control.monitor_orders import monitors_status
 from appliance.control.overview import graph_of
+from appliance.control.policies import Policies
 from appliance.control.surroundings import Surroundings
 from appliance.hosts.hosts import Hosts
 from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
-from appliance.master.policies import Policies
 from appliance.policy import Live
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)

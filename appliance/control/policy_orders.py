@@ -13,7 +13,7 @@ from typing import Any
 from appliance.channel import admin
 from appliance.channel.answers import policy as answers
 from appliance.control.errors import UnknownThingError
-from appliance.master.policies import Policies, RevisionChangedError
+from appliance.control.policies import Policies, RevisionChangedError
 from appliance.policy import Known
 from appliance.store.state import RevisionRow, StateStore
 

@@ -33,10 +33,13 @@ from appliance.control.host_orders import HostOrders
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
+from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
 from appliance.control.rest import RestLink
+from appliance.control.robot import own_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
+from appliance.control.standing import HostStanding
 from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
@@ -47,12 +50,9 @@ from appliance.hosts.hosts import Hosts
 from appliance.hosts.rest_place import rest_place
 from appliance.hosts.table import HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels
-from appliance.master.graph.journal import restore
 from appliance.master.graph.registry import Life, Registry
-from appliance.master.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.master.reach.places import NoPortError
-from appliance.master.robot import own_address, robot_addresses
-from appliance.master.standing import HostStanding
+from appliance.master.upkeep.enactor import restore
 from appliance.recorder import Recorder
 from appliance.ros.uris import node_uri
 from appliance.rpc.server import listen

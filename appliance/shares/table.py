@@ -94,7 +94,7 @@ PROBES = Share(
     "",
     "the node is asked when it is its host's turn",
     "none: nothing is refused",
-    ("unit/master/graph/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
+    ("unit/master/upkeep/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
 )
 NODE_CALLS_UNDER_WAY = Share(
     "calls that are being made to nodes for ROSMaster",
@@ -102,7 +102,7 @@ NODE_CALLS_UNDER_WAY = Share(
     "",
     "the node is told when it is its host's turn",
     "none: nothing is refused",
-    ("unit/master/graph/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
+    ("unit/master/reach/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
 )
 QUEUED_NODE_CALLS = Share(
     "bytes of calls that wait for nodes",
@@ -111,7 +111,7 @@ QUEUED_NODE_CALLS = Share(
     "the host that has most loses the oldest call to the node that has most of it; the node is told how things"
     " are once it answers",
     "the process log; the node is looked at",
-    ("unit/master/graph/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
+    ("unit/master/reach/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
 )
 RELAY_FRAMES = Share(
     "bytes of unfinished messages in one relay",

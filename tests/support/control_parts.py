@@ -14,15 +14,15 @@ from typing import Any, Self, cast
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.effects import Effect, NodeCall
-from appliance.master.graph.enactor import Enactor
-from appliance.master.graph.entries import Entries
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness, LivenessSettings, Watchlist
-from appliance.master.graph.reconcile import Reconciler
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.rosmaster import RosMaster
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.entries import Entries
+from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
+from appliance.master.upkeep.reconcile import Reconciler
 from appliance.policy import compile_policy
 from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri

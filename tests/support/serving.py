@@ -10,8 +10,7 @@ from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
-from appliance.master.calls.parameter_search import ParameterSearch
-from appliance.master.calls.parameters import ParameterCalls
+from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.table import master_table

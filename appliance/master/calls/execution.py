@@ -22,17 +22,15 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text
-from appliance.master.calls.claims import Claims
 from appliance.master.calls.gate import Contest, Gate, contested
 from appliance.master.calls.parameters import ParameterCalls, Write
 from appliance.master.calls.registration import given_up
-from appliance.master.calls.write_turns import WriteTurns
-from appliance.master.graph.enactor import Enactor
-from appliance.master.graph.liveness import Liveness
+from appliance.master.calls.turns import Claims, WriteTurns
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
-from appliance.master.presence import Probe
 from appliance.master.reach.places import NoPortError
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.liveness import Liveness, Probe
 from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision
 from appliance.recorder import NOT_RECORDED, Recorder

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import Attempt, Identity, Verb
+from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
-from appliance.master.presence import Presence, Probe
-from appliance.master.reach.own_node import OWN, ROSOUT
+from appliance.master.upkeep.liveness import Presence, Probe
 from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.rights import decide, rights_of_call

@@ -5,13 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
+from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.reach.addresses import Addresses
-from appliance.master.reach.mediation import Mediation
+from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
+from appliance.master.upkeep.enactor import Enactor
 from appliance.ros.uris import node_uri, service_uri
 from appliance.ros.xmlrpc import Value
 

@@ -13,7 +13,7 @@ from appliance.audit.record import Severity
 from appliance.master.calls.call import Attempt, Verb
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.parameters import ParameterCalls
-from appliance.master.calls.write_turns import touch
+from appliance.master.calls.turns import touch
 from appliance.policy.model import Category
 from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Value

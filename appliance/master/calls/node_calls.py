@@ -11,16 +11,15 @@ import os
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.arguments import MESSAGE, PROTOCOLS, TOPIC
-from appliance.master.calls.call import Call, Identity, Verb, method
+from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, Call, Identity, Verb, method
 from appliance.master.calls.gate import Gate
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness
+from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.addresses import Addresses
-from appliance.master.reach.mediation import Mediation
+from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl, tcpros_port
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.liveness import Liveness
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError

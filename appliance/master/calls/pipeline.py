@@ -14,7 +14,7 @@ from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.places import Addresses
 from appliance.policy.model import Category
 from appliance.recorder import Recorder
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError

@@ -8,7 +8,7 @@ The columns are explained at `Call`. To add a call, write its method beside its 
 from typing import Any
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.arguments import (
+from appliance.master.calls.call import (
     CALLER_API,
     KEY,
     MESSAGE,
@@ -23,12 +23,16 @@ from appliance.master.calls.arguments import (
     TOPIC,
     TOPIC_TYPE,
     VALUE,
+    Call,
+    Identity,
+    Table,
+    Verb,
+    method,
+    served,
 )
-from appliance.master.calls.call import Call, Identity, Table, Verb, method, served
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
-from appliance.master.calls.parameter_search import ParameterSearch
-from appliance.master.calls.parameters import ParameterCalls
+from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.graph.registry import Kind
 

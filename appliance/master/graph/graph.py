@@ -27,9 +27,9 @@ from appliance.master.graph.effects import (
     WithdrawNode,
 )
 from appliance.master.graph.grants import Grants
+from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.master.reach.mediation import Mediation
 from appliance.policy import Policy
 from appliance.policy.limits import Part
 from appliance.policy.model import Address, Decision

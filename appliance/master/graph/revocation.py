@@ -8,17 +8,24 @@ import ipaddress
 from collections.abc import Callable, Iterable
 
 from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack, UsePorts
-from appliance.master.graph.entries import CALLS
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph, revocation
+from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.master.reach.own_node import OWN, ROSOUT
 from appliance.policy import Policy
 from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision
 from appliance.ros.parameter_tree import Tree
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow
+
+CALLS = {
+    Kind.PUBLICATION: ("registerPublisher", "unregisterPublisher"),
+    Kind.SUBSCRIPTION: ("registerSubscriber", "unregisterSubscriber"),
+    Kind.SERVICE: ("registerService", "unregisterService"),
+    Kind.PARAMETER: ("subscribeParam", "unsubscribeParam"),
+}
+"""The calls of the Master API by which a node has something of a kind, and gives it up."""
 
 
 class Revocation:

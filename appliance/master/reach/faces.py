@@ -2,14 +2,20 @@
 
 *Inner*: one loopback listener for ROSMaster; the path of the URI is the incarnation's key. *Outer*: a port of its
 own that other nodes call. Neither reveals the node's real URI, and neither is ever another incarnation's.
+
+What ROSMaster calls at an inner face is acknowledged, and nothing follows from it. What nodes are told is made by
+`graph` when a call that was decided is carried out: lists of publishers from the registry, values of parameters from
+the call's key and value, the order to shut down from who took the name. What ROSMaster says of these is a claim, which
+needs no reading: ROSMaster joins the names in a value into keys that nobody was asked about, and its threads come late.
 """
 
 from collections.abc import Callable
 
-from appliance.master.graph.registry import Durable, Incarnation, Registry, SaveNode
+from appliance.master.graph.registry import PUBLISHER_PATH, Durable, Incarnation, Registry, SaveNode
 from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
+from appliance.ros.xmlrpc import build_fault, build_response
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
 from appliance.rpc.turns import Turns
@@ -96,3 +102,16 @@ class Faces:
 def key_of(request: HttpRequest) -> str:
     """The key in the path of a call to the inner face."""
     return request.path.strip("/")
+
+
+class InnerFace:
+    """Serves ROSMaster's calls to nodes. The path is the incarnation's key, which only ROSMaster was ever told."""
+
+    def __init__(self, registry: Registry) -> None:
+        self._registry = registry
+
+    async def handle(self, request: HttpRequest) -> bytes:
+        """Acknowledge one call of ROSMaster."""
+        if request.path != PUBLISHER_PATH and self._registry.by_key(key_of(request)) is None:
+            return build_fault(1, "nobody is here")
+        return build_response([1, "", 0])

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _restore
-from appliance.master.graph.journal import write
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
+from appliance.master.upkeep.enactor import write
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import StateStore
 from tests.support.control_parts import Nothing

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from appliance.master.batch import BatchingClient
+from appliance.master.rosmaster import BatchingClient
 from appliance.ros.errors import EncodingError
 from appliance.rpc.client import BrokenOffError, CallFailedError
 

@@ -12,13 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.arguments import CALLER_API, KEY, SERVICE_API, Parameter
-from appliance.master.calls.call import Attempt, Call, Identity, Verb
+from appliance.master.calls.call import CALLER_API, KEY, SERVICE_API, Attempt, Call, Identity, Parameter, Verb
 from appliance.master.calls.gate import Contest, Gate, HostLimits
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.graph.entries import CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
+from appliance.master.graph.revocation import CALLS
 from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.learn import Observation, learn
 from appliance.policy.live import may_keep

@@ -11,7 +11,7 @@ from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.presence import Presence, Probe
+from appliance.master.upkeep.liveness import Presence, Probe
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import Tree

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.calls.parameter_search import ParameterSearch
+from appliance.master.calls.parameters import ParameterSearch
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import standing_at

@@ -5,7 +5,7 @@ import ipaddress
 
 import pytest
 
-from appliance.master.reach.addresses import Addresses
+from appliance.master.reach.places import Addresses
 from appliance.rpc.server import Peer
 
 

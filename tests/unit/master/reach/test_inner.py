@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.master.graph.registry import PUBLISHER_PATH, Kind
-from appliance.master.reach.inner import InnerFace
+from appliance.master.reach.faces import InnerFace
 from appliance.ros.xmlrpc import FaultReceived, Value, build_call, parse_response
 from appliance.rpc.server import HttpRequest, Peer
 from tests.support.control_parts import ControlParts

@@ -5,12 +5,11 @@ import ipaddress
 import pytest
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.arguments import CALLER_API, SERVICE_API
-from appliance.master.calls.call import Attempt
+from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.table import MASTER_CALLS
+from appliance.master.graph.own_node import ROSOUT
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.reach.own_node import ROSOUT
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.uris import parse_node_uri

@@ -9,10 +9,10 @@ told to drop the publisher and to take it again.
 
 import asyncio
 
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.relays import RelayControl
+from appliance.master.upkeep.enactor import Enactor
 
 _GENTLE = 2  # reminders before the publisher is to be dropped and taken again
 _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look

@@ -4,13 +4,12 @@ import asyncio
 import time
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.liveness import Liveness
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
-from appliance.master.reach.addresses import Addresses
 from appliance.master.reach.faces import Faces
-from appliance.master.reach.places import NoPortError, Places
+from appliance.master.reach.places import Addresses, NoPortError, Places
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.liveness import Liveness
 from appliance.policy.model import Address
 
 

@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph import reminders
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.graph.reminders import Reminders
+from appliance.master.upkeep import reminders
+from appliance.master.upkeep.reminders import Reminders
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
 

@@ -17,8 +17,6 @@ from typing import cast
 
 import structlog
 
-from appliance.master.graph.enactor import Enactor
-from appliance.master.graph.entries import NAME, NO_SERVICE, Entries, stand_in
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.graph.registry import Kind, Life, Registry
@@ -26,6 +24,8 @@ from appliance.master.graph.revocation import Revocation
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.faces import Faces
 from appliance.master.rosmaster import RosMaster
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.entries import NAME, NO_SERVICE, Entries, stand_in
 from appliance.recorder import Recorder
 from appliance.ros.parameter_tree import Tree, standing_at
 from appliance.rpc.client import CallFailedError

@@ -1,4 +1,9 @@
-"""Writes of parameters that touch each other are carried out one after the other.
+"""Calls that touch each other are carried out one after the other: registrations by name, writes of parameters by key.
+
+Between the decision on a registration and ROSMaster's answer the registry does not know of it yet. Two hosts that
+register a free name at the same moment would both be told that it is free, and the later one would take it from the
+other. So the calls that make a node part of the graph wait for each other, name by name; a decision is made when it
+is the caller's turn.
 
 A write is decided by what is there: a value that stands where it needs a namespace is written, too. Between the
 decision and ROSMaster's answer another write could put such a value there, which nobody would have asked about. And
@@ -8,7 +13,9 @@ decision is made when it is the writer's turn.
 """
 
 import asyncio
-from collections.abc import Collection
+import contextlib
+from collections.abc import AsyncIterator, Collection
+from dataclasses import dataclass, field
 
 
 class WriteTurns:
@@ -77,3 +84,32 @@ def _ended(keys: Collection[str]) -> tuple[str, ...]:
 
 def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
     return any(one.startswith(others) for one in mine) or any(one.startswith(mine) for one in others)
+
+
+@dataclass(slots=True)
+class _Claim:
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    users: int = 0
+
+
+class Claims:
+    """One lock per name that is in use at the moment; nothing is kept of other names."""
+
+    def __init__(self) -> None:
+        self._claims: dict[str, _Claim] = {}
+
+    def __len__(self) -> int:
+        return len(self._claims)
+
+    @contextlib.asynccontextmanager
+    async def alone(self, name: str) -> AsyncIterator[None]:
+        """Be the only one who registers under this name, first come, first served."""
+        claim = self._claims.setdefault(name, _Claim())
+        claim.users += 1
+        try:
+            async with claim.lock:
+                yield
+        finally:
+            claim.users -= 1
+            if not claim.users:
+                del self._claims[name]

@@ -6,6 +6,7 @@ answers again gets them back, because a ROS 1 node never registers twice.
 """
 
 import asyncio
+import enum
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -13,12 +14,11 @@ from dataclasses import dataclass, field
 import structlog
 
 from appliance.master.graph.effects import NodeCall
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.graph.revocation import Revocation
-from appliance.master.presence import Presence, Probe
 from appliance.master.reach.relays import RELAY_NAME
+from appliance.master.upkeep.enactor import Enactor
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Limits
 from appliance.rpc.client import (
@@ -32,6 +32,24 @@ from appliance.rpc.client import (
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Standing
 from appliance.shares.table import PROBES
+
+
+class Presence(enum.Enum):
+    """What came of an attempt to call a node."""
+
+    GONE = "gone"  # it refuses connections, or cannot be reached
+    SILENT = "silent"  # it takes connections and does not answer
+    ANSWERS = "answers"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """The answer to a contest's question; `patience` is seconds until a silent node is unregistered."""
+
+    holder: Incarnation
+    presence: Presence
+    patience: float
+
 
 _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0

@@ -12,11 +12,11 @@ from collections.abc import Awaitable, Callable
 import structlog
 
 from appliance.master.caller import Answer, ApiUri, Caller
-from appliance.master.graph.enactor import Enactor
-from appliance.master.graph.entries import Entries
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.reach.places import NoPortError
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.entries import Entries
 from appliance.ros.uris import node_uri, parse_node_uri
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer

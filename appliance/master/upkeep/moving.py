@@ -8,10 +8,10 @@ them again, since neither client library leaves a connection for a list it knows
 from collections.abc import Sequence
 
 from appliance.channel.messages import Message
-from appliance.master.graph.enactor import Enactor
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.reminders import Reminders
 from appliance.master.reach.relays import RelayControl
+from appliance.master.upkeep.enactor import Enactor
+from appliance.master.upkeep.reminders import Reminders
 from appliance.specifications.allocation import TOPIC, Move, Resource
 
 

@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph import liveness
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
+from appliance.master.upkeep import liveness
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import RefusedError
 from tests.support.control_parts import OPEN, POLICY, ControlParts

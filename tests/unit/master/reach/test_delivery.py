@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph.delivery import Delivery
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
+from appliance.master.reach.delivery import Delivery
 from appliance.ros.xmlrpc import FaultReceived, Limits, Value
 from appliance.rpc.client import CallFailedError
 from appliance.shares.pool import Bounds, Standing

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 from appliance.master.caller import Answer
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
+from appliance.master.graph.revocation import CALLS
 from appliance.master.rosmaster import RosMaster
 from appliance.ros.uris import service_uri
 from appliance.ros.xmlrpc import Value
@@ -15,14 +16,6 @@ from appliance.rpc.client import CallFailedError
 NAME = "/master"
 NO_SERVICE = "rosrpc://nobody:1"
 """A stand-in that is nobody's."""
-
-CALLS = {
-    Kind.PUBLICATION: ("registerPublisher", "unregisterPublisher"),
-    Kind.SUBSCRIPTION: ("registerSubscriber", "unregisterSubscriber"),
-    Kind.SERVICE: ("registerService", "unregisterService"),
-    Kind.PARAMETER: ("subscribeParam", "unsubscribeParam"),
-}
-"""The calls of the Master API by which a node has something of a kind, and gives it up."""
 
 
 class Entries:

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.policies import Policies, RevisionChangedError
+from appliance.control.policies import Policies, RevisionChangedError
 from appliance.policy import Policy, judging
 from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore

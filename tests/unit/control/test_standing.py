@@ -2,7 +2,7 @@
 
 import ipaddress
 
-from appliance.master.standing import HostStanding
+from appliance.control.standing import HostStanding
 from appliance.policy import compile_policy
 from appliance.shares.pool import Standing
 
