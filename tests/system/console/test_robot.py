@@ -13,6 +13,11 @@ from tests.system.console.reader import Reader
 
 WIDE, NARROW = (1280, 800), (390, 844)
 SMALLEST_NAME = 11  # pixels on the screen
+_ALL_IN_FRAME = """() => {
+  const frame = document.querySelector(".drawing").getBoundingClientRect();
+  return [...document.querySelectorAll(".box .shape")].map((one) => one.getBoundingClientRect()).every((box) =>
+    frame.left <= box.left && box.right <= frame.right && frame.top <= box.top && box.bottom <= frame.bottom);
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -34,15 +39,10 @@ def robot(appliance: Appliance) -> Iterator[Robot]:
 @pytest.mark.parametrize("size", [WIDE, NARROW])
 def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[int, int]) -> None:
     """Ten namespaces, none cut off, none over another, every name as large as one reads."""
-    page = opened(width=size[0], height=size[1]).go("graph")
-    expect(page.locator(".box.many")).to_have_count(10)
+    page = _graph(opened(width=size[0], height=size[1]))
     expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
-    frame = page.locator(".drawing").bounding_box()
+    page.wait_for_function(_ALL_IN_FRAME)  # it is fitted once it is drawn
     boxes = [_place(one) for one in page.locator(".box .shape").all()]
-    assert frame is not None
-    for left, top, right, bottom in boxes:
-        assert frame["x"] <= left < right <= frame["x"] + frame["width"]
-        assert frame["y"] <= top < bottom <= frame["y"] + frame["height"]
     assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
     assert _smallest_name(page) >= SMALLEST_NAME
     for _step in range(6):
@@ -53,7 +53,7 @@ def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[
 @pytest.mark.usefixtures("robot")
 def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
     """The parts of /arm stand in its place, nothing over another; what stood above it has not moved."""
-    page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
+    page = _graph(opened(width=WIDE[0], height=WIDE[1]))
     group = page.locator('[data-key="gnode:/arm/*"]')
     at = _corner(group)
     before = {key: spot for key, spot in _corners(page).items() if spot[0] <= at[0] and spot[1] < at[1]}
@@ -105,6 +105,14 @@ def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> N
     expect(card).to_contain_text("200 topics, 0 services")
     status: dict[str, Any] = appliance.status()
     assert (status["nodes"], status["topics"], status["services"]) == (100, 200, 0)
+
+
+def _graph(reader: Reader) -> Page:
+    """The graph, when all of it is there: groups, and the attempt that was refused."""
+    page = reader.go("graph")
+    expect(page.locator(".box.many")).to_have_count(10)
+    expect(page.locator("g.attempt")).to_have_count(1)
+    return page
 
 
 def _corners(page: Page) -> dict[str, tuple[float, float]]:
