@@ -214,12 +214,21 @@ def test_a_relay_runs_modules_within_its_walls(place: Place) -> None:
 
 
 def test_status_shows_the_walls() -> None:
-    """`rosrv status` and REST say of each process what it is in; nothing is lacking on this kernel."""
+    """`rosrv status` and REST say of each process what it is in; nothing is lacking on this kernel.
+
+    A relay that has taken a specification has the runtime of its module, and no memory to write code into.
+    """
     need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         rows = running.processes()
         rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
+        specification = running.directory / "count.rv"
+        specification.write_text(
+            "count() { int n = 0; event said() /chatter std_msgs/String '{}' { n++; } }\n"
+        )
+        running.rosrv("monitor", "load", str(specification))
+        memory = Path(f"/proc/{rows['relay']['pid']}/maps").read_text()
     abi = landlock.version()
     for name in ("signer", "relay", "control", "api"):
         assert (rows[name]["walls"], rows[name]["lacks"]) == (f"listed calls, Landlock {abi}", [])
@@ -227,6 +236,8 @@ def test_status_shows_the_walls() -> None:
     for name in ("rosmaster", "rosout"):
         assert (rows[name]["walls"], rows[name]["lacks"]) == (f"usual calls, Landlock {abi}", [])
     assert rows["supervisor"]["walls"] == ""
+    assert "_libwasmtime.so" in memory, "the specification has become a module"
+    assert not [line for line in memory.splitlines() if "w" in line.split()[1] and "x" in line.split()[1]]
 
 
 def test_status_shows_how_the_relay_sends() -> None:
