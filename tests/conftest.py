@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -14,6 +15,10 @@ from tests.support.outside import outside
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 from tests.support.site import Site
+
+# How long an example takes says what else the machine does, and nothing of the product.
+settings.register_profile("no clock", deadline=None)
+settings.load_profile("no clock")
 
 
 @pytest.fixture

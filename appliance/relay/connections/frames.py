@@ -15,6 +15,7 @@ subscribers have been sent always ends with a frame.
 
 import mmap
 import struct
+from math import ceil
 
 from appliance.relay.connections.memory import HostShare
 from appliance.ros.errors import LimitExceededError
@@ -71,8 +72,8 @@ class Batch:
         if len(self.view) <= size or most == 1:
             return most
         if self.stride:
-            return min(most, -int(-size // self.stride))
-        return min(most, boundary_at(self.view, int(-(-size // 1)))[0] + 1)
+            return min(most, ceil(size / self.stride))
+        return min(most, boundary_at(self.view, ceil(size) - 1)[0] + 1)
 
     def head(self, count: int) -> "Batch":
         """The first frames."""

@@ -105,7 +105,6 @@ SEQUENCES = st.lists(
 @settings(
     max_examples=80,
     derandomize=True,
-    deadline=None,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

@@ -113,7 +113,7 @@ async def taken(
     return {(one.host, one.caller_id, one.what, one.resource) for one in named}, gone, count
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(POLICIES, REGISTRATIONS, GRANTS, TREES)
 def test_a_dry_run_names_exactly_what_a_reload_then_takes(
     written: dict[str, dict[str, str]],

@@ -143,7 +143,7 @@ def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     return all(one.passed for one in run_cases(policy, text, "cases"))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.frozensets(st.sampled_from(SECTIONS)),
     st.frozensets(st.sampled_from(SECTIONS), max_size=2),

@@ -112,7 +112,7 @@ WORDS = "cases: given: host: node: allow: deny: - [ ] { } , /a ::1 robot & *a &a
 PIECES = [*VERBS, *WORDS.split(), "\n  "]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=40).map(" ".join)))
 def test_any_text_gives_results_or_a_policy_error(text: str) -> None:
     """Whatever the text, there are results or a PolicyError; nothing else."""

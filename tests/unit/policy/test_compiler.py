@@ -222,7 +222,7 @@ PIECES = st.sampled_from([*WORDS.split(), " ", "\n", "\r", "\t", "\x00", "\ufeff
 TEXTS = st.one_of(st.text(), *(st.lists(PIECES, max_size=60).map(glue.join) for glue in ("", " ")))
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(TEXTS)
 @example("[Groups]\nrobot\n=")
 def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:

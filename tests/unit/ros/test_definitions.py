@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.ros.definitions import Definitions
@@ -122,7 +122,6 @@ def test_layouts_do_not_explode() -> None:
             huge.layout(name)
 
 
-@settings(deadline=None)
 @given(
     text=st.lists(
         st.sampled_from(

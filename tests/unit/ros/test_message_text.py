@@ -1,7 +1,7 @@
 """The text of definitions: what genmsg reads is read, anything else is refused with file and line."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.ros.errors import DefinitionError
@@ -116,7 +116,6 @@ def test_the_number_of_fields_is_bounded() -> None:
         parse_message("a/B", "\n".join(f"int8 f{number}" for number in range(10_001)), "B.msg")
 
 
-@settings(deadline=None)
 @given(text=st.text(st.sampled_from("int32 string[]=#/\n-abX1\t\u00e9\udce9"), max_size=60))
 def test_any_text_is_read_or_refused(text: str) -> None:
     """No text makes the parsers raise anything but DefinitionError."""

@@ -40,7 +40,7 @@ def rosmaster() -> Iterator[Oracle]:
         to_oracle.close()
 
 
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=2000)
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """Whatever is not refused resolves to what rosmaster acts on, is canonical and resolves to itself."""
@@ -53,7 +53,7 @@ def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: 
     assert names.resolve(resolved, "/other/node") == resolved
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=1000)
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """Parameter keys and namespaces that are not refused resolve as rosmaster resolves them."""
@@ -67,7 +67,7 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
         assert resolved == "/" or not resolved.endswith("/")
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """No name of the ROS grammar is refused but those that mean the global namespace."""
@@ -77,7 +77,6 @@ def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -
         assert names.resolve(name, caller_id) == resolved
 
 
-@settings(deadline=None)
 @given(text=st.text(max_size=30), caller_id=st.text(max_size=10))
 def test_any_text_resolves_or_is_refused(text: str, caller_id: str) -> None:
     """No text makes the functions for names raise anything but the error for the peer."""

@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.ros.errors import LimitExceededError, PeerError, ProtocolError
@@ -47,7 +47,6 @@ def test_the_notation_of_a_header() -> None:
     assert decode_header(b"\x08\0\0\0topic=/a\x06\0\0\0type=*") == {"topic": "/a", "type": "*"}
 
 
-@settings(deadline=None)
 @given(
     fields=st.dictionaries(NAMES, st.text(st.characters(exclude_categories=["Cs"]))), cut=st.integers(1, 40)
 )
@@ -126,7 +125,6 @@ def test_a_complete_header_takes_nothing_more() -> None:
         parser.feed(b"x")
 
 
-@settings(deadline=None)
 @given(data=st.binary(max_size=80))
 def test_random_bytes_raise_only_the_error_for_the_peer(data: bytes) -> None:
     """No bytes make a parser raise anything but PeerError."""
@@ -144,7 +142,6 @@ def test_random_bytes_raise_only_the_error_for_the_peer(data: bytes) -> None:
     assert decode_header(encode_header(fields)[4:]) == fields
 
 
-@settings(deadline=None)
 @given(bodies=st.lists(st.binary(max_size=20), max_size=6), cut=st.integers(1, 30))
 def test_frames_come_back_in_any_pieces(bodies: list[bytes], cut: int) -> None:
     """Bodies are returned whole and in order however the bytes arrive."""
@@ -154,7 +151,6 @@ def test_frames_come_back_in_any_pieces(bodies: list[bytes], cut: int) -> None:
     assert received == bodies
 
 
-@settings(deadline=None)
 @given(
     replies=st.lists(st.tuples(st.booleans(), st.text("ab\u00e9", max_size=20)), max_size=6),
     cut=st.integers(1, 30),

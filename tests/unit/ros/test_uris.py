@@ -1,7 +1,7 @@
 """URIs of nodes and services: one reading or a refusal that helps."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.ros.errors import InvalidUriError
@@ -78,7 +78,6 @@ def test_service_uris() -> None:
         parse_service_uri("http://robot:4321")
 
 
-@settings(deadline=None)
 @given(
     host=st.one_of(
         st.ip_addresses().map(str), st.from_regex(r"[a-z][a-z0-9-]{0,20}(\.[a-z]{1,5})?", fullmatch=True)
@@ -92,7 +91,6 @@ def test_what_is_written_is_read_back(host: str, port: int) -> None:
     assert parse_service_uri(service_uri(host, port)) == NodeUri("rosrpc", host, port, "")
 
 
-@settings(deadline=None)
 @given(
     text=st.text(alphabet="htp:/[]@?#1a.\\\n\u00e9 ", max_size=20),
     prefix=st.sampled_from(["", "http://", "rosrpc://"]),

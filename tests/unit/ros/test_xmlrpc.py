@@ -76,7 +76,6 @@ def without_bare_returns(value: Value) -> Value:
 # --- round trips ------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(params=st.lists(VALUES, max_size=4), method=st.from_regex(r"[A-Za-z_.]{1,20}", fullmatch=True))
 def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -> None:
     """What is written is read back the same here and by the parser that rosmaster and rospy use."""
@@ -85,7 +84,6 @@ def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -
     assert python_loads(body) == (tuple(params), method)
 
 
-@settings(deadline=None)
 @given(params=st.lists(VALUES, max_size=4))
 @example(params=[{"\r": 1}])
 def test_calls_of_python_are_read(params: list[Value]) -> None:
@@ -96,7 +94,6 @@ def test_calls_of_python_are_read(params: list[Value]) -> None:
         assert list(parse_call(body).params) == expected
 
 
-@settings(deadline=None)
 @given(value=VALUES)
 def test_answers_are_read_as_python_reads_them(value: Value) -> None:
     """An answer is read back the same here and by Python."""
@@ -105,7 +102,6 @@ def test_answers_are_read_as_python_reads_them(value: Value) -> None:
     assert python_loads(body) == ((value,), None)
 
 
-@settings(deadline=None)
 @given(code=st.integers(-(2**31), 2**31 - 1), text=XML_TEXT)
 def test_faults_come_back(code: int, text: str) -> None:
     """A fault is an error with its code and text, here and for Python."""
@@ -477,7 +473,7 @@ SCRAPS = st.one_of(
 )
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(scraps=st.lists(SCRAPS, max_size=12), whole=st.booleans(), raw=st.binary(max_size=3))
 def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool, raw: bytes) -> None:
     """No mixture of XML-RPC's own elements makes the parsers raise anything but PeerError."""
@@ -492,7 +488,7 @@ def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool
             assert whole or isinstance(result, MethodCall) or "<methodResponse>" in text
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.data())
 def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) -> None:
     """A call with bytes changed, cut or doubled is refused, or read as rosmaster would read it."""
@@ -511,7 +507,6 @@ def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) ->
     assert repr((parsed.params, parsed.method)) == repr(python_loads(bytes(body)))
 
 
-@settings(deadline=None)
 @given(data=st.binary(max_size=200))
 def test_random_bytes_are_refused(data: bytes) -> None:
     """Bytes that are no document at all are refused as the peer's fault."""

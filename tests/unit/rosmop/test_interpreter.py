@@ -22,7 +22,7 @@ from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
 MONITORS = Path(__file__).parents[3] / "monitors"
-FEW = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=40, suppress_health_check=list(HealthCheck))
 
 
 def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:

@@ -214,7 +214,7 @@ RICH = bytes(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     changes=st.lists(st.tuples(st.integers(0, len(RICH) - 1), st.integers(0, 255)), max_size=4),
     length=st.sampled_from([len(RICH)] * 9 + [len(RICH) // 2]),

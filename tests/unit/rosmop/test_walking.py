@@ -17,7 +17,7 @@ from appliance.rosmop.walking import LONG, Walker
 from tests.unit.rosmop.interpreted import beside
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
-FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=25, suppress_health_check=list(HealthCheck))
 STAMPED = struct.pack("<I3sIIdhI2dBI", 3, b"abc", 9, 8, 2.5, 1, 2, 0.5, 7.0, 1, 0)
 
 

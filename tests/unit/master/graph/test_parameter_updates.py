@@ -56,7 +56,7 @@ def in_order(told: list[Any]) -> list[str]:
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 
-@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     SUBSCRIBED,
     KEY,

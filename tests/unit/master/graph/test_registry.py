@@ -26,7 +26,7 @@ def incarnation(number: int) -> Incarnation:
     )
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(steps=st.lists(STEP, max_size=40))
 def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
     """One live incarnation a name; shadows count for nobody; the indexes are what a look at everything finds."""

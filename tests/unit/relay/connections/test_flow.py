@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import UNLIMITED, FlowLimit
@@ -39,6 +39,7 @@ def test_who_keeps_to_the_limit_loses_nothing(rate: float, jitter: float) -> Non
     assert sent(Flow(FlowLimit(messages=rate), 0.0), *((now, frames(8)) for now in times)) == 1000
 
 
+@example(rate=1.75, size=4, gaps=[(0.0, 2)])  # the bytes end where a message does
 @given(
     rate=st.floats(0.5, 500),
     size=st.integers(4, 50),

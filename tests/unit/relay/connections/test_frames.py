@@ -55,7 +55,7 @@ sizes = st.lists(
 cut_sizes = st.lists(st.integers(1, 2 * LARGE), min_size=1, max_size=20)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(sizes, cut_sizes)
 def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int], cuts: list[int]) -> None:
     """Nothing is lost, repeated or torn, and each batch says where its last frame begins."""

@@ -52,7 +52,7 @@ batches = st.lists(st.integers(0, 40), min_size=1, max_size=8)
 steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
     """Whatever is queued, sent in parts and trimmed: same bytes, same counts, and memory accounted for."""

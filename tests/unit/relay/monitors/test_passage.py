@@ -153,7 +153,7 @@ def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
     ]
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(st.integers(0, 1 << 40))
 def test_random_monitors_do_the_same_together(seed: int) -> None:
     """Whatever monitors do, a batch taken together is what its messages are one by one."""

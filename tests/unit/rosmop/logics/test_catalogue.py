@@ -114,7 +114,7 @@ WORDS = [
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-@settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(st.sampled_from(WORDS), max_size=14), tail=st.text(max_size=3))
 def test_any_text_is_compiled_or_refused(logic: str, words: list[str], tail: str) -> None:
     """Whatever the text, the answer is a property or findings inside the text; never another error."""
