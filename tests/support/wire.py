@@ -13,6 +13,7 @@ from tests.support.processes import LIMIT
 _EVERYTHING = 0x0003  # ETH_P_ALL
 _OWN = 4  # PACKET_OUTGOING
 _UDP = 17
+_UNREACHABLE = 3  # of ICMP
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,13 @@ class Frame:
             int.from_bytes(self.data[start : start + 2]),
             int.from_bytes(self.data[start + 2 : start + 4]),
         )
+
+    @property
+    def returned(self) -> "Frame | None":
+        """The packet that an ICMP error sends back the beginning of, in a frame as it came in."""
+        if self.protocol != socket.IPPROTO_ICMP or self.data[self.header] != _UNREACHABLE:
+            return None
+        return Frame(self.data[:14] + self.data[self.header + 8 :])
 
     @property
     def udp_payload(self) -> bytes:
