@@ -34,7 +34,8 @@ def wanted(rows: Sequence[N], revision: int | None, present: int) -> N:
     number = revision if revision is not None else max((one for one in known if one < present), default=0)
     if number not in known:
         kept = ", ".join(map(str, sorted(known))) or "none"
-        raise UnknownRevisionError(f"there is no revision {revision or 'before this one'}; kept are: {kept}")
+        asked = "before this one" if revision is None else revision
+        raise UnknownRevisionError(f"there is no revision {asked}; kept are: {kept}")
     return known[number]
 
 
