@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.config import Settings
 from appliance.control.doors import Doors, value_limits
@@ -54,7 +55,6 @@ from appliance.master.upkeep.reconcile import Reconciler
 from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.ros.standard import standard_definitions
 from appliance.rpc.bulk import bulk_turns
 from appliance.shares.pool import Pool
@@ -76,7 +76,7 @@ class Foundation:
     settings: Settings
     lifeline: ControlLifeline
     store: StateStore
-    recorder: Recorder
+    trail: AuditTrail
     policies: Policies
     registry: Registry
     standing: HostStanding
@@ -96,7 +96,7 @@ class Parts:
         self._base = base
         self._limits = value_limits(base.settings)
         self._offload = int(base.settings.limits.offload_bytes)
-        self.registry, self.recorder = base.registry, base.recorder
+        self.registry, self.trail = base.registry, base.trail
         self._make_graph()
         self._make_reach()
         self._make_changers()
@@ -106,7 +106,7 @@ class Parts:
     def _make_graph(self) -> None:
         """What decides, and touches nothing."""
         base, settings = self._base, self._base.settings
-        self._carried = Carried(self.recorder, self.registry, settings.relays)
+        self._carried = Carried(self.trail, self.registry, settings.relays)
         self.grants = Grants(self._carried.used)
         self.mediation = Mediation(
             self._policy,
@@ -114,7 +114,7 @@ class Parts:
             relay_all=settings.relaying == "all",
             stand_ins=settings.mediation == "full",
         )
-        self._rights = ParameterRights(self._policy, self.recorder)
+        self._rights = ParameterRights(self._policy, self.trail)
         self.graph = Graph(self.registry, self.grants, self.mediation, may_be_told=self._rights.may_be_told)
         host_limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
         self._gate = Gate(self._policy, self.registry, host_limits)
@@ -180,7 +180,7 @@ class Parts:
             self.graph,
             self._entries,
             store=base.store,
-            recorder=self.recorder,
+            trail=self.trail,
             delivery=self.delivery,
             relay=self.relay,
             faces=self.faces,
@@ -214,7 +214,7 @@ class Parts:
             self.revocation,
             self.enactor,
             self.parameters,
-            self.recorder,
+            self.trail,
             own_parameters=own_parameters,
         )
         self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
@@ -262,7 +262,7 @@ class Parts:
             settings.monitors,
             settings.enable,
             base.store,
-            self.recorder,
+            self.trail,
             on_fault=settings.on_fault,
             allocation=self._allocation,
             relays=Moving(self.relay, self.graph, self.enactor, self.reminders),
@@ -306,7 +306,7 @@ class Parts:
         execution = Execution(
             gate=self._gate,
             policy=self._policy,
-            recorder=self.recorder,
+            trail=self.trail,
             registry=self.registry,
             enactor=self.enactor,
             liveness=self.liveness,
@@ -317,9 +317,9 @@ class Parts:
         )
         self.pipeline = Pipeline(
             execution,
-            Multicall(execution, parameters, self.recorder, offload=self._offload),
+            Multicall(execution, parameters, self.trail, offload=self._offload),
             addresses=self._addresses,
-            recorder=self.recorder,
+            trail=self.trail,
             limits=self._limits,
             offload=self._offload,
             bulk=bulk_turns(base.standing),

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from functools import partial
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.config import Settings
 from appliance.master.calls.glimpse import asked_for
 from appliance.policy import Policy
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.server import Handler, HttpServer, Peer, Refusal
@@ -30,7 +30,7 @@ class Doors:
     def __init__(
         self,
         settings: Settings,
-        recorder: Recorder,
+        trail: AuditTrail,
         policy: Callable[[], Policy],
         standing: Callable[[Address], Standing],
     ) -> None:
@@ -48,11 +48,11 @@ class Doors:
             ),
         )
         self.turns = Turns(
-            RVMASTER_REQUESTS.bounds, standing, lambda host: policy().named_as(host), recorder.pause
+            RVMASTER_REQUESTS.bounds, standing, lambda host: policy().named_as(host), trail.pause
         )
         self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
-        self._recorder = recorder
+        self._trail = trail
         self._policy = policy
         self._unhidden = ""
         self._servers: list[HttpServer] = []
@@ -89,7 +89,7 @@ class Doors:
     def _refuse_stranger(self, peer: Peer, beginning: bytes) -> bytes:
         asked = asked_for(peer, beginning)
         reason = f"no rule of the policy names {peer.text}"
-        record = self._recorder.happened(
+        record = self._trail.happened(
             "decision",
             reason,
             severity=Severity.WARNING,
@@ -104,7 +104,7 @@ class Doors:
 
     def troubled(self, peer: Peer, reason: str) -> None:
         """A peer went over a limit."""
-        self._recorder.happened(
+        self._trail.happened(
             "limit exceeded", reason, severity=Severity.WARNING, decision="deny", host=peer.text
         )
 
@@ -114,7 +114,7 @@ class Doors:
             event, severity = (
                 ("probe failed", Severity.ALARM) if reason else ("probe passed", Severity.NOTICE)
             )
-            self._recorder.happened(event, reason or "the ROS Master is hidden", severity=severity)
+            self._trail.happened(event, reason or "the ROS Master is hidden", severity=severity)
         self._unhidden = reason
 
 

@@ -6,11 +6,11 @@ import msgspec
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.answers.status import ForwardingState
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
-from appliance.recorder import Recorder
 
 _log = structlog.get_logger()
 _PATIENCE_SECONDS = 10.0  # a receiver that is started again is no event
@@ -19,9 +19,9 @@ _PATIENCE_SECONDS = 10.0  # a receiver that is started again is no event
 class Forwarded:
     """The last report of the forwarder; `wanted` is what the configuration asks for."""
 
-    def __init__(self, wanted: Syslog, recorder: Recorder) -> None:
+    def __init__(self, wanted: Syslog, trail: AuditTrail) -> None:
         self._wanted = wanted
-        self._recorder = recorder
+        self._trail = trail
         self._channel: Channel | None = None
         self._report: messages.ForwardingReported | None = None
         self._failing: asyncio.TimerHandle | None = None
@@ -59,7 +59,7 @@ class Forwarded:
         self._report = report
         if before is not None and report.missed > before.missed:
             count = report.missed - before.missed
-            self._recorder.happened(
+            self._trail.happened(
                 "forwarding gap",
                 f"retention removed {count} records before {self._wanted.to} had them",
                 severity=Severity.ALARM,
@@ -73,7 +73,7 @@ class Forwarded:
             self._failing = None
             if self._failure_recorded:
                 self._failure_recorded = False
-                self._recorder.happened(
+                self._trail.happened(
                     "forwarding resumed",
                     f"{self._wanted.to} has the log again",
                     severity=Severity.NOTICE,
@@ -83,7 +83,7 @@ class Forwarded:
     def _still_failing(self) -> None:
         assert self._report is not None  # noqa: S101  a report began this
         self._failure_recorded = True
-        self._recorder.happened(
+        self._trail.happened(
             "forwarding failed",
             f"{self._wanted.to}: {self._report.trouble}",
             severity=Severity.WARNING,

@@ -31,7 +31,7 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
     lives = Counter(one.life for one in parts.registry.all() if not one.own)
     kinds = Counter(one.kind.value for node, one in parts.registry.in_order() if not node.own)
     records = parts.monitors.records
-    meter, carried = parts.recorder.meter, parts.relay.carried
+    meter, carried = parts.trail.meter, parts.relay.carried
     relayed, delayed = carried_of(carried)
     done = from_zero(records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS))
     return Measures(

@@ -13,10 +13,10 @@ from pathlib import Path
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import RevisionRow, StateStore
 
@@ -65,7 +65,7 @@ class Policies:
         self,
         file: Path,
         store: StateStore,
-        recorder: Recorder,
+        trail: AuditTrail,
         *,
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
@@ -77,7 +77,7 @@ class Policies:
         """
         self.file = file
         self._store = store
-        self._recorder = recorder
+        self._trail = trail
         self._robot = robot
         self._hosts = hosts
         self._changed = changed
@@ -178,7 +178,7 @@ class Policies:
         if self.confirm_by is None:
             return False
         self._trial.end()
-        self._recorder.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
+        self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
         return True
 
     def revisions(self) -> list[RevisionRow]:
@@ -227,7 +227,7 @@ class Policies:
         return policy
 
     def _refused(self, error: PolicyRefusedError, who: str) -> None:
-        self._recorder.happened(
+        self._trail.happened(
             "policy refused",
             f"revision {self.revision} stays in force: {error.findings[0]}",
             severity=Severity.WARNING,
@@ -258,7 +258,7 @@ class Policies:
         row = RevisionRow(number, policy.text, policy.file, time.time(), who, note)
         self._store.save_revision(row)
         revoked = self._enforce(policy, row)
-        self._recorder.happened(
+        self._trail.happened(
             "policy loaded",
             f"revision {number} is in force: {note}",
             severity=Severity.NOTICE,
@@ -271,7 +271,7 @@ class Policies:
 
     def _enforce(self, policy: Policy, row: RevisionRow) -> int:
         before, self._current, self.in_force = self._current, policy, row
-        self.revision = self._recorder.revision = row.revision
+        self.revision = self._trail.revision = row.revision
         return 0 if before is None else self._changed(before, policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:

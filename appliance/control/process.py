@@ -20,6 +20,7 @@ from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.answers.status import AuditState
 from appliance.channel.channel import Channel
@@ -53,7 +54,6 @@ from appliance.hosts.tunnels import Tunnels
 from appliance.master.graph.registry import Life, Registry
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import restore
-from appliance.recorder import Recorder
 from appliance.ros.uris import node_uri
 from appliance.rpc.server import listen
 from appliance.shares.pool import Standing
@@ -132,7 +132,7 @@ class _Control:
         self._standing: HostStanding | None = None
         self._audit = _open_audit(self._settings, self._signing, self._log_held(), self._standing_of)
         audit = self._settings.audit
-        recorder = Recorder(
+        trail = AuditTrail(
             self._audit,
             strict=audit.durability == "strict",
             deny_when_failed=audit.on_audit_failure == "deny",
@@ -145,7 +145,7 @@ class _Control:
         self._table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
         self._tunnels = Tunnels(
             self._table,
-            recorder,
+            trail,
             self._authority,
             listen=self._settings.listen_address,
             say=self._lifeline.say,
@@ -154,7 +154,7 @@ class _Control:
         policies = Policies(
             self._settings.policy,
             store,
-            recorder,
+            trail,
             robot=robot_addresses(self._settings),
             hosts=lambda: self._tunnels.addresses,
             changed=lambda before, policy: self._parts.policy_changed(before, policy),  # noqa: PLW0108 - made later
@@ -166,11 +166,11 @@ class _Control:
             settings=self._settings,
             lifeline=self._lifeline,
             store=store,
-            recorder=recorder,
+            trail=trail,
             policies=policies,
             registry=registry,
             standing=standing,
-            doors=Doors(self._settings, recorder, lambda: policies.current, standing),
+            doors=Doors(self._settings, trail, lambda: policies.current, standing),
             sockets=self._take_sockets(),
             parameters_dirty=self._parameters_dirty,
         )
@@ -182,7 +182,7 @@ class _Control:
     def _make_hosts(self) -> Hosts:
         self._certification = Certification(
             self._base.store,
-            self._base.recorder,
+            self._base.trail,
             self._authority,
             self._table,
             self._tunnels,
@@ -218,10 +218,10 @@ class _Control:
         await doors.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
         await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
-        self._tokens = Tokens(base.store, base.recorder, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below
+        self._tokens = Tokens(base.store, base.trail, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below
         if self._lifeline.announced:
             self._tokens.told()
-        self._forwarded = Forwarded(self._settings.audit.syslog, base.recorder)
+        self._forwarded = Forwarded(self._settings.audit.syslog, base.trail)
         looks = Looks(
             parts,
             base.policies,
@@ -241,7 +241,7 @@ class _Control:
         self._rest = RestLink(
             administration,
             self._tokens,
-            base.recorder,
+            base.trail,
             served=self._certification.served_by,
             require_proof=self._settings.api_require_proof,
         )
@@ -288,9 +288,7 @@ class _Control:
         uri = node_uri(told, base.port(RVMASTER))
         self._lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
-            base.recorder.happened(
-                "appliance started", f"nodes may connect at {uri}", severity=Severity.NOTICE
-            )
+            base.trail.happened("appliance started", f"nodes may connect at {uri}", severity=Severity.NOTICE)
         detail = {
             "master": uri.rstrip("/"),
             "revision": base.policies.revision,
@@ -313,9 +311,7 @@ class _Control:
         parts.reminders.close()
         parts.delivery.close()
         parts.rosmaster.close()
-        base.recorder.happened(
-            "appliance stopped", "control ended in an orderly way", severity=Severity.NOTICE
-        )
+        base.trail.happened("appliance stopped", "control ended in an orderly way", severity=Severity.NOTICE)
         base.store.save_parameters(parts.parameters.tree)
         base.store.close()
         self._audit.close()

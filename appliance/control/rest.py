@@ -18,6 +18,7 @@ from typing import Any
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
@@ -36,7 +37,6 @@ from appliance.channel.operations import CHANGES
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
 from appliance.control.tokens import Tokens
-from appliance.recorder import Recorder
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64
@@ -59,7 +59,7 @@ class RestLink:
         self,
         administration: Administration,
         tokens: Tokens,
-        recorder: Recorder,
+        trail: AuditTrail,
         *,
         served: Callable[[str], None],
         require_proof: bool,
@@ -67,7 +67,7 @@ class RestLink:
         self._administration = administration
         self._tokens = tokens
         self._askers = Askers(tokens, require_proof=require_proof)
-        self._recorder = recorder
+        self._trail = trail
         self._channel: Channel | None = None
         self._waiting: deque[messages.RequestMade] = deque()
         self._worker: asyncio.Task[None] | None = None  # of the present link
@@ -136,8 +136,8 @@ class RestLink:
             self._send_answer(made.number, answer)
 
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer[Any]:
-        if type(made.request) in _CHANGES and self._recorder.obstacle is not None:
-            return AdminAnswer(False, error=self._recorder.obstacle, trouble="failed")
+        if type(made.request) in _CHANGES and self._trail.obstacle is not None:
+            return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
         try:
             who = await self._askers.asker(made)
             if isinstance(made.request, ChallengeWanted):
@@ -152,7 +152,7 @@ class RestLink:
 
     def _refused(self, made: messages.RequestMade, error: UnprovenError) -> None:
         asked = made.asked
-        self._recorder.happened(
+        self._trail.happened(
             "order refused",
             str(error)[:_TEXT],
             severity=error.severity,
@@ -166,7 +166,7 @@ class RestLink:
 
     def _record(self, call: messages.RestCalled) -> None:
         denied = call.status in _DENIED or (call.method in _ORDERS and call.status >= 400 and not call.dry)
-        self._recorder.happened(
+        self._trail.happened(
             "rest call",
             call.reason[:_TEXT],
             severity=Severity.WARNING if denied else Severity.INFO,

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import TokenKept
-from appliance.recorder import Recorder
 from appliance.store.state import StateStore
 from appliance.store.tokens import BadTokenNameError, TokenRow, make_token
 
@@ -27,9 +27,9 @@ class TokenRefusedError(Exception):
 class Tokens:
     """All tokens. `changed()` is called when what may be used has changed."""
 
-    def __init__(self, store: StateStore, recorder: Recorder, changed: Callable[[], None]) -> None:
+    def __init__(self, store: StateStore, trail: AuditTrail, changed: Callable[[], None]) -> None:
         self._store = store
-        self._recorder = recorder
+        self._trail = trail
         self._rows = {row.id: row for row in store.tokens()}
         self._untold = bool(store.settings().get(_UNTOLD))
         self._changed = changed
@@ -95,7 +95,7 @@ class Tokens:
         except BadTokenNameError as error:
             raise TokenRefusedError(str(error)) from error
         self._keep(row)
-        self._recorder.happened(
+        self._trail.happened(
             "token added",
             f"token {row.name} ({row.role}) was made",
             severity=Severity.NOTICE,
@@ -116,7 +116,7 @@ class Tokens:
             raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
         revoked = row._replace(revoked=now)
         self._keep(revoked)
-        self._recorder.happened(
+        self._trail.happened(
             "token revoked",
             f"token {row.name} ({row.role}) was revoked",
             severity=Severity.NOTICE,

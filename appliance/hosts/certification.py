@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.authority import Authority, AuthorityError
@@ -23,7 +24,6 @@ from appliance.hosts.rest_place import RestPlace
 from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels
 from appliance.hosts.view import soon
-from appliance.recorder import Recorder
 from appliance.store.state import StateStore
 
 _SERVED_SECONDS = 10.0
@@ -38,7 +38,7 @@ class Certification:
     def __init__(
         self,
         store: StateStore,
-        recorder: Recorder,
+        trail: AuditTrail,
         authority: Authority,
         table: HostTable,
         tunnels: Tunnels,
@@ -48,7 +48,7 @@ class Certification:
         changed: Callable[[], int],
     ) -> None:
         self.store = store
-        self.recorder = recorder
+        self.trail = trail
         self.table = table
         self.tunnels = tunnels
         self.rest = rest
@@ -93,7 +93,7 @@ class Certification:
         """A host has its first certificate, or another after it was revoked."""
         self.awaited.forget(name)
         self.keep(name, address, made)
-        self.recorder.happened(
+        self.trail.happened(
             "host enrolled",
             f"{name} may come through its tunnel as {address}",
             severity=Severity.NOTICE,
@@ -107,7 +107,7 @@ class Certification:
 
     def renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
         """Record that a host has another certificate in the place of the one before."""
-        self.recorder.happened(
+        self.trail.happened(
             "host renewed",
             f"{name} has a new certificate; its tunnel comes back with it",
             severity=Severity.NOTICE,
@@ -194,7 +194,7 @@ class Certification:
         for row in self.table.enrolled():
             if soon(self.table, row, now) and row.serial not in self._warned:
                 self._warned.add(row.serial)
-                self.recorder.happened(
+                self.trail.happened(
                     "certificate ends soon" if row.expires > now else "certificate ended",
                     f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
                     severity=Severity.WARNING,

@@ -24,7 +24,7 @@ class CheckedPorts:
         self._certification = certification
         self._table = certification.table
         self._tunnels = certification.tunnels
-        self._recorder = certification.recorder
+        self._trail = certification.trail
         self._view = view
         self._machines = machines
 
@@ -46,7 +46,7 @@ class CheckedPorts:
             raise HostRefusedError("the moment of the check is more than a day ahead")
         row = PortsRow(key, state, sorted(set(opened))[:_MOST_PORTS], min(checked, now), who)
         self._table.keep_ports(row)
-        self._recorder.happened(
+        self._trail.happened(
             "ports checked",
             f"the ROS ports of {key} are {state}" + (f": {row.open}" if row.open else ""),
             severity=Severity.WARNING if state == "open" else Severity.NOTICE,

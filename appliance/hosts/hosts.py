@@ -43,7 +43,7 @@ class Hosts:
     ) -> None:
         self._certification = certification
         self._store = certification.store
-        self._recorder = certification.recorder
+        self._trail = certification.trail
         self._table = certification.table
         self._tunnels = certification.tunnels
         self._awaited = certification.awaited
@@ -157,7 +157,7 @@ class Hosts:
                 who=who,
             )
             self._table.changed()
-            self._recorder.happened(
+            self._trail.happened(
                 "host awaited",
                 f"whoever brings the one-time token {row.id} is enrolled as {name}",
                 severity=Severity.NOTICE,
@@ -199,7 +199,7 @@ class Hosts:
         self._tunnels.state_anew()
         taken = self._certification.changed()
         taken += self._expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
-        self._recorder.happened(
+        self._trail.happened(
             "host revoked",
             f"{name} ({row.address}) may no longer come; {taken} registrations and grants were taken back",
             severity=Severity.WARNING,
@@ -234,7 +234,7 @@ class Hosts:
         if self._tunnels.addresses != meant:  # the first tunnel of all: only now is clear text kept out
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
-        self._recorder.happened(
+        self._trail.happened(
             "hosts reloaded",
             f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
             severity=Severity.NOTICE,
@@ -266,7 +266,7 @@ class Hosts:
 
     async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> answers.Revoked:
         self._table.changed()
-        self._recorder.happened(
+        self._trail.happened(
             "host awaited no longer",
             f"the one-time token {awaited.id} of {awaited.name} was revoked",
             severity=Severity.NOTICE,

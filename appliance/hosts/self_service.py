@@ -36,7 +36,7 @@ class SelfService:
         self._certification = certification
         self._table = certification.table
         self._tunnels = certification.tunnels
-        self._recorder = certification.recorder
+        self._trail = certification.trail
         kept = certification.store.settings()
         self._renewals = {  # by name, seconds since the epoch
             name.removeprefix(_RENEWED): float(moment)
@@ -50,7 +50,7 @@ class SelfService:
             try:
                 awaited = self._certification.awaited.take(token)
             except BadEnrolmentTokenError as error:
-                self._recorder.happened(
+                self._trail.happened(
                     "enrolment refused", str(error), severity=Severity.WARNING, decision="deny", host=peer
                 )
                 raise HostForbiddenError(str(error)) from error
@@ -106,7 +106,7 @@ class SelfService:
         mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
         row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
         if row is None or row.name != name or not self._table.declared.wants(name):
-            self._recorder.happened(
+            self._trail.happened(
                 "renewal refused",
                 f"not in the tunnel of {name[:80]}",
                 severity=Severity.WARNING,

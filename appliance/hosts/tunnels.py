@@ -18,13 +18,13 @@ from collections.abc import Callable
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.revocation_list import RevocationList
 from appliance.hosts.table import HostRefusedError, HostTable
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 
 _log = structlog.get_logger()
 _APPLIANCE_DAYS = 90.0
@@ -41,14 +41,14 @@ class Tunnels:
     def __init__(
         self,
         table: HostTable,
-        recorder: Recorder,
+        trail: AuditTrail,
         authority: Authority,
         *,
         listen: tuple[str, int],
         say: Callable[[messages.Message], None],
     ) -> None:
         self._table = table
-        self._recorder = recorder
+        self._trail = trail
         self._authority = authority
         self._listen = listen
         self._say = say
@@ -211,7 +211,7 @@ class Tunnels:
             case messages.TunnelChanged(name, up, remote):
                 self._changed(name, up, remote)
             case messages.TunnelRefused(remote, reason, packets) if packets:
-                self._recorder.happened(
+                self._trail.happened(
                     "packets refused",
                     reason,
                     severity=Severity.WARNING,
@@ -220,7 +220,7 @@ class Tunnels:
                     packets=packets,
                 )
             case messages.TunnelRefused(remote, reason):
-                self._recorder.happened(
+                self._trail.happened(
                     "tunnel refused", reason, severity=Severity.WARNING, decision="deny", host=remote
                 )
             case messages.TunnelsReported(taken, rows):
@@ -265,7 +265,7 @@ class Tunnels:
         elif name not in self.seen:
             self.seen[name] = messages.TunnelSeen(name, remote, 0, 0, 0)
             self.last[name] = time.time()
-            self._recorder.happened(
+            self._trail.happened(
                 "tunnel up",
                 f"{name} is here, from {remote}",
                 severity=Severity.NOTICE,
@@ -290,7 +290,7 @@ class Tunnels:
         """A host that moves keeps its tunnel; a copy of its kit elsewhere would look like this, too."""
         before = self.seen[row.name].remote
         if row.remote != before:
-            self._recorder.happened(
+            self._trail.happened(
                 "tunnel moved",
                 f"{row.name} comes from {row.remote} now, before from {before}",
                 severity=Severity.NOTICE,
@@ -304,7 +304,7 @@ class Tunnels:
         seen = self.seen.pop(name, None)
         if seen is None:
             return
-        self._recorder.happened(
+        self._trail.happened(
             "tunnel down",
             f"the tunnel of {name} is down: {reason}",
             severity=Severity.NOTICE,

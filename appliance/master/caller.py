@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from appliance.audit_trail import Asker
 from appliance.master.graph.registry import Incarnation
-from appliance.recorder import Asker
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer

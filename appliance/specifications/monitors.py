@@ -29,8 +29,8 @@ import msgspec
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.recorder import Recorder
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import (
     Checked,
@@ -110,7 +110,7 @@ class Monitors:
         folder: Path | None,
         enable: str,
         store: StateStore,
-        recorder: Recorder,
+        trail: AuditTrail,
         *,
         on_fault: Literal["drop", "pass"],
         allocation: Allocation,
@@ -122,8 +122,8 @@ class Monitors:
         self._folder = SpecificationFolder(folder)
         self._enable = enable
         self._store = store
-        self._recorder = recorder
-        self._stating = Stating(allocation, recorder, on_fault, self.enabled, relays)
+        self._trail = trail
+        self._stating = Stating(allocation, trail, on_fault, self.enabled, relays)
         self._switches: dict[str, bool] = {}
         self._acts = 0  # switches and resumptions, ever
         self._changing = asyncio.Lock()
@@ -135,7 +135,7 @@ class Monitors:
         self.sources = Sources()
         self.checked = Checked()
         self.who, self.note, self.loaded = _DISK, "", 0.0
-        self.records = MonitorRecords(recorder, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
+        self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
         self._published = published
 
     # --- start ---
@@ -326,7 +326,7 @@ class Monitors:
             if self.confirm_by is None:
                 return False
             self._trial.end()
-            self._recorder.happened(
+            self._trail.happened(
                 "specifications confirmed",
                 f"revision {self.revision} of the specifications was confirmed",
                 category="monitor",
@@ -350,7 +350,7 @@ class Monitors:
                 self._switches[name] = enabled
                 self._stating.tell(name, messages.MonitorSwitched(name, enabled))
                 word = "enabled" if enabled else "disabled"
-                self._recorder.happened(
+                self._trail.happened(
                     f"monitor {word}",
                     f"{name} is {word}",
                     severity=Severity.NOTICE,
@@ -381,7 +381,7 @@ class Monitors:
                     away.append(name)
                     continue
                 self._stating.resumed(name)
-                self._recorder.happened(
+                self._trail.happened(
                     "monitor resumed",
                     f"the topics of {name} go on",
                     severity=Severity.NOTICE,
@@ -460,7 +460,7 @@ class Monitors:
             self._switches = switched
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
             findings = error.findings + hint
-            self._recorder.happened(
+            self._trail.happened(
                 "specifications refused",
                 f"revision {self.revision} stays in force: {error.findings[0]}",
                 severity=Severity.WARNING,
@@ -509,7 +509,7 @@ class Monitors:
         self._store.save_monitor_revision(row)
         self._enforce(sources, checked, row)
         added, changed, removed = sources.difference(before)
-        self._recorder.happened(
+        self._trail.happened(
             "specifications loaded",
             f"revision {row.revision} of the specifications is in force: {note}",
             severity=Severity.NOTICE,

@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
-from appliance.recorder import Recorder
 
 _EVENTS = {
     "verdict": ("monitor verdict", Severity.NOTICE),
@@ -31,11 +31,11 @@ class MonitorRecords:
 
     def __init__(
         self,
-        recorder: Recorder,
+        trail: AuditTrail,
         fields: Callable[[str, bytes], dict[str, Any] | None],
         told: Collection[Callable[[MonitorEvent], None]],
     ) -> None:
-        self._recorder = recorder
+        self._trail = trail
         self._fields = fields
         self.counts: Counter[tuple[str, str]] = Counter()
         self.at: Counter[tuple[str, str]] = Counter()
@@ -53,7 +53,7 @@ class MonitorRecords:
                 tell(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"
-            self._recorder.happened("records lost", text, severity=Severity.ALARM, lost=lost)
+            self._trail.happened("records lost", text, severity=Severity.ALARM, lost=lost)
 
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
@@ -73,7 +73,7 @@ class MonitorRecords:
         if event.count:
             detail["count"] = event.count
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")
-        self._recorder.happened(
+        self._trail.happened(
             name,
             text,
             severity=severity,

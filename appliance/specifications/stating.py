@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.recorder import Recorder
 from appliance.specifications.allocation import Allocation, Plan
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.relays import Relays
@@ -45,14 +45,14 @@ class Stating:
     def __init__(
         self,
         allocation: Allocation,
-        recorder: Recorder,
+        trail: AuditTrail,
         on_fault: Literal["drop", "pass"],
         enabled: Callable[[str], bool],
         relays: Relays,
     ) -> None:
         self.allocation = allocation
         self._relays = relays
-        self._recorder = recorder
+        self._trail = trail
         self._on_fault: Literal["drop", "pass"] = on_fault
         self._enabled = enabled
         self._now = Revision()
@@ -215,7 +215,7 @@ class Stating:
     def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
         names = [move.name for move in plan.moves]
         anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
-        self._recorder.happened(
+        self._trail.happened(
             "topics moved",
             f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} carried by another relay process{anew}",
             severity=Severity.ALARM if monitors else Severity.NOTICE,
@@ -277,7 +277,7 @@ class Stating:
         if (relay, statement) in self._waiting:
             self._began |= set(began)
         if relay in self._fresh and began:
-            self._recorder.happened(
+            self._trail.happened(
                 "monitors restarted",
                 f"a new relay process: {', '.join(began)} began in the initial state"
                 + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
@@ -293,7 +293,7 @@ class Stating:
     def _refused(self, relay: int, number: int, findings: list[str], statement: int) -> None:
         if number == self._now.number:
             self._refusals[relay] = findings
-        self._recorder.happened(
+        self._trail.happened(
             "specifications refused",
             f"the relay does not take revision {number}: {findings[0] if findings else ''}",
             severity=Severity.ALARM,

@@ -48,7 +48,7 @@ class Nothing:
 
 
 class Records:
-    """The recorder: what happened, as (event, resource)."""
+    """The trail: what happened, as (event, resource)."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str | None]] = []
@@ -59,22 +59,22 @@ class Records:
         self.meter = Nothing()
 
     def shut_out(self, _host: str) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         return ""
 
     def owing(self, _host: str) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         return self.debt
 
     def decided(
         self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
     ) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         self.events.append(("allow" if decision.allowed else "deny", resource))
         return "id"
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         self.events.append((event, resource))
         return "id"
 
@@ -289,8 +289,8 @@ class ControlParts:
             Addresses(),
             mirror(),
         )
-        recorder = cast(Any, self.records)
-        rights = ParameterRights(lambda: self.current, recorder)
+        trail = cast(Any, self.records)
+        rights = ParameterRights(lambda: self.current, trail)
         self.graph = Graph(
             self.registry, self.grants, cast(Any, self.mediation), may_be_told=rights.may_be_told
         )
@@ -304,7 +304,7 @@ class ControlParts:
             self.graph,
             self.entries,
             store=cast(Any, Nothing()),
-            recorder=recorder,
+            trail=trail,
             delivery=cast(Any, self.deliveries),
             relay=cast(Any, self.relay),
             faces=cast(Any, self.faces),
@@ -319,7 +319,7 @@ class ControlParts:
             self.revocation,
             self.enactor,
             self.parameters,
-            recorder,
+            trail,
             own_parameters=dict,
         )
         self.watchlist = Watchlist()
@@ -342,7 +342,7 @@ class ControlParts:
             enactor=self.enactor,
             rosmaster=self.rosmaster,
             mirror=self.parameters,
-            recorder=self.records,
+            trail=self.records,
             rights=rights,
             faces=self.faces,
             arrivals=self.faces,

@@ -31,7 +31,7 @@ def serving(
     enactor: Any,
     rosmaster: Any,
     mirror: ParameterMirror,
-    recorder: Any,
+    trail: Any,
     rights: Any,
     addresses: Any,
     faces: Any = None,
@@ -50,7 +50,7 @@ def serving(
     execution = Execution(
         gate=gate,
         policy=policy,
-        recorder=recorder,
+        trail=trail,
         registry=registry,
         enactor=enactor,
         liveness=liveness,
@@ -61,9 +61,9 @@ def serving(
     )
     pipeline = Pipeline(
         execution,
-        Multicall(execution, parameters, recorder, offload=offload),
+        Multicall(execution, parameters, trail, offload=offload),
         addresses=addresses,
-        recorder=recorder,
+        trail=trail,
         limits=Limits(),
         offload=offload,
         bulk=bulk_turns(lambda _host: Standing.REGISTERED),

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import NOT_RECORDED, AuditTrail
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text
 from appliance.master.calls.gate import Contest, Gate, contested
@@ -33,7 +34,6 @@ from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.liveness import Liveness, Probe
 from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision
-from appliance.recorder import NOT_RECORDED, Recorder
 from appliance.ros.errors import EncodingError, PeerError, ProtocolError
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh
@@ -63,7 +63,7 @@ class Execution:
         *,
         gate: Gate,
         policy: Callable[[], Policy],
-        recorder: Recorder,
+        trail: AuditTrail,
         registry: Registry,
         enactor: Enactor,
         liveness: Liveness,
@@ -74,7 +74,7 @@ class Execution:
     ) -> None:
         self._gate = gate
         self._policy = policy
-        self._recorder = recorder
+        self._trail = trail
         self._registry = registry
         self._enactor = enactor
         self._liveness = liveness
@@ -185,9 +185,7 @@ class Execution:
 
     def _decide(self, attempt: Attempt) -> Decision | Contest:
         caller = attempt.caller
-        obstacle = self._recorder.obstacle or (
-            "" if caller.own else self._recorder.shut_out(caller.peer.text)
-        )
+        obstacle = self._trail.obstacle or ("" if caller.own else self._trail.shut_out(caller.peer.text))
         if obstacle:
             return Decision(False, None, obstacle)
         return self._gate.decide(attempt, self._parameters.mirror.tree)
@@ -200,7 +198,7 @@ class Execution:
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
         """Record a decision; the answer of a denial, None for what is allowed."""
         request, call = attempt.request, attempt.call
-        record = self._recorder.decided(
+        record = self._trail.decided(
             attempt.caller.asker,
             call.name,
             request.category.value,
@@ -213,7 +211,7 @@ class Execution:
 
     async def _obstacle(self) -> str | None:
         """What a caller is told when its record must be on disk before the answer, and cannot be."""
-        if not self._recorder.strict or await self._recorder.durable() is None:
+        if not self._trail.strict or await self._trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"
 
@@ -234,7 +232,7 @@ class Execution:
         caller, call = attempt.caller, attempt.call
         match error:
             case NoPortError() | LimitReachedError():
-                record = self._recorder.happened(
+                record = self._trail.happened(
                     "limit exceeded",
                     str(error),
                     severity=Severity.ALARM,
@@ -260,11 +258,11 @@ class Execution:
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
         caller = replace(caller, caller_id=claimed_name(params))
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
-        record = self._recorder.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
+        record = self._trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._told(decision, record), 0]
 
     def _malformed(self, call: Call[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
-        self._recorder.happened(
+        self._trail.happened(
             "malformed",
             str(error),
             severity=Severity.WARNING,

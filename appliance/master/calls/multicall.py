@@ -10,12 +10,12 @@ import time
 from collections import deque
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.master.calls.call import Attempt, Verb
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.turns import touch
 from appliance.policy.model import Category
-from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
 
@@ -32,11 +32,11 @@ class Multicall:
     """Answers multicalls. The answers to one have as many bytes as one call can be answered."""
 
     def __init__(
-        self, execution: Execution, parameters: ParameterCalls, recorder: Recorder, *, offload: int
+        self, execution: Execution, parameters: ParameterCalls, trail: AuditTrail, *, offload: int
     ) -> None:
         self._execution = execution
         self._parameters = parameters
-        self._recorder = recorder
+        self._trail = trail
         self._offload = offload
 
     async def answer(self, visit: Visit, params: tuple[Value, ...]) -> Value:
@@ -50,7 +50,7 @@ class Multicall:
         limit = room = self._parameters.mirror.bytes_limit
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
         while left:
-            why = self._recorder.owing(visit.caller.peer.text)
+            why = self._trail.owing(visit.caller.peer.text)
             if room <= 0:
                 why = f"the answers to a multicall have more than {limit} bytes"
             if why:
@@ -115,7 +115,7 @@ class Multicall:
 
     def _fault(self, visit: Visit, code: int, event: str, why: str) -> Value:
         """A fault in the place of a part's answer, recorded as this event."""
-        record = self._recorder.happened(
+        record = self._trail.happened(
             event,
             why,
             severity=Severity.WARNING,

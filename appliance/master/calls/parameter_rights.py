@@ -4,13 +4,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import denial_text
 from appliance.master.graph.registry import Incarnation
 from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.rights import decide_right, right_to_find, right_to_read
-from appliance.recorder import Recorder
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
 
@@ -20,7 +20,7 @@ class ParameterRights:
     """Asks the policy that `policy()` returns at that moment, and records what it denies."""
 
     policy: Callable[[], Policy]
-    recorder: Recorder
+    trail: AuditTrail
 
     def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
         """What a caller is told in the place of a namespace that he may not read; None when there is nothing to hide.
@@ -52,7 +52,7 @@ class ParameterRights:
 
     def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
         """Record a decision on a parameter; what is told of it."""
-        record = self.recorder.decided(caller.asker, call, Category.READ.value, key, decision)
+        record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
         return denial_text(decision, record, self.policy().tell)
 
     def _to_read(self, host: Address, caller_id: str, key: str, value: Value) -> Decision:

@@ -9,6 +9,7 @@ import time
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.execution import Execution, Visit
@@ -16,7 +17,6 @@ from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.places import Addresses
 from appliance.policy.model import Category
-from appliance.recorder import Recorder
 from appliance.ros.errors import EncodingError, LimitExceededError, PeerError
 from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 from appliance.rpc.bulk import Bulk, weigh
@@ -40,7 +40,7 @@ class Pipeline:
         multicall: Multicall,
         *,
         addresses: Addresses,
-        recorder: Recorder,
+        trail: AuditTrail,
         limits: Limits,
         offload: int,
         bulk: Turns,
@@ -48,7 +48,7 @@ class Pipeline:
         self._execution = execution
         self._multicall = multicall
         self._addresses = addresses
-        self._recorder = recorder
+        self._trail = trail
         self._limits = limits
         self._offload = offload
         self._bulk = bulk
@@ -76,7 +76,7 @@ class Pipeline:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
-            self._recorder.meter.called(call.method if known else "unknown", seconds)
+            self._trail.meter.called(call.method if known else "unknown", seconds)
             if weigh(answer, self._offload) < self._offload:
                 return build_response(answer)
             await visit.bulk.take()
@@ -101,7 +101,7 @@ class Pipeline:
 
     def _not_understood(self, caller: Caller, body: bytes, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)
-        decision = self._recorder.happened(
+        decision = self._trail.happened(
             "limit exceeded" if limit else "malformed",
             str(error),
             severity=Severity.WARNING,

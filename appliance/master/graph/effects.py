@@ -144,7 +144,7 @@ class UsePorts:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """The audit log hears of it; the fields are those of `Recorder.happened`."""
+    """The audit log hears of it; the fields are those of `AuditTrail.happened`."""
 
     event: str
     reason: str

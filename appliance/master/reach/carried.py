@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 
 from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.answers.graph import Flow
 from appliance.channel.messages import TopicTraffic
 from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.limits import LimitRule
-from appliance.recorder import Recorder
 from appliance.store.state import PermissionRow
 
 MOST_RESOURCES = 2000
@@ -75,8 +75,8 @@ class Traffic:
 class Carried:
     """Connections and traffic of all relays, of which there are `relays`."""
 
-    def __init__(self, recorder: Recorder, registry: Registry, relays: int) -> None:
-        self._recorder = recorder
+    def __init__(self, trail: AuditTrail, registry: Registry, relays: int) -> None:
+        self._trail = trail
         self._registry = registry
         self._relays = relays
         self.connections: dict[tuple[int, int], Connection] = {}
@@ -142,7 +142,7 @@ class Carried:
     def unrecorded(self, connections: int) -> None:
         """So many connections came and went while a relay had no control."""
         if connections:
-            self._recorder.happened(
+            self._trail.happened(
                 "records lost",
                 f"{connections} connections through a relay ended unrecorded while it had no control",
                 severity=Severity.ALARM,
@@ -160,7 +160,7 @@ class Carried:
             message.caller_id,
         )
         name = self._name(message.key)
-        self._recorder.happened(
+        self._trail.happened(
             "connection opened",
             f"{message.caller_id} ({message.host}) is connected to {message.resource} of {name}",
             host=message.host,
@@ -175,7 +175,7 @@ class Carried:
         connection = self.connections.pop((relay, message.number), None)
         if connection is None:
             return
-        self._recorder.happened(
+        self._trail.happened(
             "connection closed",
             message.reason or "closed in an orderly way",
             host=connection.host,
@@ -188,7 +188,7 @@ class Carried:
     def refused(self, message: messages.ConnectionRefused) -> None:
         """Somebody was turned away; our own node that comes too late for what it may have attacks nobody."""
         own = self._is_own(message.host, message.caller_id, message.resource)
-        self._recorder.happened(
+        self._trail.happened(
             "connection refused",
             message.reason,
             severity=Severity.INFO if own else Severity.WARNING,
@@ -204,7 +204,7 @@ class Carried:
     def upstream_lost(self, message: messages.UpstreamLost, host: str) -> None:
         """A publisher at this address is not read any more: recorded if it was cut for what it sent."""
         if message.violation:
-            self._recorder.happened(
+            self._trail.happened(
                 message.violation,
                 message.reason,
                 severity=Severity.WARNING,
@@ -217,7 +217,7 @@ class Carried:
 
     def latch_refused(self, message: messages.LatchRefused, host: str) -> None:
         """A relay does not keep the latched message of a publisher at this address."""
-        self._recorder.happened(
+        self._trail.happened(
             "limit exceeded",
             "its latched message is not kept for later subscribers: its host has no memory left for such in the relay",
             severity=Severity.ALARM,
@@ -240,7 +240,7 @@ class Carried:
             "subscriber": "a subscriber gets",
             "topic": "all publishers together may send",
         }[row.part]
-        self._recorder.happened(
+        self._trail.happened(
             "rate limited",
             f"messages beyond what {whose} were dropped",
             severity=Severity.INFO if row.part == "subscriber" else Severity.WARNING,
@@ -257,7 +257,7 @@ class Carried:
 
     def publication_refused(self, message: messages.PublicationRefused) -> None:
         """A publisher is not carried."""
-        self._recorder.happened(
+        self._trail.happened(
             "publication refused",
             message.reason,
             severity=Severity.ALARM,

@@ -10,6 +10,7 @@ from typing import assert_never
 
 import structlog
 
+from appliance.audit_trail import AuditTrail
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
@@ -46,7 +47,6 @@ from appliance.master.reach.faces import Faces
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.entries import Entries
-from appliance.recorder import Recorder
 from appliance.ros.uris import parse_node_uri
 from appliance.rpc.client import CallFailedError
 from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
@@ -63,7 +63,7 @@ class Enactor:
         entries: Entries,
         *,
         store: StateStore,
-        recorder: Recorder,
+        trail: AuditTrail,
         delivery: Delivery,
         relay: RelayControl,
         faces: Faces,
@@ -72,7 +72,7 @@ class Enactor:
         self._graph = graph
         self._entries = entries
         self._store = store
-        self._recorder = recorder
+        self._trail = trail
         self._delivery = delivery
         self._relay = relay
         self._faces = faces
@@ -101,7 +101,7 @@ class Enactor:
                 case SaveNode() | EraseNode() | SaveRegistration() | EraseRegistration():
                     write(effect, self._store)
                 case Record():
-                    self._recorder.happened(
+                    self._trail.happened(
                         effect.event,
                         effect.reason,
                         severity=effect.severity,

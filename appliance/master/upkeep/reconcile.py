@@ -17,6 +17,7 @@ from typing import cast
 
 import structlog
 
+from appliance.audit_trail import AuditTrail
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.graph.registry import Kind, Life, Registry
@@ -26,7 +27,6 @@ from appliance.master.reach.faces import Faces
 from appliance.master.rosmaster import RosMaster
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import NAME, NO_SERVICE, Entries, stand_in
-from appliance.recorder import Recorder
 from appliance.ros.parameter_tree import Tree, standing_at
 from appliance.rpc.client import CallFailedError
 
@@ -48,7 +48,7 @@ class Reconciler:
         revocation: Revocation,
         enactor: Enactor,
         parameters: ParameterMirror,
-        recorder: Recorder,
+        trail: AuditTrail,
         *,
         own_parameters: Callable[[], Tree],
         interval: float = 30.0,
@@ -61,7 +61,7 @@ class Reconciler:
         self._revocation = revocation
         self._enactor = enactor
         self._parameters = parameters
-        self._recorder = recorder
+        self._trail = trail
         self._own_parameters = own_parameters
         self._interval = interval
         self.ready = asyncio.Event()
@@ -128,7 +128,7 @@ class Reconciler:
             text = (
                 f"a new ROS Master was told {made} registrations and {len(tree)} parameter namespaces again"
             )
-            self._recorder.happened("reconciled", text, registrations=made)
+            self._trail.happened("reconciled", text, registrations=made)
 
     # --- the same ROSMaster ---
 
@@ -153,7 +153,7 @@ class Reconciler:
             await self._settle(kind, resource, name, uris.get(name))
         if missing or extra:
             text = f"{len(missing)} registrations were made again, {len(extra)} adopted or removed"
-            self._recorder.happened("reconciled", text, made=len(missing), settled=len(extra))
+            self._trail.happened("reconciled", text, made=len(missing), settled=len(extra))
 
     async def _seen(self) -> Seen:
         state = (await self._rosmaster.call_now("getSystemState", NAME))[2]

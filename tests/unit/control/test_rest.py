@@ -35,7 +35,7 @@ def loading(number: int, text: str, shown: str = TOKEN) -> messages.RequestMade:
 
 
 class Everything:
-    """Stands in for administration, tokens and recorder."""
+    """Stands in for administration, tokens and trail."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[AnyRequest, str]] = []

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from appliance.audit.log import AuditLog
+from appliance.audit_trail import AuditTrail
 from appliance.control.tokens import Tokens
-from appliance.recorder import Recorder
 from appliance.store.state import StateStore
 from appliance.store.tokens import is_secret, parse_token
 
@@ -20,7 +20,7 @@ class Lives:
     def __init__(self, home: Path) -> None:
         self.home = home
         self.log = AuditLog(home / "audit.db")
-        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.store: StateStore | None = None
 
     def next(self) -> Tokens:
@@ -28,7 +28,7 @@ class Lives:
         if self.store is not None:
             self.store.close()
         self.store = StateStore(self.home, failed=pytest.fail)
-        return Tokens(self.store, self.recorder, lambda: None)
+        return Tokens(self.store, self.trail, lambda: None)
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
 from appliance.control.forwarded import Forwarded
 from appliance.forwarding.forwarder import Progress
 from appliance.forwarding.process import Reports
-from appliance.recorder import Recorder
 
 
 class Control:
@@ -21,11 +21,11 @@ class Control:
 
     def __init__(self) -> None:
         self.gaps: list[int] = []
-        self.forwarded = Forwarded(Syslog(to="udp://127.0.0.1:514"), cast(Recorder, self))
+        self.forwarded = Forwarded(Syslog(to="udp://127.0.0.1:514"), cast(AuditTrail, self))
         self.hears: Callable[[object, tuple[int, ...]], None] = lambda _message, _descriptors: None
 
     def happened(self, event: str, _text: str, **detail: Any) -> None:
-        """As the recorder takes it."""
+        """As the trail takes it."""
         if event == "forwarding gap":
             self.gaps.append(detail["count"])
 

@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
+from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.hosts.authority import Authority, AuthorityError
@@ -33,7 +34,6 @@ from appliance.ipsec import authority as ipsec
 from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.store.state import StateStore
 
 
@@ -80,20 +80,20 @@ class Bench:
         self.log = AuditLog(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
         self.authority = NearAuthority(directory)
-        recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.records: list[tuple[str, str]] = []
-        happened = recorder.happened
+        happened = trail.happened
 
         def noted(event: str, reason: str, **fields: Any) -> str:
             self.records.append((event, reason))
             return str(happened(event, reason, **fields))
 
-        recorder.happened = noted  # type: ignore[method-assign]  # beside what it does
+        trail.happened = noted  # type: ignore[method-assign]  # beside what it does
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
-        self.tunnels = Tunnels(self.table, recorder, self.authority, listen=(listen, 11311), say=self._said)
+        self.tunnels = Tunnels(self.table, trail, self.authority, listen=(listen, 11311), say=self._said)
         certification = Certification(
             self.store,
-            recorder,
+            trail,
             self.authority,
             self.table,
             self.tunnels,

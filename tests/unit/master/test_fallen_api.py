@@ -35,7 +35,7 @@ class World:
         self.done: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
-        self.tokens = Tokens(self.store, self, self.token_changed)  # type: ignore[arg-type]  # stands in for the recorder
+        self.tokens = Tokens(self.store, self, self.token_changed)  # type: ignore[arg-type]  # stands in for the trail
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:

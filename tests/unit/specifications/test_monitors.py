@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from appliance.audit.log import AuditLog
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.recorder import Recorder
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
@@ -30,15 +30,15 @@ class Desk:
         self.folder.mkdir()
         (self.folder / "a.rv").write_text(A)
         self.log = AuditLog(home / "audit.db")
-        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.events: list[tuple[str, dict[str, Any]]] = []
-        happened = self.recorder.happened
+        happened = self.trail.happened
 
         def noted(event: str, reason: str, **fields: Any) -> str:
             self.events.append((event, fields))
             return happened(event, reason, **fields)
 
-        self.recorder.happened = noted  # type: ignore[method-assign]
+        self.trail.happened = noted  # type: ignore[method-assign]
         self.store = StateStore(home, failed=pytest.fail)
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
@@ -52,7 +52,7 @@ class Desk:
             self.folder if folder else None,
             enable,
             self.store,
-            self.recorder,
+            self.trail,
             on_fault="drop",
             allocation=Allocation(1),
             relays=relay,

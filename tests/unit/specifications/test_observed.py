@@ -7,8 +7,8 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import export
+from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
-from appliance.recorder import Recorder
 from appliance.specifications.observed import MonitorRecords
 from tests.support.audit import settle
 
@@ -20,7 +20,7 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     """A verdict has a category of its own, and a robot's names are not ours to choose."""
     log = AuditLog(tmp_path / "audit.db")
     records = MonitorRecords(
-        Recorder(log, strict=False, deny_when_failed=False), lambda _topic, _data: None, []
+        AuditTrail(log, strict=False, deny_when_failed=False), lambda _topic, _data: None, []
     )
     detail = {"logic": "fsm", **{name: f"its {name}" for name in NAMES}}
     event = MonitorEvent(

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from appliance.audit.log import AuditLog
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.recorder import Recorder
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from appliance.specifications.stating import Revision, Stating
@@ -39,8 +39,8 @@ def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTa
 class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self.stating = Stating(Allocation(2), recorder, "drop", lambda _name: True, self)
+    def __init__(self, trail: AuditTrail) -> None:
+        self.stating = Stating(Allocation(2), trail, "drop", lambda _name: True, self)
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()
@@ -85,16 +85,16 @@ class World:
 
     def __init__(self, home: Path) -> None:
         self.log = AuditLog(home / "audit.db")
-        self.recorder = Recorder(self.log, strict=False, deny_when_failed=False)
+        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.records: list[tuple[str, str]] = []
-        happened = self.recorder.happened
+        happened = self.trail.happened
 
         def noted(event: str, reason: str, **fields: Any) -> str:
             self.records.append((event, reason))
             return happened(event, reason, **fields)
 
-        self.recorder.happened = noted  # type: ignore[method-assign]  # listens in
-        self.fleet = Fleet(self.recorder)
+        self.trail.happened = noted  # type: ignore[method-assign]  # listens in
+        self.fleet = Fleet(self.trail)
         self.stating = self.fleet.stating
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
         self.stating.start(revision(1, **self.files), restarted=False, kept="")
@@ -291,8 +291,8 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     allocation.adopt(allocation.plan(revision(1, **files).checked))
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
     log = AuditLog(tmp_path / "other.db")
-    recorder = Recorder(log, strict=False, deny_when_failed=False)
-    after = Fleet(recorder).stating
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
+    after = Fleet(trail).stating
     after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
@@ -310,7 +310,7 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    after = Fleet(world.recorder).stating
+    after = Fleet(world.trail).stating
     after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)

@@ -31,7 +31,7 @@ class Site:
         self.records: list[tuple[str, Decision]] = []
 
     def decided(self, _caller: Any, method: str, _category: str, resource: str, decision: Decision) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         assert method == "searchParam"
         self.records.append((resource, decision))
         return f"id{len(self.records)}"

@@ -50,7 +50,7 @@ class Anything:
 
 
 class Records:
-    """The recorder: decisions as (call, resource, decision), events by name."""
+    """The trail: decisions as (call, resource, decision), events by name."""
 
     def __init__(self) -> None:
         self.strict = False
@@ -61,22 +61,22 @@ class Records:
         self.events: list[str] = []
 
     def shut_out(self, _host: str) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         return ""
 
     def owing(self, _host: str) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         return self.debt
 
     def decided(
         self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **_more: Any
     ) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         self.decisions.append((method, resource, decision))
         return "id"
 
     def happened(self, event: str, _reason: str, **_more: Any) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         self.events.append(event)
         return "id"
 
@@ -87,7 +87,7 @@ class Site:
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
         policy = compile_policy(self.policy_text, file="test.ini")
-        self.recorder = Records()
+        self.trail = Records()
         self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
         self.there = mirror(copy.deepcopy(tree or {}))
         self.arrived: list[str] = []
@@ -100,8 +100,8 @@ class Site:
             enactor=Anything(),
             rosmaster=self,
             mirror=self.parameters,
-            recorder=self.recorder,
-            rights=ParameterRights(lambda: policy, cast(Any, self.recorder)),
+            trail=self.trail,
+            rights=ParameterRights(lambda: policy, cast(Any, self.trail)),
             addresses=self,
             offload=OFFLOAD,
         )
@@ -181,7 +181,7 @@ def test_a_value_that_is_being_set_is_not_replaced_from_below(together: bool) ->
         assert (answer[1][0] if together else answer)[0] == 0
         assert (await setting)[0] == (await elsewhere)[0] == 1
         assert site.there.tree == site.parameters.tree == {"arm": {"max": 5, "min": 1}}
-        assert [one.allowed for _, _, one in site.recorder.decisions].count(False) == 1
+        assert [one.allowed for _, _, one in site.trail.decisions].count(False) == 1
 
     play(scene)
 
@@ -197,7 +197,7 @@ def test_what_is_denied_anyway_waits_for_nobody() -> None:
         assert (await site.ask(OPERATOR, "deleteParam", "/me", "/"))[0] == 0
         [answer] = await site.ask(OPERATOR, "system.multicall", [part("setParam", "/", {"a": 1})])
         assert answer[0][0] == 0
-        assert len(site.recorder.decisions) == 3
+        assert len(site.trail.decisions) == 3
         site.go.set()
         assert (await setting)[0] == 1
 
@@ -223,7 +223,7 @@ def test_parts_are_decided_and_answered_in_their_places() -> None:
         assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
         assert "[Parameters] write default" in answers[1][0][1]
         assert site.there.tree == site.parameters.tree == {"arm": {}}
-        assert [resource.allowed for _, _, resource in site.recorder.decisions] == [True, False, True, True]
+        assert [resource.allowed for _, _, resource in site.trail.decisions] == [True, False, True, True]
 
     play(scene)
 
@@ -238,7 +238,7 @@ def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
         assert answer[0] == 0
         assert "4711" not in str(answer)
         assert answer[1].endswith("[id]")
-        assert site.recorder.decisions[-1][1:2] == ("/arm",)
+        assert site.trail.decisions[-1][1:2] == ("/arm",)
         assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
 
     play(scene)
@@ -255,7 +255,7 @@ def test_answers_to_a_multicall_are_bounded_together() -> None:
         assert [one[0][0] for one in answers[:10]] == [1] * 10
         assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
         assert len(site.arrived) == 10
-        assert site.recorder.events == ["limit exceeded"]
+        assert site.trail.events == ["limit exceeded"]
         usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
         assert [one[0][0] for one in usual] == [1] * 100
 
@@ -340,6 +340,6 @@ def test_a_denied_host_is_told_as_much_as_the_policy_says(tell: str, told: str) 
         assert answer[0] == 0
         assert answer[1].startswith(told), answer
         assert answer[1].endswith("[id]")
-        assert "only adm (10.0.0.9) may" in site.recorder.decisions[-1][2].reason
+        assert "only adm (10.0.0.9) may" in site.trail.decisions[-1][2].reason
 
     play(scene)

@@ -13,13 +13,13 @@ from appliance.ros.uris import parse_node_uri
 
 
 class Kept:
-    """A recorder that keeps what it is given."""
+    """A trail that keeps what it is given."""
 
     def __init__(self) -> None:
         self.records: list[dict[str, Any]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> None:
-        """As the recorder has it."""
+        """As the trail has it."""
         self.records.append({"event": event, "reason": reason, **fields})
 
 

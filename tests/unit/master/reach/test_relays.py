@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.master.graph.grants import Grants
@@ -19,7 +20,6 @@ from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.enactor import Enactor
 from appliance.policy import Policy, compile_policy
 from appliance.policy.model import Address
-from appliance.recorder import Recorder
 from appliance.ros.uris import parse_node_uri
 from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
@@ -102,7 +102,7 @@ class World:
         self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
-        carried = Carried(cast(Recorder, self), self.registry, 2)
+        carried = Carried(cast(AuditTrail, self), self.registry, 2)
         self.grants = Grants(carried.used, grants)
         self.relay = RelayControl(
             self.registry,
@@ -122,7 +122,7 @@ class World:
             self.graph,
             cast(Any, _UNUSED),
             store=cast(StateStore, NoPermissions()),
-            recorder=cast(Recorder, self),
+            trail=cast(AuditTrail, self),
             delivery=cast(Delivery, NoDelivery()),
             relay=self.relay,
             faces=cast(Any, _UNUSED),
@@ -153,7 +153,7 @@ class World:
         self.lost.append(relay)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """As `Recorder`."""
+        """As `AuditTrail`."""
         self.records.append((event, reason, fields))
         return ""
 

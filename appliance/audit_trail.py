@@ -24,7 +24,7 @@ class Asker(NamedTuple):
     node: str | None = None
 
 
-class Recorder:
+class AuditTrail:
     """Records decisions and events under the running policy revision.
 
     `strict`: an answer waits until its record is on disk. `deny_when_failed`: while the log cannot be written,

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
-from appliance.recorder import NOT_RECORDED, Recorder
+from appliance.audit_trail import NOT_RECORDED, AuditTrail
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_BYTES
 
@@ -34,14 +34,14 @@ class Log:
         return self.failed
 
 
-def recorder(log: Log, *, deny: bool) -> Recorder:
+def trail(log: Log, *, deny: bool) -> AuditTrail:
     """As control makes it."""
-    return Recorder(log, strict=True, deny_when_failed=deny)  # type: ignore[arg-type]  # stands for the log
+    return AuditTrail(log, strict=True, deny_when_failed=deny)  # type: ignore[arg-type]  # stands for the log
 
 
 def test_nobody_is_told_where_the_log_is() -> None:
     """While the log cannot be written requests are denied; where it is and what is wrong is not for a node."""
-    one = recorder(Log(), deny=True)
+    one = trail(Log(), deny=True)
     assert one.obstacle == NOT_RECORDED
     assert "/" not in NOT_RECORDED
     assert asyncio.run(one.durable()) is not None
@@ -52,15 +52,15 @@ def test_when_it_is_to_go_on_without(failed: str | None) -> None:
     """With `on_audit_failure: allow`, or while the log is well, nothing stands in the way."""
     log = Log()
     log.failed = failed
-    assert recorder(log, deny=failed is None).obstacle is None
+    assert trail(log, deny=failed is None).obstacle is None
     if failed is not None:
-        assert asyncio.run(recorder(log, deny=False).durable()) is None
+        assert asyncio.run(trail(log, deny=False).durable()) is None
 
 
 def test_what_is_refused_to_a_stranger_says_so() -> None:
     """A refusal of an address that no rule names is marked; what others get wrong, or are granted, is not."""
     log = Log()
-    one = recorder(log, deny=True)
+    one = trail(log, deny=True)
     one.happened("limit exceeded", "too much", decision="deny", host=STRANGER)
     one.happened("limit exceeded", "too much", decision="deny", host=GUEST)
     one.happened("rest call", "", decision="allow", host=STRANGER)
@@ -72,7 +72,7 @@ def test_what_is_refused_to_a_stranger_says_so() -> None:
 def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
     """Once a host owes more than its share, what it causes without a call is marked to be folded; decisions are not."""
     log = Log()
-    one = recorder(log, deny=True)
+    one = trail(log, deny=True)
     one.happened("connection opened", "", host=GUEST)
     one.happened("malformed", "x" * AUDIT_BYTES.bounds.host, host=GUEST)
     one.happened("connection opened", "", host=GUEST)
