@@ -2,6 +2,7 @@
 
 import ipaddress
 from collections.abc import Callable
+from functools import lru_cache
 
 from appliance.policy import Policy
 from appliance.policy.model import Address
@@ -30,6 +31,9 @@ class HostStanding:
     def of_text(self, host: str) -> Standing:
         """The same of a host as records have it; what is no address is nobody's that could be a stranger."""
         try:
-            return self(ipaddress.ip_address(host))
+            return self(_parsed(host))
         except ValueError:
             return Standing.NAMED
+
+
+_parsed = lru_cache(1024)(ipaddress.ip_address)  # every call of a host asks

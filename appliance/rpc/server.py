@@ -19,7 +19,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import structlog
@@ -44,16 +44,18 @@ _BEGINNING_SECONDS = 1.0  # that they are waited for
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Who is connected: `host` and `text` are the peer's address, `local` the address he reached us at."""
+    """Who is connected: `host` and `text` are the peer's address, `local` the address he reached us at.
+
+    `here`: he is on this machine.
+    """
 
     host: Address
     text: str
     local: str
+    here: bool = field(init=False)
 
-    @property
-    def here(self) -> bool:
-        """Whether the peer is on this machine."""
-        return self.host.is_loopback or self.text == self.local
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "here", self.host.is_loopback or self.text == self.local)
 
 
 @dataclass(frozen=True, slots=True)

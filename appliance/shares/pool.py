@@ -15,7 +15,6 @@ A host's standing may change while it holds something. It is looked up again at 
 host holds moves with it; no call looks at other hosts.
 """
 
-from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
@@ -87,11 +86,13 @@ class Pool(Generic[Holder]):
         self.bounds = bounds
         self._standing = standing
         self._held: dict[Holder, tuple[Standing, int]] = {}
-        self._by_standing: Counter[Standing] = Counter()
+        self._by_standing = [0 for _ in Standing]
 
     def refusal(self, host: Holder, amount: int = 1) -> str:
         """Why `host` may not have `amount` more, in words; empty when it may."""
-        standing, mine = self._look_up(host)
+        return self._refusal(host, amount, *self._look_up(host))
+
+    def _refusal(self, host: Holder, amount: int, standing: Standing, mine: int) -> str:
         bounds, what = self.bounds, self.what
         if mine + amount > bounds.host:
             return f"{host} has {mine} {what}; the share of one host is {bounds.host}"
@@ -113,9 +114,10 @@ class Pool(Generic[Holder]):
 
     def take(self, host: Holder, amount: int = 1) -> str:
         """Give `host` so much if it may have it; else nothing is given. Returns the reason as `refusal` does."""
-        reason = self.refusal(host, amount)
+        standing, mine = self._look_up(host)
+        reason = self._refusal(host, amount, standing, mine)
         if not reason:
-            self.charge(host, amount)
+            self._set(host, standing, mine + amount)
         return reason
 
     def charge(self, host: Holder, amount: int = 1) -> None:
@@ -141,7 +143,7 @@ class Pool(Generic[Holder]):
     @property
     def total(self) -> int:
         """What all hosts have."""
-        return self._by_standing.total()
+        return sum(self._by_standing)
 
     def holders(self) -> Iterator[tuple[Holder, int]]:
         """Every host that holds something, and how much."""
