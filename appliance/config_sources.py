@@ -228,7 +228,7 @@ def _unknown_key(path: KeyPath) -> str:
     nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
     if not nearest:
         # A key that stands on the wrong level is the other common mistake.
-        elsewhere = [_dotted(one) for one in _all_keys(Settings, ()) if one[-1] == path[-1]]
+        elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]
         nearest = elsewhere[:1]
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
     return f"unknown key {_dotted(path)}: {advice}"

@@ -170,8 +170,8 @@ def markdown() -> str:
     """The generated part of the page on metrics."""
     lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
     lines += [
-        f"| `{one.name}` | {one.kind} | {', '.join(f'`{label}`' for label in one.labels) or '-'} | {one.help} |"
-        for one in METRICS
+        f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"
+        for row in METRICS
     ]
     return "\n".join([*lines, ""])
 

@@ -75,7 +75,7 @@ class Doorkeeper:
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
         """Only these may be used from now on."""
-        self._tokens = {one.id: one for one in tokens}
+        self._tokens = {token.id: token for token in tokens}
         self._recognised.clear()
 
     def still_good(self, bearer: Bearer) -> bool:

@@ -50,7 +50,7 @@ def _still_good(path: Path, names: Iterable[str], now: datetime.datetime) -> boo
         <= now
         < certificate.not_valid_after_utc - datetime.timedelta(days=_RENEW_DAYS)
     )
-    return in_time and {_general_name(one) for one in names} <= set(extension)
+    return in_time and {_general_name(name) for name in names} <= set(extension)
 
 
 def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: datetime.datetime) -> None:
@@ -64,7 +64,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(hours=1))
         .not_valid_after(now + datetime.timedelta(days=_DAYS))
-        .add_extension(x509.SubjectAlternativeName([_general_name(one) for one in names]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .sign(key, hashes.SHA256())

@@ -85,13 +85,13 @@ def _answer(request: Request, found: _File) -> Response:
 def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
     """All files under a folder, by their path in it."""
     found: dict[str, _File] = {}
-    for one in folder.iterdir():
-        if one.is_dir():
-            found |= _collect(one, f"{prefix}{one.name}/")
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            found |= _collect(entry, f"{prefix}{entry.name}/")
             continue
-        body = one.read_bytes()
-        found[prefix + one.name] = _File(
-            body, _media_type(one.name), f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+        body = entry.read_bytes()
+        found[prefix + entry.name] = _File(
+            body, _media_type(entry.name), f'"{hashlib.sha256(body).hexdigest()[:32]}"'
         )
     return found
 

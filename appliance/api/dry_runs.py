@@ -11,6 +11,8 @@ _NO = frozenset({b"", b"0", b"false", b"off", b"no", b"f", b"n"})
 def is_dry(query: bytes) -> bool:
     """Whether a request is a dry run, by its query."""
     found = [
-        value for name, _eq, value in (one.partition(b"=") for one in query.split(b"&")) if name == b"dry_run"
+        value
+        for name, _eq, value in (part.partition(b"=") for part in query.split(b"&"))
+        if name == b"dry_run"
     ]
     return bool(found) and found[-1].lower() not in _NO

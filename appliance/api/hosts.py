@@ -75,9 +75,9 @@ def _add_looks(router: Routes, services: Services) -> None:
     async def host(name: OneName, bearer: Viewer) -> Tagged[answers.Host]:
         """One host."""
         found = await ask(control, admin.HostList(), bearer)
-        for one in found.hosts:
-            if one.name == name:
-                return Tagged(one, found.revision)
+        for host in found.hosts:
+            if host.name == name:
+                return Tagged(host, found.revision)
         raise ProblemError(404, "unknown", f"there is no host {name}")
 
     @router.get("/{name}/kit", operation_id="host_kit", responses=_KIT | _UNKNOWN, response_class=Response)

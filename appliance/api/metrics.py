@@ -137,7 +137,9 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         **_forwarding(audit.forwarding),
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
-        "rosrv_process_restarts_total": [((name,), one.restarts) for name, one in _named(status.processes)],
+        "rosrv_process_restarts_total": [
+            ((name,), process.restarts) for name, process in _named(status.processes)
+        ],
         "rosrv_process_resident_bytes": list(_memory(status.processes)),
     }
 
@@ -160,21 +162,21 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
     """Of the hosts that may come; a revoked one is only counted."""
-    enrolled = [one for one in hosts if one.serial is not None and one.revoked is None]
+    enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
     now = time.time()
     return {
-        "rosrv_tunnel_up": [((one.name,), one.remote is not None) for one in enrolled],
-        "rosrv_tunnel_age_seconds": [((one.name,), one.seconds or 0) for one in enrolled],
+        "rosrv_tunnel_up": [((host.name,), host.remote is not None) for host in enrolled],
+        "rosrv_tunnel_age_seconds": [((host.name,), host.seconds or 0) for host in enrolled],
         "rosrv_tunnel_bytes": [
-            ((one.name, direction), count or 0)
-            for one in enrolled
-            for direction, count in (("in", one.bytes_in), ("out", one.bytes_out))
+            ((host.name, direction), count or 0)
+            for host in enrolled
+            for direction, count in (("in", host.bytes_in), ("out", host.bytes_out))
         ],
         "rosrv_host_certificate_expiry_seconds": [
-            ((one.name,), one.expires - now) for one in enrolled if one.expires is not None
+            ((host.name,), host.expires - now) for host in enrolled if host.expires is not None
         ],
-        "rosrv_host_ports_open": [((one.name,), _PORTS[one.ports.state]) for one in enrolled],
-        "rosrv_hosts": [((state,), count) for state, count in Counter(one.state for one in hosts).items()],
+        "rosrv_host_ports_open": [((host.name,), _PORTS[host.ports.state]) for host in enrolled],
+        "rosrv_hosts": [((state,), count) for state, count in Counter(host.state for host in hosts).items()],
     }
 
 
@@ -184,9 +186,9 @@ def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]
 
 
 def _memory(processes: Sequence[ProcessInfo]) -> Iterator[tuple[tuple[str, ...], float]]:
-    for name, one in _named(processes):
+    for name, process in _named(processes):
         try:
-            pages = Path(f"/proc/{one.pid}/statm").read_text().split()[1]
+            pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
         except OSError:
             continue  # it ended just now
         yield (name,), float(int(pages) * _PAGE_BYTES)

@@ -83,7 +83,9 @@ class Compiler:
     def warnings(self, file: str) -> list[Finding]:
         """The lint of a file of what was compiled last."""
         assert self._last is not None  # noqa: S101  asked after `monitor`
-        return findings_of([str(one) for one in self._last[1].warnings if one.position.file == file])
+        return findings_of(
+            [str(warning) for warning in self._last[1].warnings if warning.position.file == file]
+        )
 
 
 def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:

@@ -39,9 +39,9 @@ class _Looking:
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
         """What is in force, with texts, and the row of a monitor. Raises `ProblemError` (404)."""
         loaded = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
-        row = next((one for one in loaded.monitors if one.name == name), None)
+        row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
         if row is None:
-            known = ", ".join(one.name for one in loaded.monitors) or "none is loaded"
+            known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
             raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
         return loaded, row
 
@@ -120,7 +120,7 @@ def routes(services: Services) -> Routes:
         """
         wanted = Filter(category="monitor", text=name)
         page: Page = await looking.desk.read(search, looking.desk.path, wanted, cursor, limit)
-        happened = [_happened(one) for one in page.entries if _of(one, name)]
+        happened = [_happened(entry) for entry in page.entries if _of(entry, name)]
         return History(name, happened, page.cursor)
 
     return router

@@ -20,7 +20,7 @@ async def only_known(request: Request) -> None:
     operation = operations.get(request.method.lower())
     if operation is None:
         return
-    known = [one["name"] for one in operation.get("parameters", []) if one["in"] == "query"]
+    known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
     unknown = [name for name in dict.fromkeys(given) if name not in known][:_MOST_SHOWN]
     if unknown:
         there_are = f"there are: {', '.join(known)}" if known else "this path takes none"

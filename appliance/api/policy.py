@@ -126,18 +126,18 @@ def routes(services: Services) -> Routes:
             ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
         cases = [
             Case(
-                file=one.file,
-                line=one.line,
-                column=one.column,
-                **one.request.fields(),
-                expected="allow" if one.expected else "deny",
-                decision=one.decision.word,
-                reason=one.decision.reason,
-                passed=one.passed,
+                file=case.file,
+                line=case.line,
+                column=case.column,
+                **case.request.fields(),
+                expected="allow" if case.expected else "deny",
+                decision=case.decision.word,
+                reason=case.decision.reason,
+                passed=case.passed,
             )
-            for one in ran
+            for case in ran
         ]
-        passed = sum(one.passed for one in cases)
+        passed = sum(case.passed for case in cases)
         return Tested(
             file=current.cases_file,
             exists=current.cases is not None,
@@ -164,8 +164,8 @@ def _explained(found: Explanation) -> Explained:
         through=list(found.through),
         limit=found.limit,
         lost=[
-            LostRule(rule=_rule(one.rule), would="allow" if one.grants else "deny", why=one.why)
-            for one in found.lost
+            LostRule(rule=_rule(rule.rule), would="allow" if rule.grants else "deny", why=rule.why)
+            for rule in found.lost
         ],
         node=_explained(found.node) if found.node is not None else None,
         command=_explained(found.command) if found.command is not None else None,

@@ -124,12 +124,12 @@ async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, 
 def _report(judgement: Judgement, **known: Any) -> Report:
     changes = [
         Change(
-            **one.request.fields(),
-            now=one.old.word,
-            then=one.new.word,
-            reason=one.new.reason,
+            **change.request.fields(),
+            now=change.old.word,
+            then=change.new.word,
+            reason=change.new.reason,
         )
-        for one in judgement.changes
+        for change in judgement.changes
     ]
-    ends = [Ended(**asdict(one)) for one in judgement.ends]
+    ends = [Ended(**asdict(end)) for end in judgement.ends]
     return Report(**known, warnings=judgement.warnings, changes=changes, ends=ends)

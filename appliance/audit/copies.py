@@ -129,9 +129,9 @@ class CopiesAudit:
         copies = list(copies)
         self._log = log
         self._key = key
-        self._others = sorted({one.log for one in copies if one.log != log})
-        self._copies = sorted({one for one in copies if one.log == log}, key=lambda one: one.number)
-        self.sequences = {one.sequence for one in self._copies}
+        self._others = sorted({copy.log for copy in copies if copy.log != log})
+        self._copies = sorted({copy for copy in copies if copy.log == log}, key=lambda one: one.number)
+        self.sequences = {copy.sequence for copy in self._copies}
         self._agreeing: list[SignedCheckpoint] = []
         self.removed: list[int] = []
         """What copies say of how much is removed."""

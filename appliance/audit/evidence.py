@@ -57,17 +57,19 @@ def evidence_line(entry: Entry, chain: Chain) -> str:
 
 def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[Entry, Chain]]:
     """The records with their places; the last of them only if nothing follows it (`whole`)."""
-    following = [one.sequence for one in entries[1:]] + ([0] if whole else [])
+    following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")
         reader = _Reader(connection)
-        placed = [(one, reader.place(one, after)) for one, after in zip(entries, following, strict=False)]
-    for one, chain in placed:
+        placed = [
+            (entry, reader.place(entry, after)) for entry, after in zip(entries, following, strict=False)
+        ]
+    for entry, chain in placed:
         if chain is None:
             raise LogUnreadableError(
-                f"{path}: retention removed record {one.sequence} while it was exported: export again"
+                f"{path}: retention removed record {entry.sequence} while it was exported: export again"
             )
-        yield one, chain
+        yield entry, chain
 
 
 class _Reader:

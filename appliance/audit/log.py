@@ -336,7 +336,7 @@ class AuditLog:
         reason = str(error)
         if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
             # With ours still open, ours are in the list as well.
-            others = [one for one in holders(self.path) if one != os.getpid()]
+            others = [pid for pid in holders(self.path) if pid != os.getpid()]
             if others:
                 reason = f"{reason} by process {', '.join(map(str, others))}"
                 self._held_by(others)
@@ -362,7 +362,9 @@ class AuditLog:
         # Only what an earlier process left; what this one counts stands there as well and is still being counted.
         left = [] if self._counts_recovered else writer.open_folds()
         if left:
-            writer.close_folds([summary(one, self.ids.next(), self._clock(), recovered=True) for one in left])
+            writer.close_folds(
+                [summary(fold, self.ids.next(), self._clock(), recovered=True) for fold in left]
+            )
         self._counts_recovered = True
         self._continued = (writer.log_id, writer.sequence)
         if not self._failed_since:

@@ -75,7 +75,7 @@ def conditions(wanted: Filter) -> list[Condition]:
             found.append(_match(column, value))
     if wanted.severity is not None:
         order = list(Severity)
-        names = tuple(one.value for one in order[order.index(wanted.severity) :])
+        names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
         found.append(Condition(f"severity IN ({', '.join('?' * len(names))})", names, "record_severity"))
     if wanted.rule is not None:
         pattern = _checked("rule", wanted.rule)
@@ -131,4 +131,4 @@ def text_match(text: str) -> str | None:
     if len(text) < _TRIGRAM or "\0" in text:
         return None
     trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}
-    return " AND ".join('"' + one.replace('"', '""') + '"' for one in sorted(trigrams))
+    return " AND ".join('"' + trigram.replace('"', '""') + '"' for trigram in sorted(trigrams))

@@ -226,7 +226,7 @@ def _neighbours(
         value = getattr(entry.record, column)
         if value is not None:
             same = [Condition(f"{column} = ?", (value,)), *walk.condition("sequence")]
-            near |= {one.sequence: one for one in _select(connection, same, f"record_{column}", walk, count)}
+            near |= {row.sequence: row for row in _select(connection, same, f"record_{column}", walk, count)}
     return [near[sequence] for sequence in sorted(near, reverse=newest_first)][:count]
 
 

@@ -381,12 +381,14 @@ def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]
     order: list[_Row] = []
     left = list(rows)
     while left:
-        found = next((one for one in left if one.follows(previous, place + len(order))), None)
+        found = next(
+            (candidate for candidate in left if candidate.follows(previous, place + len(order))), None
+        )
         if found is None:
             break
         order.append(found)
         left.remove(found)
         previous = found.hash
-        if max(one.sequence for one in order) == rows[0].sequence + len(order) - 1:
+        if max(row.sequence for row in order) == rows[0].sequence + len(order) - 1:
             break
     return order

@@ -19,7 +19,7 @@ def answer(waiting: Iterable[Waiter], result: str | None) -> None:
     for loop, group in itertools.groupby(waiting, lambda one: one.loop):
         # A closed loop raises RuntimeError: nobody waits any more.
         with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(_settle, [one.future for one in group], result)
+            loop.call_soon_threadsafe(_settle, [waiter.future for waiter in group], result)
 
 
 def _settle(futures: list[asyncio.Future[str | None]], result: str | None) -> None:

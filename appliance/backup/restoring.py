@@ -47,7 +47,7 @@ def _room_in(state: Path) -> int:
     Raises `BackupError`.
     """
     try:
-        if os.path.lexists(state) and any(one.name != _OF_THE_DISK for one in state.iterdir()):
+        if os.path.lexists(state) and any(entry.name != _OF_THE_DISK for entry in state.iterdir()):
             raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
         here = state.absolute()
         while not os.path.lexists(here):

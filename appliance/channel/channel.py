@@ -72,7 +72,9 @@ class Channel:
         body = self._encoder.encode(message)
         if self._backlog + len(body) > self._limit:
             raise ChannelFullError(f"{self._backlog} bytes wait for the other end of the link")
-        self._outgoing.append((_LENGTH.pack(len(body)) + body, [os.dup(one) for one in descriptors]))
+        self._outgoing.append(
+            (_LENGTH.pack(len(body)) + body, [os.dup(descriptor) for descriptor in descriptors])
+        )
         self._backlog += len(body) + _LENGTH.size
         if self._loop is None:
             self.flush()

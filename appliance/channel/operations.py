@@ -37,7 +37,9 @@ class Operation(NamedTuple):
         """The fields that the body has."""
         elsewhere = {"expected", *self.query, *self.fixed}
         fields = msgspec.structs.fields(self.request)
-        return [one for one in fields if one.name not in elsewhere and f"{{{one.name}}}" not in self.path]
+        return [
+            field for field in fields if field.name not in elsewhere and f"{{{field.name}}}" not in self.path
+        ]
 
 
 _WITHIN = ("confirm_within",)
@@ -88,15 +90,17 @@ OPERATIONS = (
     Operation(admin.AuthorityWanted, None),
 )
 
-CHANGES = frozenset(one.request for one in OPERATIONS if one.path and one.method != "GET")
+CHANGES = frozenset(
+    operation.request for operation in OPERATIONS if operation.path and operation.method != "GET"
+)
 """What changes something in the name of a token: control makes it only with the request that asked for it."""
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
     """How a request is asked; None: not over REST."""
-    for one in OPERATIONS:
-        if one.request is type(request) and all(
-            getattr(request, name) == one.fixed[name] for name in one.fixed
+    for operation in OPERATIONS:
+        if operation.request is type(request) and all(
+            getattr(request, name) == operation.fixed[name] for name in operation.fixed
         ):
-            return one
+            return operation
     return None

@@ -144,7 +144,7 @@ def main() -> None:
         app()
     except Exception as error:  # noqa: BLE001  the last resort; what it was and where is still told
         if any(
-            one.__name__ in _TOLD and one.__module__.startswith("appliance.") for one in type(error).__mro__
+            cls.__name__ in _TOLD and cls.__module__.startswith("appliance.") for cls in type(error).__mro__
         ):
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)

@@ -113,7 +113,9 @@ def _make(
     apply: bool,
     as_json: bool,
 ) -> None:
-    text = protection.protection([protection.parse_address(one) for one in appliances], ports, services)
+    text = protection.protection(
+        [protection.parse_address(appliance) for appliance in appliances], ports, services
+    )
     for service in services:
         if service.ports.last < ports.first or service.ports.first > ports.last:
             sys.stderr.write(f"rosrv: note: {service} is outside {ports} and open in any case\n")

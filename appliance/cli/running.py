@@ -97,14 +97,16 @@ def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, Non
 
     @functools.wraps(verb)
     def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
-        context, state, api, authority = (kwargs.pop(one.name) for one in _PLACES)
+        context, state, api, authority = (kwargs.pop(place.name) for place in _PLACES)
         appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
         verb(appliance, *args, **kwargs)
 
     own = inspect.signature(verb, eval_str=True)
     parameters = [*list(own.parameters.values())[1:], *_PLACES]
     asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
-    asked.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
+    asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
+        "return": None
+    }
     return asked
 
 

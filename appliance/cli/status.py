@@ -141,7 +141,9 @@ def _tunnels(ipsec: IpsecState) -> str:
 
 def _ports(known: dict[str, PortsSeen]) -> str:
     """Whether machines on which nodes run are known to be closed to all but the appliance."""
-    by_state = {state: [name for name, one in known.items() if one.state == state] for state in _PORT_STATES}
+    by_state = {
+        state: [name for name, ports in known.items() if ports.state == state] for state in _PORT_STATES
+    }
     if not known:
         return "no other machine has nodes"
     words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]

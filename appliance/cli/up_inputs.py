@@ -32,7 +32,7 @@ def read_inputs(settings: Settings) -> range:
             return DEFAULT_PORTS
         if isinstance(error, StartError):
             raise
-        raise StartError("\n".join(str(one) for one in error.findings)) from None
+        raise StartError("\n".join(str(finding) for finding in error.findings)) from None
 
 
 def _text(file: Path) -> str:

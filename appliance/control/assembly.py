@@ -135,7 +135,7 @@ class Parts:
             relays=settings.relays,
         )
         self._addresses = Addresses(
-            [(one.network, one.address) for one in settings.advertise],
+            [(advertised.network, advertised.address) for advertised in settings.advertise],
             base.lifeline.route_to if settings.isolation == "netns" else None,
             base.sockets[RVMASTER].getsockname()[0],
         )
@@ -335,7 +335,11 @@ class Parts:
 
     def machines(self) -> dict[str, int]:
         """The number of nodes by address."""
-        return Counter(str(one.host) for one in self.registry.all() if one.life is Life.LIVE and not one.own)
+        return Counter(
+            str(incarnation.host)
+            for incarnation in self.registry.all()
+            if incarnation.life is Life.LIVE and not incarnation.own
+        )
 
     def _take_back(self, effects: Effects) -> int:
         self.enactor.carry_out(effects)

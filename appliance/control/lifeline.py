@@ -135,9 +135,9 @@ class ControlLifeline:
                 self._enclosed(message)
             case messages.EndpointFound():
                 waiting, self._endpoints = self._endpoints, []
-                for one in waiting:
-                    if not one.done():
-                        one.set_result(message)
+                for waiter in waiting:
+                    if not waiter.done():
+                        waiter.set_result(message)
             case messages.RouteFound(host, address):
                 futures = self._routes.pop(host, None)
                 if futures is not None:

@@ -74,8 +74,12 @@ class Looks:
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.registry, self.parts.relay
         # The appliance's own nodes are not of the robot, here as in the graph.
-        lives = [one.life for one in registry.all() if not one.own]
-        named = {(one.kind, one.resource) for node, one in registry.in_order() if not node.own}
+        lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
+        named = {
+            (registration.kind, registration.resource)
+            for node, registration in registry.in_order()
+            if not node.own
+        }
         return Status(
             version=appliance.__version__,
             since=self.started,

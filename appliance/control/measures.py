@@ -28,8 +28,10 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
     Topics and services are named as far as `MOST_RESOURCES` goes (histograms: `MOST_DELAYED`): who registers names
     without end fills `OTHERS`.
     """
-    lives = Counter(one.life for one in parts.registry.all() if not one.own)
-    kinds = Counter(one.kind.value for node, one in parts.registry.in_order() if not node.own)
+    lives = Counter(incarnation.life for incarnation in parts.registry.all() if not incarnation.own)
+    kinds = Counter(
+        registration.kind.value for node, registration in parts.registry.in_order() if not node.own
+    )
     records = parts.monitors.records
     meter, carried = parts.trail.meter, parts.relay.carried
     relayed, delayed = carried_of(carried)
@@ -53,7 +55,7 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
             what: sum(held.get(what, 0) for held in carried.memory.values())
             for what in ("frames", "queues", "latched", "headers")
         },
-        connections=dict(Counter(one.kind for one in parts.relay.connections.values())),
+        connections=dict(Counter(connection.kind for connection in parts.relay.connections.values())),
     )
 
 
@@ -67,8 +69,8 @@ def carried_of(carried: Carried) -> tuple[dict[str, list[int]], dict[str, list[f
     """What went through each topic and service since control started, and how late; all incarnations together."""
     rows: list[tuple[str, Traffic]] = [*carried.past.items()]
     rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
-    return by_resource((name, (one.messages, one.bytes, one.dropped)) for name, one in rows), by_resource(
-        ((name, (*one.delays, one.delay_seconds)) for name, one in rows if one.delays), MOST_DELAYED
+    return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
+        ((name, (*row.delays, row.delay_seconds)) for name, row in rows if row.delays), MOST_DELAYED
     )
 
 

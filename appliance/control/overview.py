@@ -15,11 +15,15 @@ from appliance.specifications.allocation import SERVICE, TOPIC
 def graph_of(parts: Parts) -> Graph:
     """The graph now."""
     registry = parts.registry
-    shown = [one for one in registry.all() if one.life is not Life.REPLACED and not one.own]
-    live = [one for one in shown if one.life is Life.LIVE]
-    names = {one.key: one.name for one in shown}
+    shown = [
+        incarnation
+        for incarnation in registry.all()
+        if incarnation.life is not Life.REPLACED and not incarnation.own
+    ]
+    live = [incarnation for incarnation in shown if incarnation.life is Life.LIVE]
+    names = {incarnation.key: incarnation.name for incarnation in shown}
     return Graph(
-        [_node(one) for one in sorted(shown, key=lambda one: one.name)],
+        [_node(incarnation) for incarnation in sorted(shown, key=lambda one: one.name)],
         _topics(parts, live, names),
         _services(parts, live, names),
     )
@@ -40,14 +44,14 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
     relay = parts.relay
     publishers: dict[str, list[Publisher]] = {}
     subscribers: dict[str, list[str]] = {}
-    for one in live:
-        for registration in one.registrations.values():
+    for incarnation in live:
+        for registration in incarnation.registrations.values():
             topic = registration.resource
             if registration.kind is Kind.PUBLICATION:
-                publisher = Publisher(**asdict(relay.flow(one.key, topic)), node=one.name)
+                publisher = Publisher(**asdict(relay.flow(incarnation.key, topic)), node=incarnation.name)
                 publishers.setdefault(topic, []).append(publisher)
             elif registration.kind is Kind.SUBSCRIPTION:
-                subscribers.setdefault(topic, []).append(one.name)
+                subscribers.setdefault(topic, []).append(incarnation.name)
     return [
         Topic(
             name,
@@ -65,21 +69,21 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
     relay = parts.relay
     return [
         Service(
-            **asdict(relay.flow(one.key, registration.resource)),
+            **asdict(relay.flow(incarnation.key, registration.resource)),
             name=registration.resource,
-            node=one.name,
+            node=incarnation.name,
             mediated=parts.mediation.carries_service(registration.resource),
             connections=_connections(relay, SERVICE, registration.resource, names),
         )
-        for one in live
-        for registration in one.registrations.values()
+        for incarnation in live
+        for registration in incarnation.registrations.values()
         if registration.kind is Kind.SERVICE
     ]
 
 
 def _connections(relay: RelayControl, kind: str, resource: str, names: dict[str, str]) -> list[Connection]:
     return [
-        Connection(names[one.key], one.caller_id, one.host)
-        for one in relay.connections.values()
-        if one.kind == kind and one.resource == resource and one.key in names
+        Connection(names[connection.key], connection.caller_id, connection.host)
+        for connection in relay.connections.values()
+        if connection.kind == kind and connection.resource == resource and connection.key in names
     ]

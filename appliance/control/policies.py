@@ -248,7 +248,7 @@ class Policies:
         try:
             return judge(text, file, known).accepted()
         except PolicyError as error:
-            raise PolicyRefusedError([str(one) for one in error.findings]) from error
+            raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
     def _next_number(self) -> int:
         return max([self.revision, *(row.revision for row in self._store.revisions())]) + 1
@@ -265,7 +265,7 @@ class Policies:
             who=by or who,
             file=policy.file,
             revoked=revoked,
-            warnings=[str(one) for one in policy.warnings][:100],
+            warnings=[str(warning) for warning in policy.warnings][:100],
         )
         return revoked
 
@@ -276,7 +276,9 @@ class Policies:
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
         self._trial.changed(before, confirm_within)
-        return Loaded(self.revision, before, [str(one) for one in policy.warnings], revoked, self.confirm_by)
+        return Loaded(
+            self.revision, before, [str(warning) for warning in policy.warnings], revoked, self.confirm_by
+        )
 
     async def _go_back(self, revision: int) -> None:
         self.rollback(revision, who="not confirmed in time")

@@ -80,7 +80,7 @@ class PolicyOrders:
             text=row.text,
             policy_file=str(policies.file),
             differs_from_file=policies.differs_from_file,
-            warnings=[str(one) for one in policies.current.warnings],
+            warnings=[str(warning) for warning in policies.current.warnings],
             confirm_by=policies.confirm_by,
             **policies.with_cases(known).fields(),
         )

@@ -296,7 +296,7 @@ class _Control:
             "inner_port": base.port(INNER),
             "token": token,
             "own_port": base.port(_OWN),
-            "warnings": [str(one) for one in base.policies.current.warnings[:_WARNINGS]],
+            "warnings": [str(warning) for warning in base.policies.current.warnings[:_WARNINGS]],
         }
         self._lifeline.say(messages.Ready(detail))
 

@@ -117,10 +117,10 @@ class Forwarder:
         if missed:
             _log.error("retention removed records before they were forwarded", count=missed)
         through = entries[-1].sequence if entries else position.sequence
-        ready = [one for one in checkpoints if one.sequence <= through or not entries]
+        ready = [checkpoint for checkpoint in checkpoints if checkpoint.sequence <= through or not entries]
         self._look(head - position.sequence, entries)
-        messages = [self._formatter.record(one) for one in entries if self._wanted(one.record)]
-        messages += [self._formatter.checkpoint(one) for one in ready]
+        messages = [self._formatter.record(entry) for entry in entries if self._wanted(entry.record)]
+        messages += [self._formatter.checkpoint(checkpoint) for checkpoint in ready]
         if messages:
             self._receiver.send(messages)
         last = ready[-1].number if ready else position.checkpoint

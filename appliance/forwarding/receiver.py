@@ -85,7 +85,7 @@ class StreamReceiver:
             connection = self._socket = self._connect()
         _require_open(connection)
         connection.settimeout(_SEND_SECONDS)
-        connection.sendall(b"".join(b"%d %b" % (len(one), one) for one in messages))
+        connection.sendall(b"".join(b"%d %b" % (len(message), message) for message in messages))
         _await_acknowledgement(connection)
 
     def _connect(self) -> socket.socket:

@@ -98,7 +98,7 @@ def _message(head: str, element: str, fields: dict[str, str], text: str) -> byte
 
 def _value(value: str, room: int) -> str:
     """A parameter's value, escaped, in at most `room` bytes."""
-    pieces = [f"\\{one}" if one in '\\"]' else one for one in _ascii(value)]
+    pieces = [f"\\{character}" if character in '\\"]' else character for character in _ascii(value)]
     if sum(map(len, pieces)) <= room:
         return "".join(pieces)
     left, kept = room - len(_CUT), []
@@ -122,7 +122,7 @@ def _shortened(text: str, room: int) -> str:
 
 def _name(text: str, longest: int) -> str:
     """A field of the header: printable ASCII without space, or `-` where nothing is left (RFC 5424, 6)."""
-    return "".join(one for one in text if "!" <= one <= "~")[:longest] or "-"
+    return "".join(character for character in text if "!" <= character <= "~")[:longest] or "-"
 
 
 def _time(time: int) -> str:

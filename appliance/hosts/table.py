@@ -90,7 +90,7 @@ class HostTable:
         """A host that is enrolled. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
-            known = ", ".join(one.name for one in self.enrolled()[:20]) or "none"
+            known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
             raise UnknownHostError(f"no host {name[:80]!r} is enrolled; enrolled are: {known}")
         return row
 
@@ -130,7 +130,7 @@ class HostTable:
                 f"{name[:80]!r} is no name for a host: letters, digits and . _ -, beginning and ending with a"
                 f" letter or digit, at most 63, and not {APPLIANCE_NAME}"
             )
-        twin = next((one for one in self.rows if one.lower() == name.lower() and one != name), None)
+        twin = next((other for other in self.rows if other.lower() == name.lower() and other != name), None)
         if twin is not None:
             raise HostRefusedError(
                 f"{name} differs from {twin} only in large and small letters, which IKE ignores"
@@ -151,7 +151,7 @@ class HostTable:
         taken = {row.address: row.name for row in self.rows.values() if row.name != name}
         taken |= {address: one for address, one in awaited.items() if one != name}
         if wanted is None:
-            reserved = {one.address for one in self.declared.hosts.values()}
+            reserved = {host.address for host in self.declared.hosts.values()}
             for one in itertools.islice(self.pool.hosts(), 1, None):
                 if str(one) not in taken and str(one) not in reserved:
                     return str(one)

@@ -190,7 +190,7 @@ def _seen(name: str, row: Any) -> Seen | None:
     host = host_of(name)
     if host is None or _text(row, "state") != "ESTABLISHED":
         return None
-    children = [one for one in row.get("child-sas", {}).values() if _text(one, "state") == "INSTALLED"]
+    children = [child for child in row.get("child-sas", {}).values() if _text(child, "state") == "INSTALLED"]
     if not children:
         return None
     return Seen(

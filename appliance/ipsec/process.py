@@ -113,7 +113,7 @@ class TunnelProcess:
             if self._vici is None:
                 self._vici = await self._start(wanted)
             vici = self._vici
-            tunnels = [Tunnel(one.name, one.address, one.serial) for one in wanted.hosts]
+            tunnels = [Tunnel(host.name, host.address, host.serial) for host in wanted.hosts]
             material = Material(wanted.address, wanted.authority, wanted.certificate, wanted.revocations)
             await self._in_turn(partial(vici.provision, tunnels, material))
             self._taken = wanted.number
@@ -197,8 +197,8 @@ class TunnelProcess:
             messages.TunnelsReported(
                 self._taken,
                 [
-                    messages.TunnelSeen(one.name, one.remote, one.seconds, one.bytes_in, one.bytes_out)
-                    for one in rows
+                    messages.TunnelSeen(row.name, row.remote, row.seconds, row.bytes_in, row.bytes_out)
+                    for row in rows
                 ],
             )
         )

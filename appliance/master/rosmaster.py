@@ -179,8 +179,8 @@ class RosMaster:
     async def _in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
         outcomes = await self._calls.in_order(calls)
         return [
-            one if isinstance(one, CallFailedError) else _answer_to(method, one)
-            for (method, _params), one in zip(calls, outcomes, strict=True)
+            call if isinstance(call, CallFailedError) else _answer_to(method, call)
+            for (method, _params), call in zip(calls, outcomes, strict=True)
         ]
 
     async def _call(self, make: Callable[[], Awaitable[_T]]) -> _T:

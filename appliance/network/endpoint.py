@@ -62,7 +62,10 @@ def _first(namespace: Namespace, route: links.DefaultRoute, version: int) -> str
         return links.source_address_for(namespace, route.gateway)
     held = links.addresses_by_interface(namespace).get(route.interface, [])
     own = [text.partition("/")[0] for text in held]
-    return next((one for one in own if ipaddress.ip_address(one).version == version and _counts(one)), None)
+    return next(
+        (address for address in own if ipaddress.ip_address(address).version == version and _counts(address)),
+        None,
+    )
 
 
 def _counts(text: str) -> bool:

@@ -70,7 +70,7 @@ class ProbeResult:
     @property
     def closed(self) -> bool:
         """Nobody got through and every attempt had a clear end."""
-        return not any(one.outcome in (Outcome.REACHED, Outcome.UNCLEAR) for one in self.attempts)
+        return not any(attempt.outcome in (Outcome.REACHED, Outcome.UNCLEAR) for attempt in self.attempts)
 
     @property
     def proves(self) -> bool:
@@ -84,7 +84,9 @@ class ProbeResult:
 
     def describe(self) -> str:
         """Say in one line what was seen."""
-        seen = ", ".join(f"{one.address} {one.detail or one.outcome}" for one in self.attempts)
+        seen = ", ".join(
+            f"{attempt.address} {attempt.detail or attempt.outcome}" for attempt in self.attempts
+        )
         return f"port {self.port} as uid {self.uid}: {seen}"
 
 

@@ -104,7 +104,7 @@ def protection(
             source = f"{keyword} saddr {addresses} accept"
             rules += [f"{through}{source}" for through in (_THROUGH_IPSEC if tunnelled else ("",))]
             leaving.append(f"{keyword} daddr {addresses} {_SYN} iif != 0 fib saddr type local counter drop")
-    rules += [f"{one.protocol} dport {one.ports} accept" for one in dict.fromkeys(services)]
+    rules += [f"{service.protocol} dport {service.ports} accept" for service in dict.fromkeys(services)]
     rules += [
         f"tcp dport {ports} {_SYN} counter reject with tcp reset",
         f"udp dport {ports} ct state {{ new, invalid }} counter drop",

@@ -30,4 +30,4 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
     """The bridges of this namespace: a container has none, the machine that runs containers has one."""
-    return sorted(one.name for one in classes.glob("*") if (one / "bridge").is_dir())
+    return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())

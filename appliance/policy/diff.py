@@ -41,7 +41,11 @@ def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Differen
     for request in requests:
         counts[request] = counts.get(request, 0) + 1
     differences = (_difference(old, new, request, count) for request, count in counts.items())
-    return [one for one in differences if _answer(one.old) != _answer(one.new) or one.limited]
+    return [
+        difference
+        for difference in differences
+        if _answer(difference.old) != _answer(difference.new) or difference.limited
+    ]
 
 
 def _difference(old: Policy, new: Policy, request: Request, count: int) -> Difference:

@@ -43,7 +43,7 @@ class Explanation:
     @property
     def allowed(self) -> bool:
         """Whether the whole call passes."""
-        return self.decision.allowed and all(one.allowed for one in self.also)
+        return self.decision.allowed and all(other.allowed for other in self.also)
 
     @property
     def node(self) -> "Explanation | None":
@@ -56,7 +56,7 @@ class Explanation:
         return self._also(Category.COMMAND)
 
     def _also(self, category: Category) -> "Explanation | None":
-        return next((one for one in self.also if one.request.category is category), None)
+        return next((other for other in self.also if other.request.category is category), None)
 
 
 def explain(policy: Policy, request: Request) -> Explanation:
@@ -89,12 +89,12 @@ def _explain(policy: Policy, right: Right) -> Explanation:
 def render(explanation: Explanation) -> Iterator[str]:
     """The explanation as lines of text for a person."""
     yield from _render_one(explanation)
-    for one in explanation.also:
-        if one.request.category is Category.NODE:
+    for other in explanation.also:
+        if other.request.category is Category.NODE:
             yield "and the node rule, because this call makes a node part of the graph:"
         else:
-            yield f"and the rule for {one.request.resource}, with which a client learns where the service is:"
-        yield from ("  " + line for line in _render_one(one))
+            yield f"and the rule for {other.request.resource}, with which a client learns where the service is:"
+        yield from ("  " + line for line in _render_one(other))
     if explanation.also:
         yield f"together: {'allowed' if explanation.allowed else 'denied'}"
 

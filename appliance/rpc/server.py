@@ -272,7 +272,7 @@ class _Connection(Front):
     @property
     def holding(self) -> int:
         """Bytes that are held for it and that its end sets free: not those of a request that is being served."""
-        return len(self._body) + self._unsent + sum(_held_by(one) for one, _ in self._pending)
+        return len(self._body) + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
         """Count for nothing any more, once; what is being served goes on, and its answer is thrown away."""

@@ -165,10 +165,13 @@ class Visitors(Generic[Holder]):
         """The connection that holds most of all that may be ended for this host."""
         mine, most = self._standing(host), self.held.held(host)
         able = [
-            one
-            for one in self._queues[Stage.UNFINISHED]
-            if one.holding
-            and (self._standing(self._of[one][0]) < mine or self.held.held(self._of[one][0]) > most)
-            and self._standing(self._of[one][0]) <= mine
+            connection
+            for connection in self._queues[Stage.UNFINISHED]
+            if connection.holding
+            and (
+                self._standing(self._of[connection][0]) < mine
+                or self.held.held(self._of[connection][0]) > most
+            )
+            and self._standing(self._of[connection][0]) <= mine
         ]
         return max(able, key=lambda one: one.holding, default=None)

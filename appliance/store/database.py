@@ -119,10 +119,10 @@ class Database:
             self._hurry.clear()
             while len(group) < _GROUP and not self._queue.empty():
                 group.append(self._queue.get())
-            self._commit([one for one in group if isinstance(one, _Queued)])
-            for one in group:
-                if callable(one):
-                    one()
+            self._commit([item for item in group if isinstance(item, _Queued)])
+            for item in group:
+                if callable(item):
+                    item()
             if None in group:
                 return
 
@@ -130,8 +130,8 @@ class Database:
         while statements:
             try:
                 self._connection.execute("BEGIN")
-                for one in statements:
-                    self._connection.execute(one.sql, one.parameters)
+                for statement in statements:
+                    self._connection.execute(statement.sql, statement.parameters)
                 self._connection.execute("COMMIT")
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
@@ -140,7 +140,7 @@ class Database:
                 if self._closing.wait(0.5):
                     return
             else:
-                self._ahead.taken(sum(one.ahead for one in statements))
+                self._ahead.taken(sum(statement.ahead for statement in statements))
                 return
 
     def _catch_up(self) -> None:

@@ -31,7 +31,7 @@ class UnknownRevisionError(Exception):
 def wanted(rows: Sequence[N], revision: int | None, present: int) -> N:
     """A kept revision (None: the one before the present). Raises `UnknownRevisionError`."""
     known = {row.revision: row for row in rows}
-    number = revision if revision is not None else max((one for one in known if one < present), default=0)
+    number = revision if revision is not None else max((node for node in known if node < present), default=0)
     if number not in known:
         kept = ", ".join(map(str, sorted(known))) or "none"
         asked = "before this one" if revision is None else revision

@@ -109,7 +109,9 @@ class Life:
             return "", []
         calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.walls.calls)
         files = f"Landlock {self.walls.landlock}" if self.walls.landlock else None
-        return ", ".join(filter(None, (calls, files))) or "none", [one[:200] for one in self.walls.lacks[:8]]
+        return ", ".join(filter(None, (calls, files))) or "none", [
+            lack[:200] for lack in self.walls.lacks[:8]
+        ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
         """Tell the process something; nothing happens when it is gone (its death is reported by itself)."""

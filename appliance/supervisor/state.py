@@ -36,7 +36,7 @@ def foreign(path: Path) -> str | None:
     """
     if not path.is_dir():
         return None
-    found = sorted(one.name for one in path.iterdir() if one.name != _OF_THE_DISK)
+    found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
     if not found or _has_lock(path) or (path / _RESTORED).is_file():
         return None
     more = " …" if len(found) > _SHOWN else ""

@@ -271,7 +271,7 @@ class Supervisor:
         life.walls = walls
         if walls.lacks:
             log.warning(
-                "process lacks a wall", role=life.role, lacks=[_printable(one) for one in walls.lacks]
+                "process lacks a wall", role=life.role, lacks=[_printable(lack) for lack in walls.lacks]
             )
         self._tell_processes()
 
@@ -494,7 +494,10 @@ def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
 
 def _printable(text: str) -> str:
     """Text that a terminal shows and does not obey; lines stay lines."""
-    return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
+    return "".join(
+        character if character.isprintable() or character == "\n" else ascii(character)[1:-1]
+        for character in text
+    )
 
 
 def _end_of(code: int) -> str:

@@ -131,7 +131,7 @@ def _vouched(result: Verification) -> str:
 def _verdict(result: Verification) -> str:
     if result.ok:
         return "The log is complete and unchanged."
-    if all(one.kind is Kind.PROVES_NOTHING for one in result.findings):
+    if all(finding.kind is Kind.PROVES_NOTHING for finding in result.findings):
         return "Nothing is wrong in the log itself, but the checkpoints kept elsewhere prove nothing of it."
     return "The log was tampered with or is damaged."
 

@@ -49,7 +49,9 @@ class FileLog:
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         """The same as evidence: sequences, and lines of NDJSON with their places in the chain."""
-        return ((one.sequence, evidence_line(one, chain)) for one, chain in evidence(self._path, wanted))
+        return (
+            (entry.sequence, evidence_line(entry, chain)) for entry, chain in evidence(self._path, wanted)
+        )
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
         """The last records that match, the oldest first; then, if `on`, those that come, without end."""

@@ -104,8 +104,8 @@ def show(
             fail(f"no record with the id {record_id!a} is in the log", 1)
         if as_json_lines:
             around = {
-                "before": [as_object(one) for one in shown.before],
-                "after": [as_object(one) for one in shown.after],
+                "before": [as_object(record) for record in shown.before],
+                "after": [as_object(record) for record in shown.after],
             }
             write(json.dumps(as_object(shown.entry) | {"neighbours": around}))
         else:

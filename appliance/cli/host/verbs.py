@@ -147,9 +147,9 @@ def list_hosts(
             say("  ".join(_words(row)))
     if as_json or group is not None:
         return
-    for one in body.machines:
-        nodes = f"{one.nodes} nodes in clear text"
-        say("  ".join([f"{one.address:<37} {nodes:<13}", _ports_words(one.ports)]))
+    for machine in body.machines:
+        nodes = f"{machine.nodes} nodes in clear text"
+        say("  ".join([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)]))
     for trouble in body.troubles:
         say(f"! {trouble}")
 
@@ -166,8 +166,8 @@ def reload(running: Appliance, as_json: Json = False) -> None:
     for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
         if names:
             say(f"{word}: {', '.join(names)}")
-    for one in body.divergence:
-        say(f"! {one}")
+    for difference in body.divergence:
+        say(f"! {difference}")
 
 
 @app.command()

@@ -50,9 +50,9 @@ def _by_dry_run(appliance: Appliance, file: Path) -> Trial:
         if problem.findings is None:
             body_or_exit(AdminAnswer(False, error=problem.lines[0]), as_json=False)
             raise
-        return Trial([_finding(one, file) for one in problem.findings], [])
-    warnings = [_finding(one, file) for one in report["warnings"]]
-    return Trial(warnings, [Ending(**one) for one in report["ends"]])
+        return Trial([_finding(finding, file) for finding in problem.findings], [])
+    warnings = [_finding(row, file) for row in report["warnings"]]
+    return Trial(warnings, [Ending(**row) for row in report["ends"]])
 
 
 def _finding(given: dict[str, Any], file: Path) -> Finding:

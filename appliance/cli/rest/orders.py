@@ -24,7 +24,7 @@ def carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     body = _answer(rest, operation, request)
     match asked:
         case admin.MonitorLoad() | admin.MonitorReload() | admin.MonitorRemove() | admin.MonitorRollback():
-            body["warnings"] = [_line(one) for one in body["warnings"]]
+            body["warnings"] = [_line(line) for line in body["warnings"]]
         case admin.HostPorts(name):
             body = {"name": name, "ports": body, "revision": 0}
     try:

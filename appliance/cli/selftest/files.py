@@ -71,7 +71,7 @@ def _cases(file: Path, policy: Policy) -> Iterator[Found]:
     except (OSError, UnicodeDecodeError, PolicyError) as error:
         yield fail("policy tests", str(error), "a policy whose tests cannot be read is not reloaded")
         return
-    failed = [one for one in results if not one.passed]
+    failed = [result for result in results if not result.passed]
     if failed:
         yield fail("policy tests", str(failed[0]), f"rosrv policy test {file}")
     else:

@@ -148,8 +148,8 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
             if is_last:
                 raise
         else:
-            new = [one.record for one in page.entries if one.sequence > before]
-            if any(one.caller_id == caller or (refusal and one.id in refusal) for one in new):
+            new = [entry.record for entry in page.entries if entry.sequence > before]
+            if any(record.caller_id == caller or (refusal and record.id in refusal) for record in new):
                 return True
             if is_last:
                 return False

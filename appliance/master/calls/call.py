@@ -251,8 +251,8 @@ class Call(Generic[S]):
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
-        places = [place for place, one in enumerate(parameters) if one.resource]
-        own = [place for place, one in enumerate(parameters) if one.name == "caller_api"]
+        places = [place for place, parameter in enumerate(parameters) if parameter.resource]
+        own = [place for place, parameter in enumerate(parameters) if parameter.name == "caller_api"]
         object.__setattr__(self, "resource", places[0] if places else None)
         object.__setattr__(self, "api", own[0] if own else None)
 

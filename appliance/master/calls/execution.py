@@ -137,8 +137,8 @@ class Execution:
 
         Who subscribes to a parameter hears of every write after the value that answers, so that has a turn, too.
         """
-        keys = [one.resource for one in attempts if one.call.kind is Kind.PARAMETER]
-        host, values = attempts[0].caller.peer.host, [one.value for one in attempts]
+        keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
+        host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
         async with self._writes.alone(keys), self._large_writes.turn(host, values):
             yield
 

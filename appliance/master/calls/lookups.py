@@ -65,7 +65,7 @@ class LookupCalls:
         shown: dict[Kind, list[Value]] = {Kind.PUBLICATION: [], Kind.SUBSCRIPTION: [], Kind.SERVICE: []}
         for kind, resource, holders in self.registry.resources():
             names: list[Value] = [
-                one.name for one in holders if kind is not Kind.PUBLICATION or one.name != self.unseen
+                pid.name for pid in holders if kind is not Kind.PUBLICATION or pid.name != self.unseen
             ]
             if kind in shown and names:
                 shown[kind].append([resource, names])

@@ -46,9 +46,9 @@ class NodeCalls:
         target = _target(caller)
         if (Kind.PUBLICATION, topic) not in target.registrations:
             return [-1, f"Not a publisher of [{topic}]", []]
-        names = [one[0] for one in protocols if one]
+        names = [protocol[0] for protocol in protocols if protocol]
         if "TCPROS" not in names:
-            offered = ", ".join(str(one)[:40] for one in names) or "nothing"
+            offered = ", ".join(str(name)[:40] for name in names) or "nothing"
             return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # who has no way but the relay
         if not own and not self.mediation.carries_topic(topic):
@@ -146,24 +146,32 @@ class NodeCalls:
     async def get_bus_stats(self, caller: Caller) -> Answer:
         """`getBusStats(caller_id)` → `[publications, subscriptions, services]`, from the relay's counters."""
         target = _target(caller)
-        connections = [one for one in self.relay.connections.values() if one.kind == TOPIC_CONNECTION]
+        connections = [
+            connection
+            for connection in self.relay.connections.values()
+            if connection.kind == TOPIC_CONNECTION
+        ]
         published: list[Value] = []
         for topic in target.resources(Kind.PUBLICATION):
             traffic = self.relay.traffic.get((target.key, topic))
             size, count = (traffic.bytes, traffic.messages) if traffic is not None else (0, 0)
             rows: list[Value] = [
-                [one.number, size, count, True]
-                for one in connections
-                if one.key == target.key and one.resource == topic
+                [connection.number, size, count, True]
+                for connection in connections
+                if connection.key == target.key and connection.resource == topic
             ]
             published.append([topic, size, rows])
         subscribed: list[Value] = []
         for topic in target.resources(Kind.SUBSCRIPTION):
             rows = []
-            for one in connections:
-                if one.resource == topic and one.caller_id == target.name and one.host == str(target.host):
-                    traffic = self.relay.traffic.get((one.key, topic))
-                    rows.append([one.number, traffic.bytes if traffic is not None else 0, -1, True])
+            for connection in connections:
+                if (
+                    connection.resource == topic
+                    and connection.caller_id == target.name
+                    and connection.host == str(target.host)
+                ):
+                    traffic = self.relay.traffic.get((connection.key, topic))
+                    rows.append([connection.number, traffic.bytes if traffic is not None else 0, -1, True])
             subscribed.append([topic, rows])
         return [1, "", [published, subscribed, []]]
 
@@ -175,7 +183,11 @@ def _target(caller: Caller) -> Incarnation:
 
 
 def _typed(target: Incarnation, kind: Kind) -> list[Value]:
-    return [[one.resource, one.detail] for one in target.registrations.values() if one.kind is kind]
+    return [
+        [registration.resource, registration.detail]
+        for registration in target.registrations.values()
+        if registration.kind is kind
+    ]
 
 
 NODE_CALLS: dict[str, Call[NodeCalls]] = {

@@ -167,7 +167,7 @@ class ParameterCalls:
         except EncodingError as error:
             if len(calls) == 1:
                 return [error]
-            return [outcome for one in calls for outcome in await self._make([one])]  # nothing was sent yet
+            return [outcome for call in calls for outcome in await self._make([call])]  # nothing was sent yet
         except CallFailedError as error:
             return [error] * len(calls)
 

@@ -173,15 +173,15 @@ class RegistrationCalls:
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
     """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
     kind, caller = denied.call.kind, denied.caller
-    asked = next(one for one in denied.arguments if isinstance(one, ApiUri))
+    asked = next(argument for argument in denied.arguments if isinstance(argument, ApiUri))
     kept: list[Durable] = []
-    for one in registry.all():
-        shelved = None if kind is None else one.shelf.get((kind, denied.resource))
-        if shelved is None or (one.name, one.host) != (caller.caller_id, caller.peer.host):
+    for incarnation in registry.all():
+        shelved = None if kind is None else incarnation.shelf.get((kind, denied.resource))
+        if shelved is None or (incarnation.name, incarnation.host) != (caller.caller_id, caller.peer.host):
             continue
         by_port = shelved.kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
-        if by_port or one.api_text == asked.text:
-            kept += registry.unshelve(one, shelved.kind, shelved.resource)
+        if by_port or incarnation.api_text == asked.text:
+            kept += registry.unshelve(incarnation, shelved.kind, shelved.resource)
     return kept
 
 

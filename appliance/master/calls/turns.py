@@ -83,7 +83,7 @@ def _ended(keys: Collection[str]) -> tuple[str, ...]:
 
 
 def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
-    return any(one.startswith(others) for one in mine) or any(one.startswith(mine) for one in others)
+    return any(one.startswith(others) for one in mine) or any(other.startswith(mine) for other in others)
 
 
 @dataclass(slots=True)

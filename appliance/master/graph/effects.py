@@ -33,7 +33,7 @@ class NodeCall:
         if self.size:
             return self.size
         texts = [one for given in self.parameters for one in (given if isinstance(given, list) else [given])]
-        return _CALL_BYTES + sum(_TEXT_BYTES + len(one) for one in texts if isinstance(one, str))
+        return _CALL_BYTES + sum(_TEXT_BYTES + len(text) for text in texts if isinstance(text, str))
 
 
 @dataclass(frozen=True, slots=True)

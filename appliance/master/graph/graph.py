@@ -180,9 +180,9 @@ class Graph:
         registrations = list(incarnation.registrations.values())
         effects: Effects = [*self._registry.forget(incarnation), *self._tell_withdrawn(registrations)]
         if self._registry.holder(incarnation.name) is None:
-            for one in registrations:
-                if one.kind is Kind.SUBSCRIPTION:
-                    effects += self._give_up(incarnation, one.resource)
+            for registration in registrations:
+                if registration.kind is Kind.SUBSCRIPTION:
+                    effects += self._give_up(incarnation, registration.resource)
         return [*effects, *self._close(incarnation), DropCalls(incarnation)]
 
     def _close(self, incarnation: Incarnation) -> Effects:
@@ -215,10 +215,12 @@ class Graph:
             return []
         effects: Effects = []
         for node in self._registry.live():
-            for one in node.registrations.values():
+            for registration in node.registrations.values():
                 parts = ((Part.PUBLISHER, node.host), (Part.TOPIC, None))
-                if one.kind is Kind.PUBLICATION and _differ(before, now, one.resource, parts):
-                    effects.append(Place(node, one.kind, one.resource, one.detail))
+                if registration.kind is Kind.PUBLICATION and _differ(
+                    before, now, registration.resource, parts
+                ):
+                    effects.append(Place(node, registration.kind, registration.resource, registration.detail))
             for row in self._grants.of(node.key):
                 reader = ((Part.SUBSCRIBER, ipaddress.ip_address(row.host)),)
                 if row.kind == TOPIC and _differ(before, now, row.resource, reader):
@@ -230,11 +232,19 @@ class Graph:
     def tell(self, topic: str, *, always: bool = False) -> Effects:
         """Give every subscriber of a topic its list, if it has another one (or `always`)."""
         subscribers = self._registry.registered(Kind.SUBSCRIPTION, topic)
-        return [effect for one in subscribers for effect in self._tell_one(one, topic, always=always)]
+        return [
+            effect
+            for subscriber in subscribers
+            for effect in self._tell_one(subscriber, topic, always=always)
+        ]
 
     def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> Effects:
         """Give every subscriber the lists of all (the concerned) topics, once: after a rebuild or a new relay."""
-        topics = {one.resource for _node, one in self._registry.in_order() if one.kind is Kind.SUBSCRIPTION}
+        topics = {
+            registration.resource
+            for _node, registration in self._registry.in_order()
+            if registration.kind is Kind.SUBSCRIPTION
+        }
         return [
             effect for topic in sorted(topics) if concerned(topic) for effect in self.tell(topic, always=True)
         ]
@@ -243,7 +253,7 @@ class Graph:
         """Have every subscriber of a topic drop its publishers and take them again: they are reached elsewhere."""
         publishers = list(self._registry.registered(Kind.PUBLICATION, topic))
         subscribers = self._registry.registered(Kind.SUBSCRIPTION, topic)
-        return [effect for one in subscribers for effect in self.renew(one, topic, publishers)]
+        return [effect for subscriber in subscribers for effect in self.renew(subscriber, topic, publishers)]
 
     def remind(self, subscriber: Incarnation, topic: str) -> Effects:
         """Give a subscriber its list of a topic once more; an empty one when the policy took the topic from it."""
@@ -305,7 +315,9 @@ class Graph:
         return self._registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
 
     def _tell_withdrawn(self, registrations: Iterable[Registration]) -> Effects:
-        topics = [one.resource for one in registrations if one.kind is Kind.PUBLICATION]
+        topics = [
+            registration.resource for registration in registrations if registration.kind is Kind.PUBLICATION
+        ]
         return [effect for topic in topics for effect in self.tell(topic)]
 
 

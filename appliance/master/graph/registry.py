@@ -134,7 +134,9 @@ class Incarnation:
 
     def resources(self, kind: Kind) -> list[str]:
         """What it registered of that kind, in order."""
-        return [one.resource for one in self.registrations.values() if one.kind is kind]
+        return [
+            registration.resource for registration in self.registrations.values() if registration.kind is kind
+        ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,10 +120,10 @@ class Revocation:
     def _registrations(self) -> list[tuple[Incarnation, Registration]]:
         """Every registration that counts now or will when its node is back, in the order they were made."""
         pairs = [
-            (one, each)
-            for one in self._registry.all()
-            if one.life is not Life.REPLACED
-            for each in one.registrations.values()
+            (incarnation, each)
+            for incarnation in self._registry.all()
+            if incarnation.life is not Life.REPLACED
+            for each in incarnation.registrations.values()
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 
@@ -166,4 +166,4 @@ class Revocation:
 
 def revoked(effects: Iterable[Effect]) -> int:
     """How many registrations and grants these effects take back."""
-    return sum(isinstance(one, Record) and one.event == "revoked" for one in effects)
+    return sum(isinstance(effect, Record) and effect.event == "revoked" for effect in effects)

@@ -95,8 +95,10 @@ class Carried:
     def used(self) -> set[PermissionRow]:
         """The grants that somebody is connected by."""
         return {
-            PermissionRow(one.key, one.kind, one.resource, one.host, one.caller_id)
-            for one in self.connections.values()
+            PermissionRow(
+                connection.key, connection.kind, connection.resource, connection.host, connection.caller_id
+            )
+            for connection in self.connections.values()
         }
 
     @property
@@ -123,7 +125,7 @@ class Carried:
     def lost(self, relay: int) -> None:
         """A relay is gone, and its connections and memory with it."""
         self.memory.pop(relay, None)
-        for number in [one for one in self.connections if one[0] == relay]:
+        for number in [connection for connection in self.connections if connection[0] == relay]:
             del self.connections[number]
 
     def forgotten(self, key: str) -> None:

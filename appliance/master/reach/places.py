@@ -65,7 +65,7 @@ class Places:
         """Take new ports from this range from now on, those in use stay; hosts may be named otherwise, too."""
         if ports != self._range:
             self._range = ports
-            used = {one.getsockname()[1] for one in self._sockets.values()}
+            used = {socket.getsockname()[1] for socket in self._sockets.values()}
             self._unused = deque(port for port in ports if port not in used)
         self.taken = self._counted()
 
@@ -107,15 +107,15 @@ class Places:
             while len(opened) < count:
                 opened.append(self._listen())
         except NoPortError:
-            for one in opened:
-                self._unused.append(one.getsockname()[1])
-                one.close()
+            for sock in opened:
+                self._unused.append(sock.getsockname()[1])
+                sock.close()
             raise
-        for one in opened:
-            name = f"port:{one.getsockname()[1]}"
-            self._sockets[name] = one
-            self._keep(name, one)
-        return tuple(one.getsockname()[1] for one in opened)
+        for sock in opened:
+            name = f"port:{sock.getsockname()[1]}"
+            self._sockets[name] = sock
+            self._keep(name, sock)
+        return tuple(sock.getsockname()[1] for sock in opened)
 
     def socket(self, port: int) -> sockets.socket:
         """The listening socket of a port that was opened or adopted."""
@@ -141,13 +141,13 @@ class Places:
             try:
                 opened.append(listen(self._host, port))
             except OSError:
-                for one in opened:
-                    one.close()
+                for sock in opened:
+                    sock.close()
                 return False
-        for one in opened:
-            name = f"port:{one.getsockname()[1]}"
-            self.adopt(name, one)
-            self._keep(name, one)
+        for sock in opened:
+            name = f"port:{sock.getsockname()[1]}"
+            self.adopt(name, sock)
+            self._keep(name, sock)
         known = incarnation.more_relay_ports[: self._each - 2]
         incarnation.more_relay_ports = known + self._open(self._each - 2 - len(known))
         self._own(incarnation.ports, incarnation.host)

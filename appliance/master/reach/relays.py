@@ -179,9 +179,9 @@ class RelayControl:
     def carried_now(self) -> set[Resource]:
         """Topics and services of nodes that live."""
         return {
-            (_WORDS[one.kind], one.resource)
-            for _incarnation, one in self._registry.in_order()
-            if one.kind in _WORDS
+            (_WORDS[registration.kind], registration.resource)
+            for _incarnation, registration in self._registry.in_order()
+            if registration.kind in _WORDS
         }
 
     def _post(self, kind: str, resource: str) -> RelayPost:

@@ -49,10 +49,10 @@ class Entries:
 
     async def end_lost(self, node: Incarnation, registrations: Iterable[Registration]) -> None:
         """Unregister what a lost node had; what is left of it stays when it comes back meanwhile."""
-        for one in registrations:
+        for registration in registrations:
             if node.life is Life.LIVE:
                 return
-            await self.end(node, one.kind, one.resource)
+            await self.end(node, registration.kind, registration.resource)
 
     async def put_back(
         self, node: Incarnation, registrations: Iterable[Registration]
@@ -68,11 +68,14 @@ class Entries:
             async with self._rosmaster.alone():
                 if (await self._rosmaster.call_now("getPid", NAME))[2] != self.pid:
                     raise CallFailedError("the ROS Master is new: the next round tells it everything")
-                for one in registrations:
-                    if node.life is Life.LIVE and (one.kind, one.resource) in node.registrations:
-                        answer = await self.make(node, one)
-                        if one.kind is Kind.PARAMETER and answer[0] == 1:
-                            values.append((one.resource, answer[2]))
+                for registration in registrations:
+                    if (
+                        node.life is Life.LIVE
+                        and (registration.kind, registration.resource) in node.registrations
+                    ):
+                        answer = await self.make(node, registration)
+                        if registration.kind is Kind.PARAMETER and answer[0] == 1:
+                            values.append((registration.resource, answer[2]))
         except CallFailedError:
             self._rosmaster.doubtful.set()
             raise

@@ -161,8 +161,10 @@ class Liveness:
         while True:
             await asyncio.sleep(self._settings.interval)
             known = self._registry.all()
-            self._answered = {one.key: self._answered[one.key] for one in known if one.key in self._answered}
-            self._watchlist.keep_only({one.key for one in known})
+            self._answered = {
+                node.key: self._answered[node.key] for node in known if node.key in self._answered
+            }
+            self._watchlist.keep_only({node.key for node in known})
             for incarnation in known:
                 self.look_at(incarnation)
 
@@ -243,7 +245,11 @@ class Liveness:
             return
         for topic in sorted(missed.topics):
             self._enactor.carry_out(self._graph.remind(incarnation, topic))
-        subscribed = [one for one in incarnation.registrations.values() if one.kind is Kind.PARAMETER]
+        subscribed = [
+            registration
+            for registration in incarnation.registrations.values()
+            if registration.kind is Kind.PARAMETER
+        ]
         if missed.parameters and subscribed:
             await self._enactor.put_back(incarnation, subscribed)
 

@@ -89,4 +89,4 @@ class OwnPublisher:
                 raise CallFailedError(f"{self._name} cannot publish {topic}: {answer[1]!s}")
 
     def _mine(self) -> list[Incarnation]:
-        return [one for one in self._registry.live() if one.of_monitors]
+        return [incarnation for incarnation in self._registry.live() if incarnation.of_monitors]

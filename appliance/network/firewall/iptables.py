@@ -72,7 +72,7 @@ class IptablesBackend:
             raise BackendMissingError(
                 f"address translation is done with nft, not iptables: {'; '.join(elsewhere)}"
             )
-        rendered = [one for rule in rules for one in render_rule(rule)]
+        rendered = [line for rule in rules for line in render_rule(rule)]
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:

@@ -30,6 +30,6 @@ def runnable(program: Path) -> tuple[str, ...]:
 
 def around(*files: Path | None) -> tuple[str, ...]:
     """The folders of these files and folders, and of what they are links to: who saves a file often makes a new one."""
-    given = [one for one in files if one is not None]
-    found = [str(place.parent) for one in given for place in (one.absolute(), one.resolve())]
+    given = [file for file in files if file is not None]
+    found = [str(place.parent) for file in given for place in (file.absolute(), file.resolve())]
     return tuple(dict.fromkeys(found))

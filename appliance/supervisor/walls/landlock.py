@@ -114,7 +114,7 @@ def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
 def _call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
     """The result of a call of the kernel, and its error."""
     libc = ctypes.CDLL(None, use_errno=True)
-    given = [ctypes.c_long(one) if isinstance(one, int) else one for one in arguments]
+    given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
     result: int = libc.syscall(ctypes.c_long(number), *given)
     return result, ctypes.get_errno()
 

@@ -68,7 +68,7 @@ class _Filter:
         """Take `action` for these calls, when all comparisons hold; what this machine does not have is left out."""
         if action == self._otherwise:
             return
-        compared = (_Comparison * len(comparisons))(*(_Comparison(*one) for one in comparisons))
+        compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))
         for name in names:
             number = self._library.seccomp_syscall_resolve_name(name.encode())
             if number < 0:
