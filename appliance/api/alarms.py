@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.status import Status
 from appliance.channel.serving import no_relay, probe_failed
 

@@ -15,7 +15,7 @@ import msgspec
 
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel.admin import MetricsWanted
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import Status
 

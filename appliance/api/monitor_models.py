@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.monitors import MonitorState, Tag
 
 _WHOLE = r"(?!\n)"  # after `$`, which Python finds before a last newline, too

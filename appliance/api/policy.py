@@ -21,7 +21,7 @@ from appliance.api.roles import Viewer, ask
 from appliance.api.routing import Responses, Routes, Tagged, body
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.policy import PolicyInForce, Revisions, RevisionText
 from appliance.policy.explain import Explanation
 from appliance.policy.model import Category, Rule

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.policy.model import Category
 
 LONGEST_REVISION = 10**15

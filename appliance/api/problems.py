@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from starlette.responses import Response
 
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope that has why it was answered as it was

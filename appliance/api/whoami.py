@@ -8,7 +8,7 @@ from appliance.api.roles import Viewer, ask
 from appliance.api.routing import Routes
 from appliance.api.services import Services
 from appliance.channel.admin import ChallengeWanted
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.tokens import Challenge, TokenRole
 
 

@@ -2,7 +2,7 @@
 
 What is exported proves itself elsewhere, also when a filter left most records out: each record has the hash before it
 and its own, the content hashes of those that follow it and are left out (`then`), up to the next record that is
-exported or to the signed checkpoint (`checkpoint`) that seals it. `exported.py` holds that against the public key.
+exported or to the signed checkpoint (`checkpoint`) that seals it. `export_proof.py` holds that against the public key.
 """
 
 import sqlite3

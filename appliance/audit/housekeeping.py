@@ -17,7 +17,7 @@ from typing import Any
 
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.record import Record, Severity
-from appliance.audit.removing import Remover
+from appliance.audit.removal import Remover
 from appliance.audit.signatures import Signatures
 from appliance.audit.writer import ChainWriter
 

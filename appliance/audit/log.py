@@ -32,13 +32,13 @@ from appliance.audit.holders import holders
 from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
 from appliance.audit.kinds import summary
-from appliance.audit.lost import Lost
+from appliance.audit.losses import Lost
 from appliance.audit.record import Record, Severity
-from appliance.audit.removing import Remover
+from appliance.audit.removal import Remover
 from appliance.audit.retention import Retention
 from appliance.audit.room import Room
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
-from appliance.audit.waiting import Waiter, answer
+from appliance.audit.waiters import Waiter, answer
 from appliance.audit.writer import ChainWriter
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE

@@ -9,8 +9,8 @@ import typer
 
 from appliance.audit.output import printable
 from appliance.backup.contents import BackupError
-from appliance.backup.restoring import restore as put_back
-from appliance.backup.taking import back_up
+from appliance.backup.create import back_up
+from appliance.backup.restore import restore as put_back
 from appliance.cli.running import DEFAULT_STATE, State
 
 _NewState = Annotated[

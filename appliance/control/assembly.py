@@ -49,7 +49,7 @@ from appliance.master.upkeep.arrivals import Arrivals
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
 from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
-from appliance.master.upkeep.moving import Moving
+from appliance.master.upkeep.moves import Moving
 from appliance.master.upkeep.publisher import OwnPublisher
 from appliance.master.upkeep.reconcile import Reconciler
 from appliance.master.upkeep.reminders import Reminders

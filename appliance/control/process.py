@@ -29,7 +29,7 @@ from appliance.control.admin import AdminServer
 from appliance.control.administration import Administration
 from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts
 from appliance.control.doors import Doors
-from appliance.control.forwarded import Forwarded
+from appliance.control.forwarder import Forwarded
 from appliance.control.host_orders import HostOrders
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.looks import Looks
@@ -45,9 +45,9 @@ from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
 from appliance.hosts.certification import Certification
-from appliance.hosts.declared import Declared
 from appliance.hosts.endpoint import find_endpoint
 from appliance.hosts.hosts import Hosts
+from appliance.hosts.hosts_file import Declared
 from appliance.hosts.rest_place import rest_place
 from appliance.hosts.table import HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels

@@ -19,7 +19,7 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.authority import Authority, AuthorityError
-from appliance.hosts.awaited import Awaited
+from appliance.hosts.enrolment_tokens import Awaited
 from appliance.hosts.rest_place import RestPlace
 from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels

@@ -14,10 +14,10 @@ from collections.abc import Awaitable, Callable
 from appliance.audit.record import Severity
 from appliance.channel.answers import hosts as answers
 from appliance.channel.answers.status import IpsecState
-from appliance.hosts.awaited import LONGEST_SECONDS, MOST
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
-from appliance.hosts.declared import DeclaredHostsError
+from appliance.hosts.enrolment_tokens import LONGEST_SECONDS, MOST
+from appliance.hosts.hosts_file import DeclaredHostsError
 from appliance.hosts.self_service import SelfService
 from appliance.hosts.table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.view import HostView

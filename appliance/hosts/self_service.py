@@ -18,8 +18,8 @@ import time
 
 from appliance.audit.record import Severity
 from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
-from appliance.hosts.awaited import BadEnrolmentTokenError
 from appliance.hosts.certification import Certification
+from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
 from appliance.hosts.table import HostForbiddenError, HostRefusedError
 from appliance.hosts.view import span
 from appliance.store.hosts import HostRow

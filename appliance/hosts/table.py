@@ -15,7 +15,7 @@ import re
 import time
 
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
-from appliance.hosts.declared import Declared
+from appliance.hosts.hosts_file import Declared
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.store.hosts import CertificateRow, HostRow, NextCertificate, PortsRow, RevokedRow
 from appliance.store.state import StateStore

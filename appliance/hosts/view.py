@@ -7,7 +7,7 @@ from typing import cast
 
 from appliance.channel.answers.hosts import Host, Machine, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
-from appliance.hosts.awaited import Awaited
+from appliance.hosts.enrolment_tokens import Awaited
 from appliance.hosts.table import HostTable
 from appliance.hosts.tunnels import Tunnels
 from appliance.store.hosts import AwaitedRow, HostRow

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.described import told
+from appliance.channel.answers.field_docs import told
 
 Tag = Annotated[
     str,

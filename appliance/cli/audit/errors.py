@@ -8,7 +8,7 @@ import typer
 
 from appliance.audit.copies import CopiesUnreadableError
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.exported import ExportUnreadableError
+from appliance.audit.export_proof import ExportUnreadableError
 from appliance.audit.moment import MomentError
 from appliance.audit.output import printable
 from appliance.audit.query import FilterError

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.audit.exported import ExportVerification
+from appliance.audit.export_proof import ExportVerification
 from appliance.audit.findings import Elsewhere, Kind, Verification
 from appliance.audit.output import Entry, printable, rfc3339, rule_text
 from appliance.audit.record import Record, Severity

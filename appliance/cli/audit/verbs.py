@@ -15,7 +15,7 @@ import msgspec
 import typer
 
 from appliance.audit.copies import read_copies
-from appliance.audit.exported import verify_export
+from appliance.audit.export_proof import verify_export
 from appliance.audit.output import Entry, as_json, as_object
 from appliance.audit.query import Filter
 from appliance.audit.search import LARGEST_PAGE

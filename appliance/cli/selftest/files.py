@@ -14,7 +14,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
 from appliance.config import Settings
-from appliance.hosts.declared import DeclaredHostsError, read_declared
+from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
 from appliance.policy import PolicyError, compile_policy, run_cases
 from appliance.policy.policy import Policy
 from appliance.shipped import SHIPPED

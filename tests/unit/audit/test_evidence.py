@@ -11,7 +11,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.evidence import evidence, evidence_line
-from appliance.audit.exported import ExportUnreadableError, ExportVerification, verify_export
+from appliance.audit.export_proof import ExportUnreadableError, ExportVerification, verify_export
 from appliance.audit.findings import Kind
 from appliance.audit.log import AuditLog
 from appliance.audit.output import as_json

@@ -11,7 +11,7 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
-from appliance.control.forwarded import Forwarded
+from appliance.control.forwarder import Forwarded
 from appliance.forwarding.forwarder import Progress
 from appliance.forwarding.process import Reports
 

@@ -20,8 +20,8 @@ from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, 
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.certification import Certification
-from appliance.hosts.declared import Declared
 from appliance.hosts.hosts import Hosts
+from appliance.hosts.hosts_file import Declared
 from appliance.hosts.rest_place import RestPlace
 from appliance.hosts.table import (
     HostForbiddenError,

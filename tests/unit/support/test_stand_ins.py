@@ -28,7 +28,7 @@ PRIVATE = {
     "support/root_host.py": "a laboratory gives its hosts away, not what they are plugged into",
     "unit/api/test_streams.py": _LET_GO,
     "unit/audit/test_budget.py": _LET_GO,
-    "unit/backup/test_taking.py": "a file changes between two looks of the backup",
+    "unit/backup/test_create.py": "a file changes between two looks of the backup",
     "unit/cli/selftest/test_running.py": "one check of the self-test, without the others",
     "unit/cli/test_status.py": "the screen, without an appliance to ask",
     "unit/control/test_lifeline.py": "the end of control, which ends with its process",

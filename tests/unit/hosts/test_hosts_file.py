@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.hosts.declared import Declared, DeclaredHost, DeclaredHostsError, read_declared
+from appliance.hosts.hosts_file import Declared, DeclaredHost, DeclaredHostsError, read_declared
 
 
 def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The state directory in one file, taken while the appliance runs or not (put back: `backup_restore`).
+"""The state directory in one file, taken while the appliance runs or not (put back: `restore.py`).
 
 Invariants:
 

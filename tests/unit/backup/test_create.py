@@ -17,10 +17,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
 from appliance.audit.verify import verify
-from appliance.backup import taking as backup
+from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
-from appliance.backup.restoring import restore
-from appliance.backup.taking import back_up
+from appliance.backup.create import back_up
+from appliance.backup.restore import restore
 from appliance.ipsec.checkpoints import SignedCheckpoints
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
@@ -112,7 +112,7 @@ def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
         path.chmod(0o777)
     (state / "signer").chmod(0o700)
     program = (
-        "import os, sys; from pathlib import Path; from appliance.backup.taking import back_up;"
+        "import os, sys; from pathlib import Path; from appliance.backup.create import back_up;"
         "os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534);"
         "back_up(Path(sys.argv[1]), Path(sys.argv[2]))"
     )
