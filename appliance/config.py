@@ -26,6 +26,8 @@ from pydantic import (
     model_validator,
 )
 
+from appliance.site_keys import checked_key
+
 _NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}){1,5}")
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 
@@ -343,6 +345,11 @@ class Settings(_Section):
     )
     hide_publisher: bool = Field(
         default=False, description="leave out what monitors publish in getSystemState"
+    )
+    site_keys: list[Annotated[str, AfterValidator(checked_key)]] = Field(
+        default=[],
+        description="public keys (`ssh-ed25519 BASE64 COMMENT`); with any, a policy or specification that none of them"
+        " signed is refused",
     )
     state: Path = Field(
         default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"

@@ -5,12 +5,13 @@ Everything is a pure function of texts; it runs in a thread, and a stranger's lo
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import msgspec
 
 from appliance.api.problems import Finding, ProblemError
+from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph import Registration
 from appliance.channel.answers.policy import PolicyKnown
 from appliance.policy import (
@@ -42,12 +43,12 @@ class Judgement:
     ends: list[Ending]
 
 
-def judge_change(text: str, current: PolicyKnown, registrations: Iterable[Registration]) -> Judgement:
+def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Judgement:
     """Judge a new text beside the policy in force. Raises `ProblemError` with every finding when it is refused."""
     known = Known.of(msgspec.structs.asdict(current))
     before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:
-        policy = judge(text, "policy", known).accepted()
+        policy = judge(order.text, "policy", known, order.signature).accepted()
     except PolicyError as error:
         raise _refused(error) from error
     live = [Live.of(msgspec.structs.asdict(row)) for row in registrations]
@@ -56,14 +57,15 @@ def judge_change(text: str, current: PolicyKnown, registrations: Iterable[Regist
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:
-    """A text, with the cases beside the policy file if they matter, whether it passes them or not.
+    """A text, signed or not, with the cases beside the policy file if they matter, whether it passes them or not.
 
     Raises `ProblemError` with every finding when the text or the cases cannot be understood.
     """
     text, file = (current.text, current.file) if text is None else (text, "policy")
     known = Known.of(msgspec.structs.asdict(current))
     try:
-        return judge(text, file, known if cases else Known(known.hosts, known.robot))
+        known = replace(known, site_keys=()) if cases else Known(known.hosts, known.robot)
+        return judge(text, file, known)
     except PolicyError as error:
         raise _refused(error) from error
 

@@ -66,7 +66,9 @@ def _add_texts(router: Routes, services: Services) -> None:
         """
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
-        order = admin.MonitorLoad(new.files, new.definitions, new.note, expected, confirm_within)
+        order = admin.MonitorLoad(
+            new.files, new.definitions, new.note, expected, confirm_within, new.signatures
+        )
         return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
     @router.put("/{name}", operation_id="replace_monitor", responses=_CHANGES | UNKNOWN)
@@ -86,10 +88,20 @@ def _add_texts(router: Routes, services: Services) -> None:
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
-            order = admin.MonitorReplace(name, new.text, new.definitions, new.note, expected, confirm_within)
+            order = admin.MonitorReplace(
+                name,
+                new.text,
+                new.definitions,
+                new.note,
+                expected,
+                confirm_within,
+                new.signature,
+                new.signatures,
+            )
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)
-        tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected)
+        signatures = {**new.signatures, file: new.signature}
+        tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected, None, signatures)
         return await _tried(services, tried, bearer)
 
     @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
@@ -166,7 +178,7 @@ async def _tried(services: Services, order: admin.MonitorLoad, bearer: Bearer) -
         text = f"the monitors are at {loaded.tag}, not at {order.expected}: look at them first"
         raise _stale(text, loaded.tag)
     async with services.judging:
-        draft = await asyncio.to_thread(judge, loaded, order.files, order.definitions)
+        draft = await asyncio.to_thread(judge, loaded, order)
     would = Replaced(
         loaded=False,
         revision=loaded.revision,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from appliance.api.monitor_models import EventShown, PropertyShown
 from appliance.api.problems import Finding, ProblemError
+from appliance.channel.admin import MonitorLoad
 from appliance.channel.answers.monitors import Monitors
 
 if TYPE_CHECKING:
@@ -32,14 +33,14 @@ class Draft:
     monitors: list[str]
 
 
-def judge(before: Monitors, files: dict[str, str], definitions: dict[str, str]) -> Draft:
+def judge(before: Monitors, order: MonitorLoad) -> Draft:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
     from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  when needed
 
-    present = Sources(before.files or {}, before.definitions or {})
-    following = present.with_files(files, definitions)
+    present = Sources(before.files or {}, before.definitions or {}, before.signatures or {})
+    following = present.with_files(Sources(order.files, order.definitions, order.signatures))
     try:
-        checked = check(following)
+        checked = check(following, before.site_keys)
     except SpecificationsRefusedError as error:
         raise refusal(
             f"refused; revision {before.revision} of the specifications stays in force", error.findings

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import msgspec
 
+from appliance.api.policy_models import Signature
 from appliance.api.problems import Finding
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.monitors import MonitorState, Tag
@@ -27,6 +28,7 @@ Definitions = Annotated[
     ),
 ]
 Note = Annotated[str, told("kept with the revision: why", max_length=200)]
+Signatures = Annotated[dict[Name, Signature], told("by the names of files and definitions", max_length=2000)]
 
 
 class EventShown(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,6 +93,7 @@ class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     ]
     definitions: Definitions = {}
     note: Note = ""
+    signatures: Signatures = {}
 
 
 class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -99,6 +102,8 @@ class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
     definitions: Definitions = {}
     note: Note = ""
+    signature: Signature = ""
+    signatures: Annotated[Signatures, told("of the definitions")] = {}
 
 
 class Replaced(msgspec.Struct, frozen=True, kw_only=True):

@@ -58,7 +58,7 @@ def routes(services: Services) -> Routes:
                 403, "not-for-this-role", "loading a policy is for admins; operators may use dry_run=1"
             )
         expected = None if dry_run and if_match is None else expected_revision(if_match)
-        order = admin.PolicyLoad(posted.text, posted.note, confirm_within, expected)
+        order = admin.PolicyLoad(posted.text, posted.note, confirm_within, expected, posted.signature)
         report = await _load(services, order, bearer, dry_run=dry_run)
         return Tagged(report, report.revision)
 
@@ -97,7 +97,7 @@ async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, 
     live = (await ask(services.control, admin.RegistrationsWanted(), bearer)).registrations
     try:
         async with services.judging:
-            judgement = await asyncio.to_thread(judge_change, order.text, current, live)
+            judgement = await asyncio.to_thread(judge_change, order, current, live)
     except ProblemError as refusal:
         if dry_run:
             raise

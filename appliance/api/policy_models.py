@@ -11,6 +11,10 @@ from appliance.policy.model import Category
 LONGEST_REVISION = 10**15
 Decided = Literal["allow", "deny", "would deny"]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
+Signature = Annotated[
+    str,
+    told("of the site, where it asks for one: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
+]
 
 
 class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -18,6 +22,7 @@ class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     text: Text
     note: Annotated[str, told("kept with the revision: why", max_length=200)] = ""
+    signature: Signature = ""
 
 
 class Change(msgspec.Struct, frozen=True):

@@ -63,6 +63,7 @@ class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
     note: str = ""
     confirm_within: float | None = None
     expected: int | None = None
+    signature: str = ""
 
 
 class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
@@ -96,6 +97,7 @@ class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors
 class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
+    `signatures` are the site's, by the names of both.
     Of this and every change below, `expected` is the tag of the monitors that it is meant for; None for any. What is
     loaded or removed goes back by itself after `confirm_within` seconds unless confirmed.
     """
@@ -105,10 +107,14 @@ class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor loa
     note: str = ""
     expected: str | None = None
     confirm_within: float | None = None
+    signatures: dict[str, str] = {}
 
 
 class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
-    """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name."""
+    """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.
+
+    `signatures` are those of the definitions.
+    """
 
     name: str
     text: str
@@ -116,6 +122,8 @@ class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor 
     note: str = ""
     expected: str | None = None
     confirm_within: float | None = None
+    signature: str = ""
+    signatures: dict[str, str] = {}
 
 
 class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):

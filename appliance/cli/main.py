@@ -97,6 +97,10 @@ VERBS: dict[str, Verb | Group] = {
             ),
         },
     ),
+    "sign": Verb(
+        "appliance.cli.sign:sign",
+        "Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.",
+    ),
     "version": Verb("appliance.cli.version:version", "Show which version this is, and what it stands on."),
     "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
     "host": Verb(

@@ -6,11 +6,13 @@ that an operator brought into force while the appliance ran outlast a restart, w
 
 import contextlib
 import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.config import Settings
-from appliance.policy import PolicyError, compile_policy
+from appliance.policy import Known, PolicyError, judge
 from appliance.policy.policy import DEFAULT_PORTS
+from appliance.site_keys import read_signature
 from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.errors import StartError
 
@@ -24,9 +26,11 @@ def read_inputs(settings: Settings) -> range:
     """
     state = settings.state / "control" / "state.db"
     if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
-        _require_specifications(settings.monitors)
+        _require_specifications(settings.monitors, settings.site_keys)
     try:
-        return compile_policy(_text(settings.policy), file=str(settings.policy)).ports
+        text, signature = _text(settings.policy), read_signature(settings.policy)
+        known = Known(site_keys=settings.site_keys)
+        return judge(text, str(settings.policy), known, signature).policy.ports
     except (PolicyError, StartError) as error:
         if not _is_read_at_start(state, "policy_revision"):
             return DEFAULT_PORTS
@@ -45,9 +49,9 @@ def _text(file: Path) -> str:
     raise StartError(f"{file}: the policy cannot be read: {why}; nothing was started (--policy FILE)")
 
 
-def _require_specifications(folder: Path) -> None:
+def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
     try:
-        check(read_folder(folder))
+        check(read_folder(folder), site_keys)
     except SpecificationsRefusedError as error:
         raise StartError("\n".join(error.findings)) from None
 

@@ -268,6 +268,7 @@ class Parts:
             relays=Moving(self.relay, self.graph, self.enactor, self.reminders),
             published=self.publisher.wake,
             told=[told.reported] if settings.monitors_on_rosout else [],
+            site_keys=settings.site_keys,
         )
 
     def _make_calls(self) -> None:

@@ -10,6 +10,7 @@ from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
+from appliance.specifications.files import Sources
 from appliance.specifications.monitors import Monitors, sources_of
 from appliance.specifications.monitors import Replaced as Done
 from appliance.store.state import MonitorRevisionRow
@@ -39,17 +40,18 @@ class MonitorOrders:
             differs_from_folder=monitors.differs_from_folder,
             warnings=list(monitors.checked.warnings),
             refused=monitors.refused,
+            site_keys=list(monitors.site_keys),
             rv_state=msgspec.convert(self._parts.monitor_calls.rv_state(), answers.RvState),
             monitors=states_of(monitors),
             files=monitors.sources.files if request.texts else None,
             definitions=monitors.sources.definitions if request.texts else None,
+            signatures=monitors.sources.signatures if request.texts else None,
         )
 
     async def load(self, request: admin.MonitorLoad, who: str) -> answers.Replaced:
         """Add or replace files of specifications."""
         done = await self._monitors.load(
-            request.files,
-            request.definitions,
+            Sources(request.files, request.definitions, request.signatures),
             who=who,
             note=request.note,
             expected=request.expected,
@@ -59,9 +61,14 @@ class MonitorOrders:
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> answers.Replaced:
         """Put a text in the place of a monitor's file."""
-        files = {self._monitors.file_of(request.name): request.text}
+        file = self._monitors.file_of(request.name)
         load = admin.MonitorLoad(
-            files, request.definitions, request.note, request.expected, request.confirm_within
+            {file: request.text},
+            request.definitions,
+            request.note,
+            request.expected,
+            request.confirm_within,
+            {**request.signatures, file: request.signature},
         )
         return await self.load(load, who)
 
@@ -99,9 +106,7 @@ class MonitorOrders:
         for row in await self._monitors.revisions():
             if row.revision == request.revision:
                 sources = sources_of(row)
-                return answers.RevisionTexts(
-                    **self._revision(row), files=sources.files, definitions=sources.definitions
-                )
+                return answers.RevisionTexts(**self._revision(row), **msgspec.structs.asdict(sources))
         raise UnknownThingError(f"there is no revision {request.revision} of the specifications")
 
     def _revision(self, row: MonitorRevisionRow) -> dict[str, Any]:

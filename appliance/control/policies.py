@@ -6,7 +6,7 @@ and says everything that is wrong with it. Every policy that came into force is 
 
 import asyncio
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,11 +17,16 @@ from appliance.audit_trail import AuditTrail
 from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
+from appliance.site_keys import read_signature, signer
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import RevisionRow, StateStore
 
 _log = structlog.get_logger()
 _DISK = "disk"
+_KEPT = (
+    "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To give it up, start with"
+    " the version and configuration that took it, say `rosrv policy reload` there, and start anew"
+)
 
 
 class PolicyRefusedError(Exception):
@@ -70,10 +75,12 @@ class Policies:
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
         changed: Callable[[Policy, Policy], int],
+        site_keys: Sequence[str],
     ) -> None:
         """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing.
 
-        `changed(before, policy)` decides again what is live, and says how much was revoked.
+        `changed(before, policy)` decides again what is live, and says how much was revoked. Where there are
+        `site_keys`, whatever comes into force is signed with one of them.
         """
         self.file = file
         self._store = store
@@ -81,6 +88,7 @@ class Policies:
         self._robot = robot
         self._hosts = hosts
         self._changed = changed
+        self._site_keys = site_keys
         self._current: Policy | None = None
         self._trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
         self.revision = 0
@@ -102,8 +110,8 @@ class Policies:
     def differs_from_file(self) -> bool:
         """Whether the policy in force is another than the file now has."""
         try:
-            return self.file.read_text(encoding="utf-8") != self.current.text
-        except (OSError, UnicodeDecodeError):
+            return self._read() != (self.current.text, self.in_force.signature)
+        except PolicyRefusedError:
             return True
 
     def start(self, *, restarted: bool) -> None:
@@ -115,16 +123,21 @@ class Policies:
         revisions = self._store.revisions()
         last = revisions[0] if revisions else None
         if last is not None and (restarted or last.who != _DISK):
-            self._enforce(self._judged(last.text, last.file, self.known), last)
+            try:
+                policy = self._judged(last.text, last.signature, last.file, self.known)
+            except PolicyRefusedError as error:
+                raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
+            self._enforce(policy, last)
             self._trial.resume()
             return
-        policy = self._judged(self._read(), str(self.file), self.known)
-        if last is not None and last.text == policy.text:
+        text, signature = self._read()
+        policy = self._judged(text, signature, str(self.file), self.known)
+        if last is not None and (last.text, last.signature) == (text, signature):
             self._enforce(policy, last)
             self._trial.resume()
         else:
             self._trial.end()
-            self._keep(policy, who=_DISK, note="read at start")
+            self._keep(policy, signature, who=_DISK, note="read at start")
 
     async def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
         """Read the file again: check, test, swap, decide again what is live.
@@ -133,13 +146,13 @@ class Policies:
         revision is the disk's, whoever asked for it: `who` is for the record.
         """
         before = self.revision
-        policy = await self._prepared(self._read, str(self.file), who)
+        policy, signature = await self._prepared(self._read, str(self.file), who)
         self._trial.announce(before, confirm_within)
-        revoked = self._keep(policy, who=_DISK, note="reloaded from disk", by=who)
+        revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=who)
         return self._answer(policy, before, revoked, confirm_within)
 
     async def load_text(
-        self, text: str, *, who: str, note: str, confirm_within: float | None = None
+        self, text: str, signature: str, *, who: str, note: str, confirm_within: float | None = None
     ) -> Loaded:
         """Bring a text that is not the file's into force, as `reload` does.
 
@@ -147,16 +160,16 @@ class Policies:
         says something else.
         """
         before = self.revision
-        policy = await self._prepared(lambda: text, f"revision {self._next_number()}", who)
+        policy, _ = await self._prepared(lambda: (text, signature), f"revision {self._next_number()}", who)
         self._trial.announce(before, confirm_within)
-        revoked = self._keep(policy, who=who, note=note or "posted")
+        revoked = self._keep(policy, signature, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
     def hosts_changed(self) -> int:
         """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
         before = self.current
         try:
-            self._current = self._judged(before.text, before.file, self.known)
+            self._current = self._judged(before.text, self.in_force.signature, before.file, self.known)
         except PolicyRefusedError as error:  # the same text: only a defect could make it wrong
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
@@ -169,8 +182,8 @@ class Policies:
             row = wanted(self._store.revisions(), revision, before)
         except UnknownRevisionError as error:
             raise PolicyRefusedError([str(error)]) from error
-        policy = self._judged(row.text, row.file, self.known)
-        revoked = self._keep(policy, who=who, note=f"rolled back to revision {row.revision}")
+        policy = self._judged(row.text, row.signature, row.file, self.known)
+        revoked = self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
         return self._answer(policy, before, revoked, None)
 
     def confirm(self, *, who: str) -> bool:
@@ -194,7 +207,7 @@ class Policies:
     @property
     def known(self) -> Known:
         """What a policy means now: the hosts and the robot."""
-        return Known(dict(self._hosts()), self._robot)
+        return Known(dict(self._hosts()), self._robot, site_keys=self._site_keys)
 
     def with_cases(self, known: Known) -> Known:
         """The same with the test cases beside the file, which are read now: a new policy is judged with them."""
@@ -210,13 +223,13 @@ class Policies:
 
     # --- inside ---
 
-    async def _prepared(self, read: Callable[[], str], file: str, who: str) -> Policy:
-        """Read, compiled and tested in a thread: a long policy does not keep a node waiting."""
+    async def _prepared(self, read: Callable[[], tuple[str, str]], file: str, who: str) -> tuple[Policy, str]:
+        """Read (text and signature), compiled and tested in a thread: a long policy keeps no node waiting."""
         before = self.revision
         try:
             while True:
                 known = self.known
-                policy = await asyncio.to_thread(self._tested, read, file, known)
+                policy, signature = await asyncio.to_thread(self._tested, read, file, known)
                 if self._hosts() == known.hosts:
                     break
         except PolicyRefusedError as error:
@@ -224,7 +237,7 @@ class Policies:
             raise
         if self.revision != before:  # a signal, or a confirmation that did not come in time
             raise RevisionChangedError(before, self.revision)
-        return policy
+        return policy, signature
 
     def _refused(self, error: PolicyRefusedError, who: str) -> None:
         self._trail.happened(
@@ -235,27 +248,29 @@ class Policies:
             who=who,
         )
 
-    def _read(self) -> str:
+    def _read(self) -> tuple[str, str]:
+        """The file's text and signature."""
         try:
-            return self.file.read_text(encoding="utf-8")
+            return self.file.read_text(encoding="utf-8"), read_signature(self.file)
         except (OSError, UnicodeDecodeError) as error:
             raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 
-    def _tested(self, read: Callable[[], str], file: str, known: Known) -> Policy:
-        return self._judged(read(), file, self.with_cases(known))
+    def _tested(self, read: Callable[[], tuple[str, str]], file: str, known: Known) -> tuple[Policy, str]:
+        text, signature = read()
+        return self._judged(text, signature, file, self.with_cases(known)), signature
 
-    def _judged(self, text: str, file: str, known: Known) -> Policy:
+    def _judged(self, text: str, signature: str, file: str, known: Known) -> Policy:
         try:
-            return judge(text, file, known).accepted()
+            return judge(text, file, known, signature).accepted()
         except PolicyError as error:
             raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
     def _next_number(self) -> int:
         return max([self.revision, *(row.revision for row in self._store.revisions())]) + 1
 
-    def _keep(self, policy: Policy, *, who: str, note: str, by: str | None = None) -> int:
+    def _keep(self, policy: Policy, signature: str, *, who: str, note: str, by: str | None = None) -> int:
         number = self._next_number()
-        row = RevisionRow(number, policy.text, policy.file, time.time(), who, note)
+        row = RevisionRow(number, policy.text, policy.file, time.time(), who, note, signature)
         self._store.save_revision(row)
         revoked = self._enforce(policy, row)
         self._trail.happened(
@@ -264,6 +279,7 @@ class Policies:
             severity=Severity.NOTICE,
             who=by or who,
             file=policy.file,
+            signed_by=signer(self._site_keys, policy.text, signature),
             revoked=revoked,
             warnings=[str(warning) for warning in policy.warnings][:100],
         )

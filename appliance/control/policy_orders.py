@@ -37,7 +37,11 @@ class PolicyOrders:
         """Bring another text into force."""
         async with self._changing(request.expected):
             loaded = await self._policies.load_text(
-                request.text, who=who, note=request.note, confirm_within=request.confirm_within
+                request.text,
+                request.signature,
+                who=who,
+                note=request.note,
+                confirm_within=request.confirm_within,
             )
         return answers.Loaded(**asdict(loaded))
 
@@ -78,6 +82,7 @@ class PolicyOrders:
         return answers.PolicyKnown(
             **self._revision(row),
             text=row.text,
+            signature=row.signature,
             policy_file=str(policies.file),
             differs_from_file=policies.differs_from_file,
             warnings=[str(warning) for warning in policies.current.warnings],

@@ -158,6 +158,7 @@ class _Control:
             robot=robot_addresses(self._settings),
             hosts=lambda: self._tunnels.addresses,
             changed=lambda before, policy: self._parts.policy_changed(before, policy),  # noqa: PLW0108 - made later
+            site_keys=self._settings.site_keys,
         )
         policies.start(restarted=restarted)
         registry = Registry()

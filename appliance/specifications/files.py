@@ -3,6 +3,7 @@
 What is checked here is compiled again in the relay; nothing comes into force that either refuses.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from appliance.ros.reading import read_fields
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.site_keys import UnsignedError, read_signature, signer
 
 _MOST_FILES = 1000
 _LONGEST_FILE = 1 << 20
@@ -31,22 +33,50 @@ class SpecificationsRefusedError(Exception):
 
 
 class Sources(msgspec.Struct, frozen=True):
-    """Texts of specifications by file name, and of message definitions by `package/Type.msg` (or `.srv`)."""
+    """Texts of specifications by file name, and of message definitions by `package/Type.msg` (or `.srv`).
+
+    `signatures` are the site's, by the same names.
+    """
 
     files: dict[str, str] = {}
     definitions: dict[str, str] = {}
+    signatures: dict[str, str] = {}
 
-    def with_files(self, files: dict[str, str], definitions: dict[str, str]) -> "Sources":
+    def with_files(self, new: "Sources") -> "Sources":
         """These, with others added or in the place of those of the same name; in the order of names."""
+        fresh = new.files.keys() | new.definitions.keys()
+        signatures = {name: text for name, text in self.signatures.items() if name not in fresh}
+        signatures |= {name: text for name, text in new.signatures.items() if text and name in fresh}
         return Sources(
-            dict(sorted((self.files | files).items())), dict(sorted((self.definitions | definitions).items()))
+            dict(sorted((self.files | new.files).items())),
+            dict(sorted((self.definitions | new.definitions).items())),
+            signatures,
         )
 
     def without(self, files: set[str]) -> "Sources":
         """These without some files; definitions stay."""
-        return Sources(
-            {name: text for name, text in self.files.items() if name not in files}, self.definitions
+        left, signatures = (
+            {name: text for name, text in texts.items() if name not in files}
+            for texts in (self.files, self.signatures)
         )
+        return Sources(left, self.definitions, signatures)
+
+    def signers(self, site_keys: Sequence[str]) -> list[str]:
+        """The keys that signed these; none where there are no keys.
+
+        Raises `SpecificationsRefusedError` with every file and definition that none of them signed.
+        """
+        found: set[str] = set()
+        findings = []
+        for name, text in (self.files | self.definitions).items() if site_keys else ():
+            try:
+                found.add(signer(site_keys, text, self.signatures.get(name, "")))
+            except UnsignedError as error:
+                place = name if name in self.files else f"msg/{name}"
+                findings.append(f"{place}:1:1: error: {error}")
+        if findings:
+            raise SpecificationsRefusedError(findings)
+        return sorted(found)
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
         """The names of files that these add, change and remove; definitions as `msg/package/Type.msg`."""
@@ -65,7 +95,8 @@ class Sources(msgspec.Struct, frozen=True):
 class Checked:
     """Specifications without errors: their monitors (name to file), what they listen to and publish.
 
-    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
+    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes;
+    `signed_by` are the keys of the site that signed them.
     """
 
     monitors: dict[str, str] = field(default_factory=dict)
@@ -77,6 +108,7 @@ class Checked:
     definitions: Definitions = field(default_factory=lambda: Definitions({}))
     uses: dict[str, frozenset[str]] = field(default_factory=dict)
     published_by: dict[str, frozenset[str]] = field(default_factory=dict)
+    signed_by: list[str] = field(default_factory=list)
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
         """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
@@ -92,8 +124,11 @@ class Checked:
         return any(service in services for services in self.services.values())
 
 
-def check(sources: Sources) -> Checked:
-    """Compile everything. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment."""
+def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """Compile everything. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
+
+    Where there are `site_keys`, each text must be signed with one of them.
+    """
     if not sources.files:
         return Checked()
     if len(sources.files) > _MOST_FILES:
@@ -132,11 +167,15 @@ def check(sources: Sources) -> Checked:
         definitions,
         {one.name: one.code.uses for one in monitors.monitors},
         {name: monitors.published_by(name) for name in sources.files},
+        sources.signers(site_keys),
     )
 
 
 def read_folder(folder: Path) -> Sources:
-    """The `.rv` files of a folder and the definitions in its `msg/`. Raises `SpecificationsRefusedError`."""
+    """The `.rv` files of a folder and the definitions in its `msg/`, with their signatures.
+
+    Raises `SpecificationsRefusedError`.
+    """
     try:
         return _read_folder(folder)
     except OSError as error:
@@ -148,7 +187,8 @@ def read_folder(folder: Path) -> Sources:
 def _read_folder(folder: Path) -> Sources:
     if not folder.is_dir():
         raise SpecificationsRefusedError([f"{folder}: there is no such folder of specifications"])
-    files = {path.name: _read(path) for path in sorted(folder.glob("*.rv"))}
+    paths = {path.name: path for path in sorted(folder.glob("*.rv"))}
+    files = {name: _read(path) for name, path in paths.items()}
     definitions: dict[str, str] = {}
     for path in sorted((folder / "msg").rglob("*")):
         if path.suffix in {".msg", ".srv"} and path.is_file():
@@ -158,8 +198,15 @@ def _read_folder(folder: Path) -> Sources:
                 raise SpecificationsRefusedError(
                     [f"{path}: a definition belongs into the folder of its package: {place}"]
                 )
-            definitions[f"{package.name}/{path.name}"] = _read(path)
-    return Sources(files, definitions)
+            name = f"{package.name}/{path.name}"
+            definitions[name], paths[name] = _read(path), path
+    return Sources(files, definitions, signatures_of(paths))
+
+
+def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
+    """The signatures beside these files, by the same names; of those that have one."""
+    found = {name: read_signature(path) for name, path in paths.items()}
+    return {name: text for name, text in found.items() if text}
 
 
 def _read(path: Path) -> str:

@@ -40,7 +40,7 @@ class SpecificationFolder:
 def _stamps(folder: Path) -> list[_Stamp] | None:
     """What changes when a file does; None if that cannot be seen."""
     try:
-        paths = [folder, *folder.glob("*.rv"), *(folder / "msg").rglob("*")]
+        paths = [folder, *folder.glob("*.rv*"), *(folder / "msg").rglob("*")]
         return sorted(_stamp(path) for path in paths)
     except OSError:
         return None

@@ -102,7 +102,8 @@ class Monitors:
     """Keeps specifications and switches.
 
     `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
-    reports. Changes are made one at a time.
+    reports. Where there are `site_keys`, whatever comes into force is signed with one of them. Changes are made one at
+    a time.
     """
 
     def __init__(
@@ -117,10 +118,12 @@ class Monitors:
         relays: Relays,
         published: Callable[[], None],
         told: Collection[Callable[[messages.MonitorEvent], None]],
+        site_keys: Sequence[str],
     ) -> None:
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self._enable = enable
+        self.site_keys = site_keys
         self._store = store
         self._trail = trail
         self._stating = Stating(allocation, trail, on_fault, self.enabled, relays)
@@ -154,11 +157,11 @@ class Monitors:
             self._row = last
         if last is not None and (restarted or last.who != _DISK):
             sources = sources_of(last)
-            self._enforce(sources, _check_kept(sources, last), last)
+            self._enforce(sources, _check_kept(sources, last, self.site_keys), last)
             self._trial.resume()
         else:
             sources = self._folder.read()
-            checked = check(sources)
+            checked = check(sources, self.site_keys)
             if last is not None and sources_of(last) == sources:
                 self._enforce(sources, checked, last)
                 self._trial.resume()
@@ -236,8 +239,7 @@ class Monitors:
 
     async def load(
         self,
-        files: dict[str, str],
-        definitions: dict[str, str],
+        new: Sources,
         *,
         who: str,
         note: str,
@@ -250,7 +252,7 @@ class Monitors:
         """
         async with self._changing:
             self._expect(expected)
-            sources = self.sources.with_files(files, definitions)
+            sources = self.sources.with_files(new)
             return await self._change(sources, who, who, note or "loaded", confirm_within)
 
     async def reload(
@@ -272,9 +274,7 @@ class Monitors:
             sources = await asyncio.to_thread(self._folder.read)
             kept = [] if prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
-                left = {name: self.sources.files[name] for name in kept}
-                definitions = self.sources.definitions | sources.definitions
-                sources = sources.with_files(left, definitions)
+                sources = self.sources.with_files(sources)
             keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
             return await self._change(sources, keeper, who, "reloaded from disk", confirm_within, kept=kept)
 
@@ -454,7 +454,7 @@ class Monitors:
             **switched,
         }
         try:
-            checked = await asyncio.to_thread(check, sources)
+            checked = await asyncio.to_thread(check, sources, self.site_keys)
             moved = await self._stating.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
             self._switches = switched
@@ -503,7 +503,7 @@ class Monitors:
     ) -> None:
         last, before = self._row, sources_of(self._row)
         if last.revision:
-            ended = Kept(before.files, before.definitions, self._switches)
+            ended = Kept(before.files, before.definitions, before.signatures, self._switches)
             self._store.save_monitor_revision(last._replace(sources=_text(ended)))
         row = MonitorRevisionRow(last.revision + 1, _text(sources), time.time(), who, note)
         self._store.save_monitor_revision(row)
@@ -522,6 +522,7 @@ class Monitors:
             changed=changed,
             removed=removed,
             began=list(began),
+            signed_by=checked.signed_by,
             warnings=list(checked.warnings)[:100],
         )
 
@@ -559,10 +560,10 @@ def sources_of(row: MonitorRevisionRow) -> Sources:
     return msgspec.json.decode(row.sources, type=Sources)
 
 
-def _check_kept(sources: Sources, row: MonitorRevisionRow) -> Checked:
+def _check_kept(sources: Sources, row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
     """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
     try:
-        return check(sources)
+        return check(sources, site_keys)
     except SpecificationsRefusedError as error:
         way = (
             f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."

@@ -35,6 +35,7 @@ CREATE TABLE IF NOT EXISTS policy_revision (
     revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS policy_signature (revision INTEGER PRIMARY KEY, signature TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS monitor_revision (
     revision INTEGER PRIMARY KEY, sources TEXT NOT NULL, loaded REAL NOT NULL, who TEXT NOT NULL, note TEXT NOT NULL
 );
@@ -92,7 +93,10 @@ class PermissionRow(NamedTuple):
 
 
 class RevisionRow(NamedTuple):
-    """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where."""
+    """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where.
+
+    `signature` is the site's, or empty.
+    """
 
     revision: int
     text: str
@@ -100,6 +104,7 @@ class RevisionRow(NamedTuple):
     loaded: float
     who: str
     note: str
+    signature: str = ""
 
 
 class MonitorRevisionRow(NamedTuple):
@@ -231,11 +236,16 @@ class StateStore:
 
     def save_revision(self, row: RevisionRow) -> None:
         """Keep a policy that comes into force."""
-        self._database.put("policy_revision", *row)
+        # First: a revision without its signature would be refused by a start in between.
+        self._database.put("policy_signature", row.revision, row.signature)
+        self._database.put("policy_revision", *row[:-1])
 
     def revisions(self) -> list[RevisionRow]:
         """All kept revisions, the newest first."""
-        rows = self._database.query("SELECT * FROM policy_revision ORDER BY revision DESC")
+        rows = self._database.query(
+            "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
+            " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC"
+        )
         return [RevisionRow(*row) for row in rows]
 
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:

@@ -50,9 +50,11 @@ class Monitors(msgspec.Struct, frozen=True):
     rv_state: Annotated[
         RvState, told("ROSRV's `getRVState`: ROSMaster's port, RVMaster's, and where topics are carried")
     ]
+    site_keys: Annotated[list[str], told("with any, one of them must have signed what is loaded")]
     monitors: Annotated[list[MonitorState], told("in the order in which they see messages")]
     files: Annotated[dict[str, str] | None, told("with `texts=1`: specifications by file name")] = None
     definitions: Annotated[dict[str, str] | None, told("with `texts=1`: those that came with them")] = None
+    signatures: Annotated[dict[str, str] | None, told("with `texts=1`: the site's, by the same names")] = None
 
 
 class Replaced(msgspec.Struct, frozen=True):
@@ -101,6 +103,7 @@ class RevisionTexts(Revision, frozen=True):
 
     files: Annotated[dict[str, str], told("specifications by file name")]
     definitions: Annotated[dict[str, str], told("those that came with them")]
+    signatures: Annotated[dict[str, str], told("the site's, by the names of files and definitions")]
 
 
 class Switched(msgspec.Struct, frozen=True):

@@ -25,9 +25,10 @@ class Revisions(msgspec.Struct, frozen=True):
 
 
 class RevisionText(Revision, frozen=True):
-    """A kept revision with its text."""
+    """A kept revision with its text, and the signature of the site (empty: it came without one)."""
 
     text: str
+    signature: str
 
 
 class PolicyInForce(RevisionText, frozen=True):
@@ -37,6 +38,7 @@ class PolicyInForce(RevisionText, frozen=True):
     differs_from_file: bool
     warnings: list[str]
     confirm_by: float | None
+    site_keys: Annotated[list[str], told("with any, one of them must have signed what is loaded")]
 
 
 class PolicyKnown(PolicyInForce, frozen=True):

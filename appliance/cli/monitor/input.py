@@ -11,6 +11,7 @@ from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.specifications.files import Sources, signatures_of
 
 usage_error = functools.partial(output.usage_error, verb="rosrv monitor")
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")
@@ -50,7 +51,7 @@ def read_definitions(files: Sequence[Path], folders: Sequence[Path]) -> Definiti
     return definitions
 
 
-def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> tuple[dict[str, str], dict[str, str]]:
+def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
     """Specifications by the names that the appliance knows them by, and the definitions for them, as files.
 
     The same files are taken and refused as by `read_specifications` and `read_definitions`; what the definitions say is
@@ -68,6 +69,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> tuple[dict[s
     for folder in _folders_of(files, folders):
         texts, places = _definition_texts(folder)
         definitions |= {name: _sendable(text, places[name]) for name, text in texts.items()}
+        named |= {name: Path(places[name]) for name in texts}
     texts = read_specifications(files)
     for path, text in texts.items():
         found = _NOT_UTF_8.search(text)
@@ -77,7 +79,8 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> tuple[dict[s
                 found.start() - text.rfind("\n", 0, found.start()),
             )
             raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
-    return {Path(path).name: text for path, text in texts.items()}, definitions
+    sent = {Path(path).name: text for path, text in texts.items()}
+    return Sources(sent, definitions, signatures_of(named))
 
 
 def _folders_of(files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:

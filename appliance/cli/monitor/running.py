@@ -94,7 +94,7 @@ def load(
     from appliance.rosmop.syntax.errors import SpecificationError  # noqa: PLC0415  as above
 
     try:
-        texts, definitions = read_to_send(files, msg or [])
+        sent = read_to_send(files, msg or [])
     except SpecificationError as error:
         found = [printable(str(finding)) for finding in error.findings]
         body_or_exit(
@@ -102,10 +102,14 @@ def load(
         )
         return
     order = admin.MonitorLoad(
-        texts, definitions, note, confirm_within=seconds_within(confirm_within, "monitor")
+        sent.files,
+        sent.definitions,
+        note,
+        confirm_within=seconds_within(confirm_within, "monitor"),
+        signatures=sent.signatures,
     )
     say_replaced(appliance.answer_or_exit(order, as_json=as_json))
-    _say_disabled(appliance, texts)
+    _say_disabled(appliance, sent.files)
 
 
 @speaks

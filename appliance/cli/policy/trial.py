@@ -14,6 +14,7 @@ from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.policy.input import known_of, live_now, read_text
 from appliance.cli.running import Appliance, body_or_exit
 from appliance.policy import Ending, Finding, Known, PolicyError, Severity, endings, judge
+from appliance.site_keys import read_signature
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def try_policy(
         return _by_dry_run(appliance, file)
     known = known_of(robot, enrolled, Known.of(asdict(appliance.ask(PolicyWanted()).given())))
     try:
-        policy = judge(read_text(file), str(file), known).accepted()
+        policy = judge(read_text(file), str(file), known, read_signature(file)).accepted()
     except PolicyError as error:
         return Trial(error.findings, [])
     return Trial(list(policy.warnings), endings(policy, live_now(appliance)))
@@ -43,7 +44,7 @@ def _by_dry_run(appliance: Appliance, file: Path) -> Trial:
     from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
 
     assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
-    query, text = {"dry_run": "1"}, {"text": read_text(file)}
+    query, text = {"dry_run": "1"}, {"text": read_text(file), "signature": read_signature(file)}
     try:
         report = appliance.way.client.call("POST", "/v1/policy", params=query, body=text, order=False)
     except ProblemError as problem:

@@ -4,7 +4,7 @@ import datetime
 import os
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cryptography import x509
@@ -15,9 +15,10 @@ from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
 from appliance.config import Settings
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
-from appliance.policy import PolicyError, compile_policy, run_cases
+from appliance.policy import Known, PolicyError, judge, run_cases
 from appliance.policy.policy import Policy
 from appliance.shipped import SHIPPED
+from appliance.site_keys import read_signature
 from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.state import foreign
 
@@ -28,16 +29,16 @@ _AHEAD_SECONDS = 60.0
 
 def files(settings: Settings) -> Iterator[Found]:
     """What the configuration names, and the state directory."""
-    yield from told("policy", lambda: _policy(settings.policy))
-    yield from told("monitors", lambda: _monitors(settings.monitors))
+    yield from told("policy", lambda: _policy(settings.policy, settings.site_keys))
+    yield from told("monitors", lambda: _monitors(settings.monitors, settings.site_keys))
     yield from told("hosts", lambda: _hosts(settings.hosts))
     yield from told("state", lambda: _state(settings.state))
 
 
-def _policy(file: Path) -> Iterator[Found]:
+def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
     try:
         text = file.read_text(encoding="utf-8")
-        policy = compile_policy(text, file=str(file))
+        policy = judge(text, str(file), Known(site_keys=site_keys), read_signature(file)).policy
     except OSError as error:
         if isinstance(error, FileNotFoundError) and file == Settings().policy.absolute():
             first = SHIPPED / "policies" / "default.ini"
@@ -78,12 +79,12 @@ def _cases(file: Path, policy: Policy) -> Iterator[Found]:
         yield ok("policy tests", f"{len(results)} passed")
 
 
-def _monitors(folder: Path | None) -> Iterator[Found]:
+def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[Found]:
     if folder is None:
         yield skip("monitors", "no folder of specifications is configured")
         return
     try:
-        checked = check(read_folder(folder))
+        checked = check(read_folder(folder), site_keys)
     except SpecificationsRefusedError as error:
         yield fail("monitors", error.findings[0], f"rosrv monitor check {folder}/*.rv")
         return

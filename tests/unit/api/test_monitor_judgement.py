@@ -12,6 +12,7 @@ from appliance.api.monitor_judgement import (
     refusal,
 )
 from appliance.api.problems import ProblemError
+from appliance.channel.admin import MonitorLoad
 from appliance.channel.answers.monitors import Monitors
 from tests.support.answers import example
 
@@ -22,15 +23,15 @@ IN_FORCE = example(Monitors, revision=7, files={"a.rv": A}, definitions={})
 
 def test_a_draft_says_what_it_would_change() -> None:
     """Files that are added and changed, the monitors there would be; what is the same is not named."""
-    draft = judge(IN_FORCE, {"a.rv": A + " ", "b.rv": TICK}, {})
+    draft = judge(IN_FORCE, MonitorLoad({"a.rv": A + " ", "b.rv": TICK}))
     assert (draft.added, draft.changed, draft.removed, draft.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
-    assert judge(IN_FORCE, {"a.rv": A}, {}).changed == []
+    assert judge(IN_FORCE, MonitorLoad({"a.rv": A})).changed == []
 
 
 def test_a_draft_that_is_wrong_is_refused_with_its_place() -> None:
     """The problem has every finding as a structure, and as lines of its detail."""
     with pytest.raises(ProblemError) as refused:
-        judge(IN_FORCE, {"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}, {})
+        judge(IN_FORCE, MonitorLoad({"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}))
     problem = refused.value
     assert (problem.status, problem.kind, problem.line) == (422, "specifications-refused", 2)
     assert problem.detail.splitlines()[0] == "refused; revision 7 of the specifications stays in force"

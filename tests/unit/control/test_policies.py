@@ -5,17 +5,18 @@ import contextlib
 import ipaddress
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from appliance.control.policies import Policies, RevisionChangedError
+from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.policy import Policy, judging
 from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
+from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 
 pytestmark = pytest.mark.anyio
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
@@ -42,11 +43,14 @@ class Appliance:
         restarted: bool = False,
         hosts: Callable[[], Mapping[str, Address]] = dict,
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
+        site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
         """The policies of a control that has started; it dies at the end."""
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
-        policies = Policies(self.file, store, records, robot=(), hosts=hosts, changed=changed)
+        policies = Policies(
+            self.file, store, records, robot=(), hosts=hosts, changed=changed, site_keys=site_keys
+        )
         policies.start(restarted=restarted)
         try:
             yield policies
@@ -202,3 +206,66 @@ async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_i
         assert (policies.revision, policies.current.text) == (2, OTHER)
         await until(policies, 3)
         assert policies.current.text == OPEN
+
+
+def unsigned(policies: Policies, change: Callable[[], object]) -> str:
+    """What a refused change says; the policy in force stays."""
+    before = policies.revision, policies.current.text
+    with pytest.raises(PolicyRefusedError) as refused:
+        change()
+    assert (policies.revision, policies.current.text) == before
+    return refused.value.findings[0]
+
+
+async def test_where_the_site_signs_nothing_else_comes_into_force(tmp_path: Path) -> None:
+    """Start, reload, posted text, rollback, and the start after a crash: each asks for the site's signature."""
+    appliance = Appliance(tmp_path)
+    beside = tmp_path / "policy.ini.sig"
+    with pytest.raises(PolicyRefusedError, match="it has no signature of the site"):
+        appliance.started(site_keys=[LINE]).__enter__()
+    with appliance.started() as policies:  # revision 1 is unsigned
+        assert policies.in_force.signature == ""
+    beside.write_text(signed(OPEN))
+    with appliance.started(site_keys=[LINE]) as policies:
+        assert (policies.revision, policies.in_force.signature) == (2, signed(OPEN))
+        appliance.file.write_text(OTHER)
+        assert policies.differs_from_file
+        with pytest.raises(PolicyRefusedError, match="it is not the text that"):
+            await policies.reload()
+        for signature in ("", signed(OPEN), signed(OTHER, OTHER_KEY)):
+            with pytest.raises(PolicyRefusedError):
+                await policies.load_text(OTHER, signature, who="eve", note="")
+        assert "no signature" in unsigned(policies, lambda: policies.rollback(1, who="eve"))
+        assert policies.hosts_changed() == 0
+        await policies.load_text(OTHER, signed(OTHER), who="adam", note="")
+        assert policies.rollback(2, who="eve").revision == 4
+    with appliance.started(restarted=True, site_keys=[LINE]) as policies:
+        assert (policies.revision, policies.in_force.signature) == (4, signed(OPEN))
+    with pytest.raises(PolicyRefusedError, match="this is revision 4, which eve brought into force"):
+        appliance.started(site_keys=[OTHER_LINE]).__enter__()
+
+
+async def test_a_trial_goes_back_to_what_is_signed(tmp_path: Path) -> None:
+    """The revision that an unconfirmed change goes back to has its signature still."""
+    appliance = Appliance(tmp_path)
+    (tmp_path / "policy.ini.sig").write_text(signed(OPEN))
+    with appliance.started(site_keys=[LINE]) as policies:
+        await policies.load_text(OTHER, signed(OTHER), who="adam", note="", confirm_within=0.0)
+        await until(policies, 3)
+        assert (policies.current.text, policies.in_force.signature) == (OPEN, signed(OPEN))
+
+
+async def test_keys_are_changed_over_with_both_in_force(tmp_path: Path) -> None:
+    """The same text, signed anew, is a new revision: no crash afterwards asks for the key that is gone."""
+    appliance = Appliance(tmp_path)
+    beside = tmp_path / "policy.ini.sig"
+    beside.write_text(signed(OPEN))
+    with appliance.started(site_keys=[LINE]) as policies:
+        differs = [policies.differs_from_file]
+        beside.write_text(signed(OPEN, OTHER_KEY))
+        differs.append(policies.differs_from_file)
+        assert differs == [False, True]
+    with appliance.started(site_keys=[LINE, OTHER_LINE]) as policies:
+        assert (policies.revision, policies.in_force.signature) == (2, signed(OPEN, OTHER_KEY))
+    with appliance.started(restarted=True, site_keys=[OTHER_LINE]) as policies:
+        assert policies.revision == 2

@@ -19,7 +19,7 @@ def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
 
 def checked(**files: str) -> Checked:
     """What files of these names have."""
-    return check(Sources({f"{name}.rv": text for name, text in files.items()}))
+    return check(Sources({f"{name}.rv": text for name, text in files.items()}), ())
 
 
 def together(**files: str) -> list[set[str]]:

@@ -21,7 +21,7 @@ def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
     assert list(sources.files) == ["a.rv", "b.rv"]
     assert sources.files["a.rv"] == SPEC
     assert sources.definitions == {"own_msgs/Trigger.msg": "int32 data\n"}
-    checked = check(sources)
+    checked = check(sources, ())
     assert checked.monitors == {"a": "a.rv", "b": "b.rv"}
     assert checked.of_topic("/trigger")
     assert not checked.of_topic("/other")
@@ -41,7 +41,7 @@ def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
 def test_what_is_wrong_is_said_with_its_place(sources: Sources, said: str) -> None:
     """Nothing is taken in part."""
     with pytest.raises(SpecificationsRefusedError) as error:
-        check(sources)
+        check(sources, ())
     assert said in str(error.value)
 
 

@@ -12,9 +12,10 @@ from appliance.audit.log import AuditLog
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.specifications.allocation import Allocation, Move, Resource
-from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.files import Sources, SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
 from appliance.store.state import StateStore
+from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
 B = "hold b() { event said() /other std_msgs/String '{}' { } }"
@@ -45,7 +46,14 @@ class Desk:
         self.began: list[str] = []
         self.away = False
 
-    def monitors(self, enable: str = "all", *, restarted: bool = False, folder: bool = True) -> Monitors:
+    def monitors(
+        self,
+        enable: str = "all",
+        *,
+        restarted: bool = False,
+        folder: bool = True,
+        site_keys: Sequence[str] = (),
+    ) -> Monitors:
         """A control starts."""
         relay = Taking(self)
         relay.monitors = Monitors(
@@ -58,6 +66,7 @@ class Desk:
             relays=relay,
             published=lambda: None,
             told=[],
+            site_keys=site_keys,
         )
         relay.monitors.start(restarted=restarted)
         return relay.monitors
@@ -118,7 +127,7 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     again = desk.monitors()
     assert again.revision == 1
     desk.began = ["b"]
-    replaced = await again.load({"b.rv": B}, {}, who="eve", note="")
+    replaced = await again.load(Sources({"b.rv": B}), who="eve", note="")
     assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
     assert replaced.began == ["b"]
     restarted = desk.monitors()
@@ -133,7 +142,7 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
     """What the folder does not have stays in force, over restarts, too, until somebody says that it is to go."""
     monitors = desk.monitors()
-    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
     (desk.folder / "c.rv").write_text(C)
     kept = await monitors.reload(who="operator")
     assert (kept.added, kept.removed, kept.kept) == (["c.rv"], [], ["b.rv"])
@@ -192,7 +201,7 @@ async def test_a_refused_rollback_leaves_no_switch_behind(desk: Desk) -> None:
     with pytest.raises(SpecificationsRefusedError, match="the relay says no"):
         await monitors.rollback(1, who="eve")
     desk.findings = []
-    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
     assert not monitors.enabled("b")
 
 
@@ -229,7 +238,7 @@ async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
     """Where there was no revision before."""
     desk = Desk(tmp_path)
     monitors = desk.monitors(folder=False)
-    await monitors.load({"b.rv": B}, {}, who="eve", note="", confirm_within=0.0)
+    await monitors.load(Sources({"b.rv": B}), who="eve", note="", confirm_within=0.0)
     await gone_back(monitors, 2)
     assert monitors.names() == []
     desk.store.close()
@@ -240,7 +249,7 @@ async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
     """Nothing is removed, the words say what to do, and nothing is said to differ from a folder that is not there."""
     desk = Desk(tmp_path)
     monitors = desk.monitors(folder=False)
-    await monitors.load({"b.rv": B}, {}, who="eve", note="")
+    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
     assert not monitors.differs_from_folder
     for prune in (False, True):
         with pytest.raises(SpecificationsRefusedError, match="no folder of specifications is configured"):
@@ -254,11 +263,11 @@ async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
     """Whether control or the relay finds the fault; it is a record."""
     monitors = desk.monitors()
     with pytest.raises(SpecificationsRefusedError):
-        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+        await monitors.load(Sources({"b.rv": "nonsense"}), who="eve", note="")
     assert not desk.sent
     desk.findings = ["b.rv:1:1: error: something"]
     with pytest.raises(SpecificationsRefusedError, match="something"):
-        await monitors.load({"b.rv": B}, {}, who="eve", note="")
+        await monitors.load(Sources({"b.rv": B}), who="eve", note="")
     assert (monitors.revision, monitors.names()) == (1, ["a"])
     assert [event for event, _ in desk.events].count("specifications refused") == 3
     desk.findings = []
@@ -321,7 +330,7 @@ async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
     monitors = desk.monitors()
     user = "c() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
     await monitors.load(
-        {"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}, {}, who="eve", note=""
+        Sources({"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}), who="eve", note=""
     )
     for names in (["a"], ["c"]):
         with pytest.raises(SpecificationsRefusedError):
@@ -336,7 +345,7 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
     """Two engineers cannot overwrite each other: not after a load, a switch, or a resumption."""
     monitors = desk.monitors()
     seen = [monitors.tag]
-    await monitors.load({"b.rv": B}, {}, who="adam", note="", expected=monitors.tag)
+    await monitors.load(Sources({"b.rv": B}), who="adam", note="", expected=monitors.tag)
     seen.append(monitors.tag)
     await monitors.switch(["a"], False, who="adam", expected=monitors.tag)
     seen.append(monitors.tag)
@@ -345,7 +354,7 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
     assert len({*seen, monitors.tag}) == 4
     for stale in seen:
         changes: list[Callable[[], Any]] = [
-            partial(monitors.load, {"b.rv": B}, {}, who="eve", note="", expected=stale),
+            partial(monitors.load, Sources({"b.rv": B}), who="eve", note="", expected=stale),
             partial(monitors.reload, who="eve", expected=stale),
             partial(monitors.remove, ["a"], who="eve", expected=stale),
             partial(monitors.switch, ["a"], True, who="eve", expected=stale),
@@ -362,10 +371,10 @@ async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
     """One that is loaded later under its name is as `--enable` says; so it is in the next life of control."""
     monitors = desk.monitors()
     await monitors.switch(["a"], False, who="eve")
-    await monitors.load({"a.rv": A.replace("{", "{ int n;", 1)}, {}, who="eve", note="")
+    await monitors.load(Sources({"a.rv": A.replace("{", "{ int n;", 1)}), who="eve", note="")
     assert not monitors.enabled("a")
     await monitors.remove(["a"], who="eve")
-    await monitors.load({"a.rv": A}, {}, who="eve", note="")
+    await monitors.load(Sources({"a.rv": A}), who="eve", note="")
     assert monitors.enabled("a")
     assert desk.monitors(restarted=True).enabled("a")
 
@@ -389,7 +398,7 @@ async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> N
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
     tag = monitors.tag
     done = await asyncio.gather(
-        monitors.load({"c.rv": A.replace("a()", "c()")}, {}, who="adam", note="", expected=tag),
+        monitors.load(Sources({"c.rv": A.replace("a()", "c()")}), who="adam", note="", expected=tag),
         monitors.switch(["a"], False, who="eve", expected=tag),
         monitors.resume(["b"], who="eve", expected=tag),
         return_exceptions=True,
@@ -408,7 +417,7 @@ async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
     with pytest.raises(UnknownMonitorError):
         await monitors.switch(["a", "nobody"], False, who="eve")
     with pytest.raises(SpecificationsRefusedError):
-        await monitors.load({"b.rv": "nonsense"}, {}, who="eve", note="")
+        await monitors.load(Sources({"b.rv": "nonsense"}), who="eve", note="")
     assert monitors.tag == first
     await monitors.switch(["a"], False, who="eve")
     await monitors.switch(["a"], True, who="eve")
@@ -438,3 +447,68 @@ async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
     assert (monitors.records.counts["change", "a"], monitors.records.counts["change", "b"]) == (52, 10)
     assert (monitors.records.at["change", "/chatter"], monitors.records.at["change", "/cmd"]) == (42, 10)
     assert [fields["lost"] for event, fields in desk.events if event == "records lost"] == [5]
+
+
+def sources(**texts: str) -> Sources:
+    """Files and their signatures."""
+    files = {f"{name}.rv": text for name, text in texts.items()}
+    return Sources(files, {}, {name: signed(text) for name, text in files.items()})
+
+
+async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) -> None:
+    """Start, load, reload, removal, rollback, and the start after a crash: each asks for the site's signatures."""
+    unsigned = "a.rv:1:1: error: it has no signature of the site"
+    with pytest.raises(SpecificationsRefusedError, match=unsigned):
+        desk.monitors(site_keys=[LINE])
+    desk.monitors()  # revision 1 is unsigned
+    await desk.store.settled()
+    beside = desk.folder / "a.rv.sig"
+    beside.write_text(signed(A))
+    monitors = desk.monitors(site_keys=[LINE])
+    assert (monitors.revision, monitors.differs_from_folder) == (2, False)
+    for new in (
+        Sources({"b.rv": B}),
+        Sources({"b.rv": B}, {}, {"b.rv": signed(A)}),
+        Sources({"a.rv": A + "//"}),
+    ):
+        with pytest.raises(SpecificationsRefusedError):
+            await monitors.load(new, who="eve", note="")
+    with pytest.raises(SpecificationsRefusedError, match=r"msg/own/T.msg:1:1: error: it has no signature"):
+        await monitors.load(
+            Sources({"a.rv": A}, {"own/T.msg": "int32 x"}, {"a.rv": signed(A)}), who="eve", note=""
+        )
+    with pytest.raises(SpecificationsRefusedError, match=unsigned):
+        await monitors.rollback(1, who="eve")
+    assert monitors.revision == 2
+    await monitors.load(sources(b=B), who="adam", note="")
+    await monitors.remove(["a"], who="adam")
+    assert monitors.sources == sources(b=B)
+    await monitors.rollback(3, who="adam")
+    assert monitors.sources == sources(a=A, b=B)
+    (desk.folder / "a.rv").write_text(A + " ")
+    with pytest.raises(SpecificationsRefusedError, match="it is not the text that"):
+        await monitors.reload(who="adam")
+    beside.write_text(signed(A + " "))
+    assert (await monitors.reload(who="adam")).changed == ["a.rv"]
+    assert desk.monitors(restarted=True, site_keys=[LINE]).sources == sources(a=A + " ", b=B)
+    with pytest.raises(SpecificationsRefusedError, match="rosrv monitor reset"):
+        desk.monitors(restarted=True, site_keys=[OTHER_LINE])
+    loaded = [fields["signed_by"] for event, fields in desk.events if event == "specifications loaded"]
+    assert loaded == [[], *([[NAME]] * 5)]
+
+
+async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
+    """Keys are changed over by signing what is there anew; definitions of messages have signatures, too."""
+    (desk.folder / "msg" / "own").mkdir(parents=True)
+    texts = {desk.folder / "a.rv": A, desk.folder / "msg" / "own" / "T.msg": "int32 x"}
+    for path, text in texts.items():
+        path.write_text(text)
+        Path(f"{path}.sig").write_text(signed(text))
+    monitors = desk.monitors(site_keys=[LINE, OTHER_LINE])
+    differs = [monitors.differs_from_folder]
+    for path, text in texts.items():
+        Path(f"{path}.sig").write_text(signed(text, OTHER_KEY))
+    differs.append(monitors.differs_from_folder)
+    await monitors.reload(who="adam")
+    assert [*differs, monitors.differs_from_folder] == [False, True, False]
+    assert desk.monitors(restarted=True, site_keys=[OTHER_LINE]).names() == ["a"]

@@ -28,7 +28,7 @@ def spec(name: str, *topics: str) -> str:
 def revision(number: int, **files: str) -> Revision:
     """A revision with files of these names."""
     sources = Sources({f"{name}.rv": text for name, text in files.items()})
-    return Revision(number, sources, check(sources))
+    return Revision(number, sources, check(sources, ()))
 
 
 def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTaken:

@@ -6,6 +6,7 @@ import { Dialog } from "../parts/dialog.js";
 import { Editor } from "../parts/editor.js";
 import { Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
+import { Signature } from "../parts/signature.js";
 import { done, failed } from "../parts/toast.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
@@ -21,14 +22,18 @@ example() {
 }
 `;
 
-/** @param {{etag: string, files: string[], close: () => void, loaded: () => Promise<void>}} given */
-export function LoadSpecification({ etag, files, close, loaded }) {
+/** @param {{etag: string, files: string[], signed: boolean, close: () => void, loaded: () => Promise<void>}} given `signed`: it must be */
+export function LoadSpecification({ etag, files, signed, close, loaded }) {
   const [name, setName] = useState("example.rv");
   const [note, setNote] = useState("");
   const [definitions, setDefinitions] = useState(/** @type {Record<string, string>} */ ({}));
+  const [signatures, setSignatures] = useState(/** @type {Record<string, string>} */ ({})); // by the names of files, without folders
   const [line, setLine] = useState(/** @type {any} */ (null));
   const draft = useSpecification(EXAMPLE);
-  const send = (/** @type {boolean} */ dry) => draft.send({ [name]: draft.text }, { dry, note, definitions, match: dry ? undefined : etag });
+  const send = (/** @type {boolean} */ dry) => {
+    const names = [name, ...Object.keys(definitions)].map((one) => [one, signatures[one.split("/").at(-1) ?? ""] ?? ""]);
+    return draft.send({ [name]: draft.text }, { dry, note, definitions, signatures: Object.fromEntries(names), match: dry ? undefined : etag });
+  };
   const load = async () => {
     const body = await send(false);
     if (!body) return;
@@ -45,6 +50,8 @@ export function LoadSpecification({ etag, files, close, loaded }) {
           draft.write(text);
         }
       }
+      const beside = read.filter(([file]) => file.endsWith(".sig")).map(([file, , text]) => [file.slice(0, -4), text]);
+      setSignatures({ ...signatures, ...Object.fromEntries(beside) });
       const more = read.filter(([file]) => /\.(msg|srv)$/.test(file)).map(([file, , text]) => [`custom_msgs/${file}`, text]);
       if (more.length) setDefinitions({ ...definitions, ...Object.fromEntries(more) });
     } catch (failure) {
@@ -55,7 +62,8 @@ export function LoadSpecification({ etag, files, close, loaded }) {
   const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="operator" onClick=${() => send(true)}>Dry run</${Button}><${Button} role="admin" tone="primary" onClick=${load}>${files.includes(name) ? "Replace the file" : "Load"}</${Button}>`;
   return html`<${Dialog} wide title="Load a specification" close=${close} foot=${foot}>
     <div class="form-grid"><${Field} label="File name" mono value=${name} set=${setName} hint=${files.includes(name) ? "replaces the file of this name" : "a new file"} /><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" hint="kept with the revision" />
-      <div class="field"><label for="spec-files">Take it from files</label><input id="spec-files" class="input" type="file" multiple accept=".rv,.msg,.srv" onChange=${choose} /><span class="hint">.rv, and the .msg or .srv that ROS does not ship</span></div></div>
+      <div class="field"><label for="spec-files">Take it from files</label><input id="spec-files" class="input" type="file" multiple accept=".rv,.msg,.srv,.sig" onChange=${choose} /><span class="hint">.rv, and the .msg or .srv that ROS does not ship${signed && ", each with its .sig"}</span></div></div>
+    <${Signature} asked=${signed} value=${signatures[name] ?? ""} set=${(/** @type {string} */ next) => setSignatures({ ...signatures, [name]: next })} />
     ${Object.keys(definitions).length > 0 && html`<div class="form-grid">${Object.keys(definitions).map((one, index) => html`<${Field} key=${index} label="Definition, as package/Type.msg" mono value=${one} set=${(/** @type {string} */ next) => rename(one, next)} hint=${html`${definitions[one].length} characters; ends up as <${Given} value=${one} />`} />`)}</div>`}
     <${Outcome} ...${draft} pick=${(/** @type {any} */ one) => setLine({ number: one.line, column: one.column, count: (line?.count ?? 0) + 1 })} />
     <${Editor} label="Specification" language="rv" value=${draft.text} change=${draft.write} findings=${draft.findings.filter((one) => one.file === name)} line=${line} dry=${() => send(true)} height="38vh" /></${Dialog}>`;

@@ -13,6 +13,7 @@ import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
+import { Signature } from "../parts/signature.js";
 import { useResource } from "../parts/resource.js";
 import { Tabs } from "../parts/tabs.js";
 import { done, failed } from "../parts/toast.js";
@@ -53,13 +54,15 @@ function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
 function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, monitors }) {
   const draft = useSpecification(monitor.text);
   const [note, setNote] = useState("");
+  const [signature, setSignature] = useState("");
   const [asking, setAsking] = useState(false);
   const [line, setLine] = useState(/** @type {any} */ (null));
   const changed = draft.text !== monitor.text;
   const files = { [monitor.file]: draft.text };
-  const dry = () => draft.send(files, { dry: true });
+  const signatures = { [monitor.file]: signature };
+  const dry = () => draft.send(files, { dry: true, signatures });
   const load = async () => {
-    const body = await draft.send(files, { dry: false, note, match: monitors.etag });
+    const body = await draft.send(files, { dry: false, note, signatures, match: monitors.etag });
     setAsking(false);
     if (body) {
       done(`Revision ${body.revision} of the specifications is in force`, body.changed.join(", "));
@@ -72,7 +75,8 @@ function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, m
     ${(draft.report || draft.error || findings.length > 0) && html`<div class="panel-body"><${Outcome} report=${draft.report} error=${draft.error} findings=${findings} pick=${(/** @type {any} */ one) => setLine({ number: one.line, column: one.column, count: (line?.count ?? 0) + 1 })} /></div>`}
     <${Editor} label=${`Specification ${monitor.file}`} language="rv" value=${draft.text} change=${draft.write} findings=${findings} line=${line} dry=${() => may("operator") && dry()} height="46vh" />
     ${asking && html`<${Dialog} title=${`Replace ${monitor.file}?`} close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Not yet</button><${Button} role="admin" tone="primary" onClick=${load}>Replace</${Button}>`}>
-      <p>It is compiled and swapped between two messages; monitors of this file begin in their initial state, others keep theirs.</p><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" /></${Dialog}>`}</section>`;
+      <p>It is compiled and swapped between two messages; monitors of this file begin in their initial state, others keep theirs.</p><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" />
+      <${Signature} asked=${monitors.body.site_keys.length > 0} value=${signature} set=${setSignature} /></${Dialog}>`}</section>`;
 }
 
 function About(/** @type {{monitor: any, path: string}} */ { monitor, path }) {

@@ -44,7 +44,7 @@ export function Monitors() {
     <section class="panel" aria-label="Monitors">${body.monitors.length === 0
       ? html`<${Empty} icon="monitors" title="No monitor is loaded">Load a specification (.rv), or start the appliance with <code>--monitors FOLDER</code>. docs/monitors-tutorial.md begins with an example.</${Empty}>`
       : html`<${MonitorTable} monitors=${monitors} />`}</section>
-    ${loading && html`<${LoadSpecification} etag=${monitors.etag} files=${body.monitors.map((/** @type {any} */ one) => one.file)} close=${() => setLoading(false)} loaded=${again} />`}`;
+    ${loading && html`<${LoadSpecification} etag=${monitors.etag} files=${body.monitors.map((/** @type {any} */ one) => one.file)} signed=${body.site_keys.length > 0} close=${() => setLoading(false)} loaded=${again} />`}`;
 }
 
 function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {

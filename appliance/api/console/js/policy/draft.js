@@ -9,6 +9,7 @@ export const draft = createStore({
   etag: /** @type {string | null} */ (null), // of what the text was begun from
   base: "", // the text it was begun from
   text: "",
+  signature: "", // of the site, for the text
   error: /** @type {unknown} */ (null),
   findings: /** @type {any[]} */ ([]),
   report: /** @type {any} */ (null), // of the last dry run, or load
@@ -16,7 +17,7 @@ export const draft = createStore({
 });
 
 session.subscribe(() => {
-  if (!session.get().current) draft.set({ live: null, etag: null, base: "", text: "", error: null, findings: [], report: null, tested: null });
+  if (!session.get().current) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], report: null, tested: null });
 });
 
 /** Ask for the policy in force. A text that was changed here stays, and keeps what it was begun from. */
@@ -60,9 +61,9 @@ export async function check(/** @type {AbortSignal} */ signal) {
 
 /** What the text would do. */
 export async function dryRun() {
-  const { text } = draft.get();
+  const { text, signature } = draft.get();
   try {
-    const { body } = await ask("POST", "/v1/policy", { query: { dry_run: 1 }, json: { text } });
+    const { body } = await ask("POST", "/v1/policy", { query: { dry_run: 1 }, json: { text, signature } });
     draft.update({ report: body, findings: body.warnings, error: null });
   } catch (error) {
     refused(error);
@@ -72,9 +73,9 @@ export async function dryRun() {
 
 /** Bring the text into force. @param {string} note @param {number | null} within seconds to confirm */
 export async function load(note, within) {
-  const { text, etag } = draft.get();
+  const { text, signature, etag } = draft.get();
   try {
-    const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note }, match: etag ?? "" });
+    const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note, signature }, match: etag ?? "" });
     draft.update({ report: body, findings: body.warnings, base: text, etag: next, error: null });
     await look();
     return body;

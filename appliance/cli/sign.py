@@ -1,0 +1,74 @@
+"""`rosrv sign`: sign policies and specifications with a key of the site."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_ssh_private_key
+
+from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.site_keys import name_of, public_line
+from appliance.site_keys import sign as signature_of
+
+_OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
+
+
+def sign(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
+    key: Annotated[Path, typer.Option(metavar="KEY", help="The private key (ssh-keygen -t ed25519 -f KEY)")],
+    as_json: Json = False,
+) -> None:
+    """Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.
+
+    The public half of the key (KEY.pub) goes into `site_keys` of appliance.yaml: then nothing comes into force that no
+    such key signed. `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same, also with a passphrase or an agent.
+
+    Example: rosrv sign policies/default.ini --key site
+    """
+    private = _private(key)
+    signatures = {file: signature_of(_text(file), private) for file in files}
+    line = public_line(private)
+    for file, text in signatures.items():
+        beside = file.with_name(f"{file.name}.sig")
+        try:
+            beside.write_text(text, encoding="ascii")
+        except OSError as error:
+            raise usage_error(f"cannot write {beside}: {error.strerror}", verb="rosrv sign") from error
+        if as_json:
+            say_json({"file": str(file), "signature": str(beside), "key": line})
+        else:
+            say(f"{beside}: signed with {name_of(line)}")
+
+
+def _private(file: Path) -> Ed25519PrivateKey:
+    try:
+        data = file.read_bytes()
+        load = load_ssh_private_key if data.startswith(_OPENSSH) else load_pem_private_key
+        key = load(data, password=None)
+    except OSError as error:
+        raise usage_error(f"cannot read {file}: {error.strerror}", verb="rosrv sign") from error
+    except TypeError:
+        why = f"{file} has a passphrase: ssh-keygen -Y sign -n rosrv -f {file} FILE asks for it and signs"
+        raise usage_error(why, verb="rosrv sign") from None
+    except (ValueError, UnsupportedAlgorithm):
+        key = None
+    if not isinstance(key, Ed25519PrivateKey):
+        why = f"{file} is no private Ed25519 key (ssh-keygen -t ed25519 -f KEY makes one)"
+        raise usage_error(why, verb="rosrv sign")
+    return key
+
+
+def _text(file: Path) -> str:
+    """What the appliance will read: it does not know a byte order mark, nor the line ends of other systems."""
+    try:
+        text = file.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise usage_error(f"cannot read {file}: {error.strerror}", verb="rosrv sign") from error
+    except UnicodeDecodeError:
+        raise usage_error(f"{file} is not UTF-8 text", verb="rosrv sign") from None
+    if "\r" in text or text.startswith("\N{ZERO WIDTH NO-BREAK SPACE}"):
+        why = f"{file} has lines that end with CR LF, or a byte order mark: save it as plain UTF-8 with LF"
+        raise usage_error(why, verb="rosrv sign")
+    return text

@@ -1,0 +1,120 @@
+"""Where the site signs, no way into the appliance takes what it did not sign."""
+
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.processes import Process
+from tests.support.rest import Answer
+from tests.support.site_key import LINE, NAME, OTHER_KEY, signed
+from tests.support.waiting import eventually
+
+OTHER = OPEN_POLICY.replace("[Subscribers]", "/chatter =\n[Subscribers]", 1)
+SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
+NO_SIGNATURE = "it has no signature of the site (site_keys in appliance.yaml)"
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with a key of the site, a signed policy and an empty folder of specifications; not started."""
+    appliance = Appliance()
+    folder = appliance.directory / "monitors"
+    folder.mkdir()
+    config = appliance.directory / "appliance.yaml"
+    config.write_text(f"site_keys:\n  - {LINE}\n")
+    appliance.options = (
+        "--config",
+        str(config),
+        "--monitors",
+        str(folder),
+        "--api",
+        "127.0.0.1:0",
+        "--api-tls",
+        "off",
+    )
+    sign(appliance.policy_file)
+    yield appliance
+    appliance.close()
+
+
+def sign(file: Path) -> None:
+    """The site signs what is in a file now."""
+    file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
+
+
+def post(appliance: Appliance, path: str, **body: Any) -> Answer:
+    """POST of the first token's holder, whatever is in force."""
+    headers = {"If-Match": "*", "Content-Type": "application/json"}
+    return appliance.rest().request("POST", path, json.dumps(body).encode(), headers)
+
+
+def in_force(appliance: Appliance) -> dict[str, Any] | None:
+    """`GET /v1/policy`; None while control is away."""
+    answer = appliance.rest().get("/v1/policy")
+    return answer.json if answer.status == 200 else None
+
+
+def test_an_unsigned_policy_ends_the_start_before_anything_is_there(appliance: Appliance) -> None:
+    """In words that say what to do; no process, no state directory."""
+    Path(f"{appliance.policy_file}.sig").unlink()
+    with pytest.raises(AssertionError, match="ended"):
+        appliance.start()
+    assert isinstance(appliance.process, Process)
+    said = appliance.process.story()
+    assert f"{appliance.policy_file}:1:1: error: {NO_SIGNATURE}: sign it (rosrv sign FILE --key KEY)" in said
+    assert not appliance.state.exists()
+
+
+def test_no_way_leads_past_the_signature_of_a_policy(appliance: Appliance) -> None:
+    """File, SIGHUP, REST, rollback and a crash: each asks for it, and the record of what is taken names the key."""
+    appliance.start()
+    appliance.policy_file.write_text(OTHER)
+    assert "it is not the text that" in appliance.rosrv("policy", "reload", check=False).stderr
+    assert isinstance(appliance.process, Process)
+    appliance.process.popen.send_signal(signal.SIGHUP)
+    appliance.recorded("--event", "policy refused", count=2)
+    checked = appliance.rosrv("policy", "check", str(appliance.policy_file), check=False)
+    assert (checked.returncode, "it is not the text that" in checked.stdout) == (1, True)
+    for query in ("", "?dry_run=1"):
+        for signature in ("", signed(OPEN_POLICY), signed(OTHER, OTHER_KEY)):
+            refused = post(appliance, f"/v1/policy{query}", text=OTHER, signature=signature)
+            assert (refused.status, refused.json["findings"][0]["line"]) == (422, 1), refused.body
+    assert NO_SIGNATURE in post(appliance, "/v1/policy", text=OTHER).json["detail"]
+    taken = post(appliance, "/v1/policy", text=OTHER, signature=signed(OTHER))
+    assert taken.status == 200, taken.body
+    appliance.rosrv("policy", "rollback")
+    appliance.kill("control")
+    state = eventually(lambda: in_force(appliance), appliance.story)
+    assert (state["revision"], state["signature"], state["site_keys"]) == (3, signed(OPEN_POLICY), [LINE])
+    records = appliance.audit("--event", "policy loaded", "--oldest-first")
+    assert [one["detail"]["signed_by"] for one in records] == [NAME] * 3
+
+
+def test_no_way_leads_past_the_signature_of_a_specification(appliance: Appliance) -> None:
+    """Command, folder and REST: each asks for it, and the record of what is taken names the key."""
+    appliance.start()
+    file = appliance.directory / "monitors" / "count.rv"
+    file.write_text(SPECIFICATION)
+    for verb in (["load", str(file)], ["reload"]):
+        assert f"count.rv:1:1: error: {NO_SIGNATURE}" in appliance.rosrv("monitor", *verb, check=False).stderr
+    for query in ("", "?dry_run=1"):
+        refused = post(appliance, f"/v1/monitors{query}", files={"count.rv": SPECIFICATION})
+        assert (refused.status, NO_SIGNATURE in refused.json["detail"]) == (422, True)
+    sign(file)
+    appliance.rosrv("monitor", "load", str(file))
+    appliance.rosrv("monitor", "remove", "count")
+    appliance.rosrv("monitor", "reload")
+    signatures = {"count.rv": signed(SPECIFICATION)}
+    assert (
+        post(appliance, "/v1/monitors", files={"count.rv": SPECIFICATION}, signatures=signatures).status
+        == 200
+    )
+    shown = appliance.rest().get("/v1/monitors?texts=1").json
+    assert (shown["signatures"], shown["site_keys"]) == (signatures, [LINE])
+    records = appliance.audit("--event", "specifications loaded", "--oldest-first")
+    assert [one["detail"]["signed_by"] for one in records] == [[NAME], [], [NAME], [NAME]]

@@ -1,0 +1,64 @@
+"""Where the site signs: the console takes a policy and a specification with the signature that is pasted beside it."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.support.site_key import LINE, signed
+from tests.system.console.conftest import CONFIG, POLICY
+from tests.system.console.reader import Reader
+
+SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance with a key of the site."""
+    config = tmp_path_factory.mktemp("console") / "appliance.yaml"
+    config.write_text(f"{CONFIG}site_keys: [{LINE}]\n")
+    running = Appliance(policy=POLICY, options=("--config", str(config)))
+    Path(f"{running.policy_file}.sig").write_text(signed(POLICY))
+    with running:
+        yield running
+
+
+def test_a_policy_is_loaded_with_its_signature_only(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """Without it the dialog says what is missing, and stays; with it the policy is loaded."""
+    text = POLICY + "# another\n"
+    reader = opened()
+    page = reader.go("policy")
+    reader.write(text)
+    page.get_by_role("button", name="Load", exact=True).click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_role("alert")).to_contain_text("it has no signature of the site")
+    dialog.get_by_label("Signature of the site").fill(signed(text))
+    expect(dialog.get_by_role("alert")).to_have_count(0)
+    dialog.get_by_role("button", name="Load the policy").click()
+    expect(reader.toast("Revision 2 is in force")).to_be_visible()
+    assert appliance.rest().get("/v1/policy").json["signature"] == signed(text)
+
+
+def test_a_specification_is_loaded_with_its_signature_only(
+    appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
+) -> None:
+    """File and signature are chosen together; the one without the other is refused."""
+    file, beside = tmp_path / "count.rv", tmp_path / "count.rv.sig"
+    file.write_text(SPECIFICATION)
+    beside.write_text(signed(SPECIFICATION))
+    reader = opened()
+    page = reader.go("monitors")
+    page.get_by_role("button", name="Load").first.click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Take it from files").set_input_files(file)
+    dialog.get_by_role("button", name="Load", exact=True).click()
+    expect(dialog).to_contain_text("it has no signature of the site")
+    dialog.get_by_label("Take it from files").set_input_files([file, beside])
+    expect(dialog.get_by_label("Signature of the site")).to_have_value(signed(SPECIFICATION))
+    dialog.get_by_role("button", name="Load", exact=True).click()
+    expect(dialog).to_have_count(0)
+    assert appliance.rest().get("/v1/monitors").json["monitors"][0]["name"] == "count"
