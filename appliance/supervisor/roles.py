@@ -181,8 +181,13 @@ def roles_of(
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
     """The environment of a program of ROS; rosmaster binds loopback only because of ROS_IP."""
-    log = str(facts.part(part) / "log")
-    return {"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": master, "ROS_LOG_DIR": log}
+    return {
+        "ROS_IP": "127.0.0.1",
+        "ROS_MASTER_URI": master,
+        "ROS_LOG_DIR": str(facts.part(part) / "log"),
+        # rosout would write a gigabyte of what nodes say, which nobody reads: they say it to who subscribes.
+        "ROSOUT_DISABLE_FILE_LOGGING": "1",
+    }
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:

@@ -73,6 +73,8 @@ def _run(
     node_ports: range,
 ) -> None:
     """From the state directory's lock to the last rule that is taken away, whatever signals come meanwhile."""
+    manager = ServiceManager.of(os.environ)
+    manager.starting("takes its state, builds its firewall")
     state = StateDirectory(settings.state)
     try:
         settings = _with_ports(settings)
@@ -92,7 +94,7 @@ def _run(
         raise_file_limit(_FILES)
         enclosure.build()
         try:
-            _supervise(settings, roles, state, enclosure, ready, rosout_ports=ports.own_node)
+            _supervise(settings, roles, state, enclosure, ready, manager=manager, rosout_ports=ports.own_node)
         finally:
             enclosure.remove()
     finally:
@@ -175,6 +177,7 @@ def _supervise(
     enclosure: Enclosure,
     ready: Callable[[ControlReady, Settings], None],
     *,
+    manager: ServiceManager,
     rosout_ports: range,
 ) -> None:
     with enclosure.inside():
@@ -182,7 +185,7 @@ def _supervise(
         require_free("127.0.0.1", settings.rosmaster_port)
         api = _listener(settings)
 
-    manager = ServiceManager.of(os.environ)
+    manager.starting("starts its processes")
 
     def say_ready(said: ControlReady) -> None:
         ready(said, settings)

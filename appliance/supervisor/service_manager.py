@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Mapping, MutableMapping
 from contextlib import asynccontextmanager, suppress
 
 _WITHOUT_WATCHDOG = 30.0
-_MORE_SECONDS = 120
+_MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
 
 
 class ServiceManager:
@@ -32,6 +32,10 @@ class ServiceManager:
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
+
+    def starting(self, status: str) -> None:
+        """It gets on with its start, and asks for time; `status` is what it does now."""
+        self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:
         """The appliance serves; `status` is what `systemctl status` shows."""
@@ -55,8 +59,7 @@ class ServiceManager:
 
     async def _live(self) -> None:
         while True:
-            more = f"EXTEND_TIMEOUT_USEC={_MORE_SECONDS * 1_000_000}\n" if self._starting else ""
-            self._say(f"{more}WATCHDOG=1")
+            self._say(f"{_MORE if self._starting else ''}WATCHDOG=1")
             await asyncio.sleep((self.watchdog_seconds or _WITHOUT_WATCHDOG) / 2)
 
     def _say(self, text: str) -> None:

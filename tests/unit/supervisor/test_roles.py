@@ -28,6 +28,13 @@ def test_rosmaster_runs_nothing_of_its_home() -> None:
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
 
 
+def test_rosout_writes_no_files() -> None:
+    """What nodes say fills no disk."""
+    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosout")
+    assert role.program is not None
+    assert role.program(FACTS).environment["ROSOUT_DISABLE_FILE_LOGGING"] == "1"
+
+
 def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
     """The message has the command that installs it."""
     with pytest.raises(StartError, match="apt install python3-rosmaster"):

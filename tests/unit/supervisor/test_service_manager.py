@@ -16,12 +16,14 @@ def listening(path: Path) -> socket.socket:
     return heard
 
 
-def test_it_hears_of_ready_and_of_the_end(tmp_path: Path) -> None:
-    """`READY=1` with a status when nodes may connect, `STOPPING=1` when the appliance ends in order."""
+def test_it_hears_of_the_start_of_ready_and_of_the_end(tmp_path: Path) -> None:
+    """What a start does, and for how long; `READY=1` when nodes may connect, `STOPPING=1` when it ends in order."""
     with listening(tmp_path / "notify") as heard:
         manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        manager.starting("builds its firewall")
         manager.ready("nodes may connect")
         manager.stopping()
+        assert heard.recv(4096) == b"EXTEND_TIMEOUT_USEC=120000000\nSTATUS=builds its firewall"
         assert heard.recv(4096) == b"READY=1\nSTATUS=nodes may connect"
         assert heard.recv(4096).startswith(b"STOPPING=1\n")
 
