@@ -173,4 +173,5 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         drops=row.drops if row is not None else 0,
         changes=row.changes if row is not None else 0,
         faults=row.faults if row is not None else 0,
+        certificates=checked.certificates.get(name, []),
     )

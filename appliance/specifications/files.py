@@ -15,6 +15,7 @@ from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.reading import read_fields
 from appliance.ros.standard import standard_definitions
+from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.site_keys import UnsignedError, read_signature, signer
@@ -96,7 +97,8 @@ class Checked:
     """Specifications without errors: their monitors (name to file), what they listen to and publish.
 
     `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes;
-    `signed_by` are the keys of the site that signed them.
+    `signed_by` are the keys of the site that signed them, `certificates` says of each property of a monitor whether its
+    automaton was proved to be what is written.
     """
 
     monitors: dict[str, str] = field(default_factory=dict)
@@ -109,6 +111,7 @@ class Checked:
     uses: dict[str, frozenset[str]] = field(default_factory=dict)
     published_by: dict[str, frozenset[str]] = field(default_factory=dict)
     signed_by: list[str] = field(default_factory=list)
+    certificates: dict[str, list[str]] = field(default_factory=dict)
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
         """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
@@ -149,6 +152,9 @@ def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
         raise SpecificationsRefusedError([str(one) for one in error.findings]) from error
     except DefinitionError as error:
         raise SpecificationsRefusedError([f"msg/{error}"]) from error
+    certificates, wrong = certificates_of(monitors.monitors)
+    if wrong:
+        raise SpecificationsRefusedError([str(finding) for finding in wrong])
     return Checked(
         {one.name: one.code.file for one in monitors.monitors},
         {
@@ -168,6 +174,7 @@ def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
         {one.name: one.code.uses for one in monitors.monitors},
         {name: monitors.published_by(name) for name in sources.files},
         sources.signers(site_keys),
+        certificates,
     )
 
 

@@ -523,6 +523,7 @@ class Monitors:
             removed=removed,
             began=list(began),
             signed_by=checked.signed_by,
+            certificates=checked.certificates,
             warnings=list(checked.warnings)[:100],
         )
 

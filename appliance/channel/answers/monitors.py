@@ -30,6 +30,10 @@ class MonitorState(msgspec.Struct, frozen=True):
     drops: int
     changes: int
     faults: int
+    certificates: Annotated[
+        list[str],
+        told("of each property: whether its automaton was proved to be what is written, or why not"),
+    ]
 
 
 class Monitors(msgspec.Struct, frozen=True):

@@ -16,6 +16,7 @@ from appliance.cli.monitor.output import lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
+from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import CompiledProperty
 from appliance.rosmop.logics.picture import dot_of, svg_of
@@ -52,15 +53,19 @@ def check(
     """
     try:
         monitors = _load(files, msg or [])
-        findings = list(monitors.warnings)
+        certificates, wrong = certificates_of(monitors.monitors)
+        findings = [*wrong, *monitors.warnings]
     except SpecificationError as error:
-        monitors = None
+        monitors, certificates = None, {}
         findings = list(error.findings)
     for finding in findings:
         say_finding(finding, as_json=as_json)
     errors = sum(finding.severity == "error" for finding in findings)
     if not as_json:
         _summarise(findings, errors, monitors)
+        for name, lines in certificates.items():
+            for line in lines:
+                say(f"{name}: {line}")
     if monitors is not None:
         properties = [each.code.property for monitor in monitors.monitors for each in monitor.properties]
         _draw(properties, dot, svg)
