@@ -75,7 +75,9 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | No
 
 
 _NO_AUTOMATON = {
-    "cfg": "a grammar has no automaton",
+    "cfg": "grammars are not followed",
+    "ptcaret": "it has a stack",
+    "srs": "it has no automaton",
     "mtl": "it has bounds of time",
     "pattern": "it has a bound of time",
 }

@@ -35,6 +35,8 @@ def unused_events(specification: tree.Specification, properties: Sequence[_HasPr
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
+    if any(code.property.logic == "ptcaret" for code in properties):
+        named |= {"begin", "end"}
     if any(
         code.property.logic in ("fsm", "tfsm") and _DEFAULT.search(code.property.formula)
         for code in properties

@@ -11,7 +11,9 @@ from appliance.rosmop.logics.lexer import suggestion
 from appliance.rosmop.logics.ltl import compile_ltl
 from appliance.rosmop.logics.mtl import compile_mtl
 from appliance.rosmop.logics.pattern import compile_pattern
+from appliance.rosmop.logics.ptcaret import compile_ptcaret
 from appliance.rosmop.logics.ptltl import compile_ptltl
+from appliance.rosmop.logics.srs import compile_srs
 from appliance.rosmop.logics.tfsm import compile_tfsm
 from appliance.rosmop.positions import Finding, Position
 
@@ -25,8 +27,16 @@ LOGICS: Mapping[str, Compiler] = MappingProxyType(
         "cfg": compile_cfg,
         "mtl": compile_mtl,
         "pattern": compile_pattern,
+        "srs": compile_srs,
+        "ptcaret": compile_ptcaret,
     }
 )
+
+_REFUSED = {
+    "dl": "`dL` (differential dynamic logic) is not supported: what is proved with it is proved elsewhere. Write the"
+    " condition that the proof gives as a test of numbers in an event, and what must follow in time as `mtl` or"
+    " `pattern`"
+}
 
 
 def compile_property(
@@ -40,7 +50,10 @@ def compile_property(
     """
     compiler = LOGICS.get(logic.lower())
     if compiler is None:
-        text = f"there is no logic `{logic}`{suggestion(logic.lower(), list(LOGICS))}"
+        text = (
+            _REFUSED.get(logic.lower())
+            or f"there is no logic `{logic}`{suggestion(logic.lower(), list(LOGICS))}"
+        )
         raise FormulaError([Finding(logic_position or origin, "error", text)])
     source = Source(logic.lower(), formula, tuple(events), origin)
     if not events:

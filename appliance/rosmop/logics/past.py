@@ -100,6 +100,8 @@ class Program:
         return self._temporal(operator, operands, low, high)
 
     def _temporal(self, operator: str, operands: list[int], low: int, high: int | None) -> int:
+        abstract = "abstract " if operator.startswith("abstract ") else ""
+        operator = operator.removeprefix("abstract ")
         if operator in ("once", "historically"):
             operands = [self._emit("true"), *operands]
         if operator == "historically":
@@ -107,7 +109,7 @@ class Program:
         elif operator.startswith("dual "):
             operands = [self._not(operand) for operand in operands]
         plain = {"once": "since", "historically": "since"}.get(operator, operator.removeprefix("dual "))
-        number = self._emit(plain, *operands, low=low, high=high)
+        number = self._emit(abstract + plain, *operands, low=low, high=high)
         return self._not(number) if operator == "historically" or operator.startswith("dual ") else number
 
 
@@ -127,28 +129,37 @@ def compile_past(source: Source, formula: Formula) -> CompiledProperty:
     return PastProperty(source, program)
 
 
+class Stepper:
+    """Steps a program without time bounds; what it remembers of an event are bits."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        remembered = [
+            (number, instruction)
+            for number, instruction in enumerate(program.instructions)
+            if instruction.operator.removeprefix("abstract ") in ("since", "previously")
+        ]
+        self._place = {number: 1 << index for index, (number, _) in enumerate(remembered)}
+        self._kept = [
+            (self._place[number], number if one.operator.endswith("since") else one.operands[0])
+            for number, one in remembered
+        ]
+        self.abstract = sum(self._place[number] for number, one in remembered if one.operator[0] == "a")
+        """The bits of what abstract operators remember."""
+
+    def step(self, bits: int, event: int) -> tuple[int, bool]:
+        """What is remembered of an event, given that of the last one, and whether the formula holds."""
+        values = _evaluate(self._program, self._place, bits, event)
+        return sum(place for place, number in self._kept if values[number]), values[self._program.result]
+
+
 def _table(program: Program, letters: Sequence[int]) -> Automaton:
     """The automaton over letters, of which the formula names ``letters[i]`` (-1: none of its events)."""
-    remembered = [
-        (number, instruction)
-        for number, instruction in enumerate(program.instructions)
-        if instruction.operator in ("since", "previously")
-    ]
-    place = {number: 1 << index for index, (number, _) in enumerate(remembered)}
-
-    def step(state: tuple[int, bool], letter: int) -> tuple[int, bool]:
-        values = _evaluate(program, place, state[0], letters[letter])
-        bits = 0
-        for number, instruction in remembered:
-            kept = number if instruction.operator == "since" else instruction.operands[0]
-            if values[kept]:
-                bits |= place[number]
-        return bits, values[program.result]
-
+    stepper = Stepper(program)
     return explore(
         (0, False),
         len(letters),
-        step,
+        lambda state, letter: stepper.step(state[0], letters[letter]),
         lambda state: ("validation",) if state[1] else ("violation",),
         min(MAX_TABLE_STATES, 1 + MAX_TABLE_WORK // (len(program.instructions) * len(letters))),
     )
@@ -159,7 +170,7 @@ def _evaluate(program: Program, place: dict[int, int], bits: int, event: int) ->
     values: list[bool] = []
     for number, instruction in enumerate(program.instructions):
         operands = [values[operand] for operand in instruction.operands]
-        operator = instruction.operator
+        operator = instruction.operator.removeprefix("abstract ")
         if operator == "event":
             value = instruction.event == event
         elif operator in ("true", "false"):

@@ -193,7 +193,7 @@ def test_a_fault_is_shown_by_a_trace() -> None:
 @pytest.mark.parametrize(
     ("logic", "formula", "why"),
     [
-        ("cfg", "S -> a S b | epsilon", "a grammar has no automaton"),
+        ("cfg", "S -> a S b | epsilon", "grammars are not followed"),
         ("mtl", "once[0,1s] a", "it has bounds of time"),
         ("pattern", "globally: a causes b within 1s", "it has a bound of time"),
         ("pattern", "after a until a: some b", "one event opens and closes the scope"),

@@ -23,6 +23,8 @@ EXAMPLES = {
     "cfg": "S -> a S b | epsilon",
     "mtl": "once[0,1s] a",
     "pattern": "globally: no a",
+    "srs": "a b -> #epsilon . c -> #fail .",
+    "ptcaret": "a => <*> b",
 }
 CATEGORIES = {
     "fsm": ("s", "fail"),
@@ -33,6 +35,8 @@ CATEGORIES = {
     "cfg": ("match", "fail"),
     "mtl": ("violation", "validation"),
     "pattern": ("violation", "validation"),
+    "srs": ("fail", "succeed"),
+    "ptcaret": ("violation", "validation"),
 }
 
 
@@ -62,6 +66,8 @@ DOCUMENTED = {
     "ptltl": ("fire", "unsafe", "armed"),
     "mtl": ("fire", "safe"),
     "pattern": ("armed", "disarmed", "fire", "safe"),
+    "srs": ("a", "b", "c", "done"),
+    "ptcaret": ("begin", "end", "lock", "write"),
 }
 
 
@@ -81,6 +87,12 @@ def test_an_unknown_logic_is_told_where_its_name_stands() -> None:
     assert str(refused.value) == "test.rv:7:1: error: there is no logic `ptlt`; did you mean `ptltl`?"
 
 
+def test_differential_dynamic_logic_is_refused_by_name() -> None:
+    """With what to write instead."""
+    with pytest.raises(FormulaError, match=r"`dL` .* is not supported: .* as `mtl` or `pattern`"):
+        compile_property("dL", "x", ("a",), ORIGIN)
+
+
 @pytest.mark.parametrize("logic", LOGICS)
 def test_an_empty_formula_is_refused(logic: str) -> None:
     """An empty formula says what was expected."""
@@ -93,7 +105,7 @@ def test_comments_and_lines(logic: str) -> None:
     assert (
         compiled(logic, f"// first\n/* then\n */ {EXAMPLES[logic]} // last").categories == CATEGORIES[logic]
     )
-    assert refusal(logic, "// first\n  $")[0].startswith("8:3: `$` has no meaning")
+    assert refusal(logic, "// first\n  %")[0].startswith("8:3: `%` has no meaning")
 
 
 @pytest.mark.parametrize("logic", LOGICS)
@@ -147,12 +159,14 @@ HOSTILE = {
     ],
     "mtl": [" and ".join(f"once[{i},{i + 1}] a" for i in range(4_000)), "once[0,1] " * 9_000 + "a"],
     "pattern": ["globally: " * 9_000, "after a until " * 5_000],
+    "srs": ["a -> a a .", "a b -> b a . " * 6_000, " ".join(["a"] * 40_000) + " -> b ."],
+    "ptcaret": [" S ".join(["a"] * 20_000), "(*) " * 20_000 + "a", " and ".join(["(*)" * 60 + " a"] * 400)],
 }
 
 PROGRAM = """
 import json, resource, sys
 from appliance.rosmop.logics.catalogue import compile_property
-from appliance.rosmop.logics.interface import FormulaError
+from appliance.rosmop.logics.interface import FormulaError, RunFaultError
 from appliance.rosmop.positions import Position
 resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
 resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
@@ -161,7 +175,7 @@ try:
     run = compile_property(logic, formula, ("a", "b", "c"), Position("f", 1, 1)).start(0)
     for event in range(6):
         run.step(event % 3, 0)
-except FormulaError as error:
+except (FormulaError, RunFaultError) as error:
     print(error)
 """
 

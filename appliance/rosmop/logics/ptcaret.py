@@ -1,0 +1,127 @@
+"""``ptcaret``: past-time linear temporal logic with calls and returns, as MOP's PTCaRet plugin reads it.
+
+``ptltl``, and operators about the *abstract* past, in which every call that has returned is one step that nobody looks
+into: from the event ``begin`` to the ``end`` that belongs to it, both included, nothing is seen any more once the
+``end`` is over. ``(*a) x``, ``<*a> x``, ``[*a] x`` and ``x Sa y`` look at that past. Derived from them:
+
+- ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
+- ``<*s@b> x``, ``[*s@b] x``: at some, at every ``begin`` of an open call; ``…s@c``: at the event before it; ``…s@bc``:
+  at an event ``begin`` or ``call`` that is not within a call that has returned.
+
+An ``end`` to which no ``begin`` belongs begins the abstract past anew. Calls that are open are remembered, up to a
+bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and Ball, 2008.)
+"""
+
+from appliance.rosmop.logics.formula import NOT, Formula, Level, Syntax, boolean_levels, nodes, read_formula
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from appliance.rosmop.logics.past import VERDICTS, Program, Stepper
+from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
+
+MAX_DEPTH = 10_000
+"""Calls that may be open at once."""
+
+BEGIN, END, CALL = "begin", "end", "call"
+
+SYNTAX = Syntax(
+    unary={
+        **NOT,
+        **PTLTL.unary,
+        "(*a)": "abstract previously",
+        "<*a>": "abstract once",
+        "[*a]": "abstract historically",
+        "@b": "at begin",
+        "@c": "at call",
+        **{f"<*s@{where}>": f"some {where}" for where in ("b", "c", "bc")},
+        **{f"[*s@{where}]": f"every {where}" for where in ("b", "c", "bc")},
+    },
+    levels=boolean_levels([Level({"S": "since", "~S": "dual since", "Sa": "abstract since"}, "left")]),
+    refused={
+        **PTLTL.refused,
+        "Ss": "has no meaning here; for `x Ss@b y` write `(begin -> x) Sa (begin and y)`",
+    },
+)
+
+
+def compile_ptcaret(source: Source) -> CompiledProperty:
+    """Compile a ``ptcaret`` formula. Raises FormulaError."""
+    formula = read_formula(source, SYNTAX)
+    plain = _plain(formula)
+    missing = [name for name in (BEGIN, END) if name not in source.events]
+    if missing and any(node.operator.startswith("abstract ") for node in nodes(plain)):
+        names = " and ".join(f"`{name}`" for name in missing)
+        raise source.error(
+            0, f"the abstract past needs the events `begin` and `end` of the specification; it has no {names}"
+        )
+    if CALL not in source.events and any(node.name == CALL for node in nodes(plain)):
+        raise source.error(0, "`@bc` needs the event `call` of the specification")
+    return CaretProperty(source, Program(plain, source.events))
+
+
+class CaretProperty(CompiledProperty):
+    """A formula with a stack: what the abstract operators remember, for each call that is open."""
+
+    def __init__(self, source: Source, program: Program) -> None:
+        super().__init__(source, VERDICTS)
+        self.stepper = Stepper(program)
+        places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
+        self.begin, self.end = places
+
+    def start(self, time_ns: int) -> Run:
+        """A run with no open call; the time plays no part."""
+        del time_ns
+        return CaretRun(self)
+
+
+class CaretRun:
+    """A run: what is remembered of the last event, and the abstract past before each open call."""
+
+    __slots__ = ("_begin", "_bits", "_end", "_mask", "_stack", "_step")
+
+    def __init__(self, compiled: CaretProperty) -> None:
+        self._step = compiled.stepper.step
+        self._mask = compiled.stepper.abstract
+        self._begin, self._end = compiled.begin, compiled.end
+        self._bits = 0
+        self._stack: list[int] = []
+
+    @property
+    def deadline(self) -> int | None:
+        """None: the verdict comes with each event."""
+        return None
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        del time_ns
+        if event == self._begin:
+            if len(self._stack) >= MAX_DEPTH:
+                raise RunFaultError(f"more than {MAX_DEPTH} calls are open: an `end` is missing")
+            self._stack.append(self._bits & self._mask)
+        bits, holds = self._step(self._bits, event)
+        if event == self._end:
+            bits = (bits & ~self._mask) | (self._stack.pop() if self._stack else 0)
+        self._bits = bits
+        return ("validation",) if holds else ("violation",)
+
+    def expire(self) -> Categories:
+        """Never right: there is no deadline."""
+        raise ValueError("this run has no deadline")
+
+
+def _plain(formula: Formula) -> Formula:
+    """The formula without the derived operators."""
+    operands = tuple(_plain(operand) for operand in formula.operands)
+    operator, _, where = formula.operator.partition(" ")
+    if operator not in ("at", "some", "every"):
+        return Formula(formula.operator, operands, formula.name, formula.bounds, formula.offset)
+    inner = operands[0]
+    if where in ("c", "call"):
+        inner = Formula("previously", (inner,))
+    there = Formula("event", name=BEGIN)
+    if where == "bc":
+        there = Formula("or", (there, Formula("event", name=CALL)))
+    if operator == "every":
+        return Formula("abstract historically", (Formula("implies", (there, inner)),))
+    both = Formula("and", (there, inner))
+    if operator == "some":
+        return Formula("abstract once", (both,))
+    return Formula("abstract since", (Formula("not", (there,)), both))
