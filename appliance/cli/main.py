@@ -41,6 +41,10 @@ VERBS: dict[str, Verb | Group] = {
                 "appliance.cli.monitor.verbs:run",
                 "Give a recording to the monitors and report what came of every message, by the recording's clock.",
             ),
+            "learn": Verb(
+                "appliance.cli.monitor.learning:learn_monitors",
+                "Propose specifications out of recordings of a robot that behaves, for a person to edit.",
+            ),
             "list": Verb(
                 "appliance.cli.monitor.running:list_monitors",
                 "Show every monitor: enabled or not, what it listens to, what it did.",

@@ -3,8 +3,10 @@
 A topic whose messages have another definition than the specifications mean is refused: its messages are dropped.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from types import TracebackType
 
@@ -67,6 +69,40 @@ def definitions_of(reader: Reader) -> Definitions:
         except DefinitionError:
             continue
     return found
+
+
+class Recorded:
+    """A bag as the learner takes it: read anew for each pass, and only the topics that fit one of the patterns.
+
+    `definitions` are those that its publishers sent. Raises `typer.BadParameter` for a bag that cannot be read or has
+    two types on one topic.
+    """
+
+    def __init__(self, path: Path, patterns: Sequence[str]) -> None:
+        self._path = path
+        self.name = path.name
+        self.topics: dict[str, str] = {}
+        with closing(open_bag(path)) as reader:
+            self.began, self.ended = reader.start_time, reader.end_time - 1
+            self.message_count = reader.message_count
+            self.definitions = definitions_of(reader)
+            for connection in reader.connections:
+                if not any(fnmatchcase(connection.topic, pattern) for pattern in patterns):
+                    continue
+                kind = ros_type(connection.msgtype)
+                other = self.topics.setdefault(connection.topic, kind)
+                if other != kind:
+                    raise usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
+
+    def messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, nanoseconds and bytes of every message, in the order of the bag."""
+        with closing(open_bag(self._path)) as reader:
+            try:
+                for connection, time_ns, data in reader.messages():
+                    if connection.topic in self.topics:
+                        yield connection.topic, time_ns, data
+            except ReaderError as error:
+                raise usage_error(f"the bag {self._path} is damaged: {error}") from error
 
 
 _Header = tuple[

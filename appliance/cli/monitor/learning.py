@@ -1,0 +1,116 @@
+"""`rosrv monitor learn`: specifications out of recordings of a robot that behaves."""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.cli.monitor.bag import Recorded
+from appliance.cli.monitor.input import BESIDE, usage_error
+from appliance.cli.output import Json, counted, say, say_json
+from appliance.cli.progress import progress
+from appliance.learning.learner import LearningError, Learnt, learn
+from appliance.ros.definitions import Definitions
+from appliance.ros.errors import DefinitionError
+from appliance.ros.message_text import BUILTINS
+from appliance.ros.standard import standard_definitions
+
+
+def learn_monitors(
+    bags: Annotated[
+        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
+    ],
+    topics: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="PATTERN", help="Only such topics, as /arm/* (repeatable)"),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.rv", help="Write it here (must not exist), definitions into msg/ beside it"
+        ),
+    ] = None,
+    hold_out: Annotated[
+        float, typer.Option(min=0.0, max=0.9, help="The share of the recordings that is its test")
+    ] = 0.3,
+    as_json: Json = False,
+) -> None:
+    """Propose specifications out of recordings of a robot that behaves, for a person to edit.
+
+    Example: rosrv monitor learn --bag monday.bag --bag tuesday.bag --out learnt.rv
+    """
+    if out is not None and out.exists():
+        raise usage_error(f"{out} is there already")
+    if len({bag.resolve() for bag in bags}) < len(bags):
+        raise usage_error("a recording is given twice: it would be its own test")
+    recordings = [Recorded(bag, topics or ["*"]) for bag in bags]
+    recorded = Definitions({})
+    for recording in recordings:
+        recorded = recorded.extended(recording.definitions)
+    definitions = standard_definitions().extended(recorded)
+    total = sum(recording.message_count for recording in recordings)
+    try:
+        with progress("learning", lambda: 2 * total, shares_screen=out is None) as told:
+            learnt = learn(recordings, definitions, hold_out, told)
+    except LearningError as error:
+        raise usage_error(str(error)) from error
+    if out is not None:
+        _write(out, learnt, recorded)
+    if as_json:
+        _say_rows(learnt)
+    elif out is None:
+        sys.stdout.write(learnt.text)
+    else:
+        conditions, names = counted(len(learnt.candidates), "condition"), set(learnt.names.values())
+        say(f"{conditions} in {counted(len(names), 'specification')}: {out}")
+        widened = sum(1 for each in learnt.candidates if each.widened)
+        if learnt.held_out:
+            say(f"alarms on what was held out: {widened} widened, {len(learnt.left_out)} left out")
+
+
+def _say_rows(learnt: Learnt) -> None:
+    for result, rows in (("kept", learnt.candidates), ("left out", learnt.left_out)):
+        for each in rows:
+            say_json({
+                "specification": learnt.names.get(each.key, ""), "topic": each.topic, "kind": each.kind,
+                "field": each.place, "says": each.says, "seen": each.seen, "support": asdict(each.support),
+                "held_out_alarms": each.alarms, "result": "widened" if each.widened else result,
+            })  # fmt: skip
+
+
+def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
+    """The text, and beside it the definitions that are not ROS's own."""
+    files = {out: learnt.text}
+    for name in _needed(learnt, recorded):
+        path = out.parent / BESIDE / f"{name}.msg"
+        text = recorded.message(name).text
+        if path.exists() and path.read_text(encoding="utf-8", errors="surrogateescape") != text:
+            raise usage_error(f"{path} is there already and is another than the recordings have")
+        files[path] = text
+    try:
+        for path, text in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8", errors="surrogateescape")
+    except OSError as error:
+        raise usage_error(f"cannot write {out}: {error.strerror}") from error
+
+
+def _needed(learnt: Learnt, recorded: Definitions) -> list[str]:
+    """The types of the specifications, and those that they are made of, that `check` would not know."""
+    own = standard_definitions()
+    waiting = [learnt.types[topic] for each in learnt.candidates for topic in each.topics]
+    found: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in found or name in BUILTINS:
+            continue
+        try:
+            if own.md5sum(name) == recorded.md5sum(name):
+                continue
+        except DefinitionError:
+            pass  # not one of ROS's own
+        found.add(name)
+        waiting += [field.type for field in recorded.message(name).fields]
+    return sorted(found)
