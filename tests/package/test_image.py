@@ -16,7 +16,10 @@ import pytest
 
 from appliance import __version__
 from distribution.checkout import ROOT
-from tests.support.docker import BASE, Engine, builder
+from examples.landshark.lab import Lab
+from tests.support.docker import BASE, Engine, MachineInside, builder
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
 
 pytestmark = pytest.mark.timeout(1800)  # the image is built
 NAME = f"rosrv/appliance:{__version__}"
@@ -139,6 +142,25 @@ def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
         "docs/air-gapped.md",
         "LICENSE",
     }
+
+
+def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
+    """On a machine whose engine has nothing, by the page's commands; nodes of the machine talk through it."""
+    needs(has_ros(), "ROS 1 (run `make setup`)")
+    with Lab("rosrv-site") as lab:
+        machine = lab.host("machine", "10.79.0.1/24")
+        with Engine(machine, data=tmp_path / "docker") as engine:
+            assert engine.docker("images", "--quiet").stdout == ""
+            engine.docker("load", "--input", str(next(unpacked.glob("rosrv-image_*.tar"))), timeout=300)
+            compose = engine.compose(unpacked, "site", "compose.yaml", "compose.host.yaml")
+            compose("up", "--detach", "--no-build", "appliance")
+            compose.wait_healthy()
+            with RosSession("http://172.29.76.2:11311", tmp_path, MachineInside(machine)) as ros:
+                listener = ros.listener("rospy", "/chatter", name="listener")
+                ros.talker("rospy", "/chatter", name="talker")
+                listener.wait_for(event="received")
+            registered = {one["caller_id"] for one in compose.audit("--event", "registered")}
+            assert registered >= {"/listener", "/talker"}
 
 
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:

@@ -7,43 +7,18 @@ import json
 import shutil
 import subprocess
 import sys
-import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.package.conftest import SLOW_SECONDS, clean_machine
 from tests.support.machine import Done, Machine
-from tests.support.machine_disk import ROOT, clean_disk, newest_kernel
-from tests.support.requirements import need_program
+from tests.support.machine_disk import ROOT
 
 # Packages are built, and a machine boots twice, each instruction computed, perhaps by a processor that others use.
 pytestmark = pytest.mark.timeout(5400)
-NODE_PACKAGES = (
-    "python3-rospy",
-    "python3-rostopic",
-    "python3-rosnode",
-    "python3-std-msgs",
-    "systemd-resolved",
-)
-SLOW_SECONDS = 1200.0  # of what is over in seconds on a machine of its own
 EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
-
-
-@pytest.fixture(scope="module")
-def package() -> Path:
-    """dist/rosrv_VERSION_amd64.deb, built now by the one command."""
-    for program, debian in (("dh", "debhelper"), ("dpkg-buildpackage", "dpkg-dev"), ("lintian", "lintian")):
-        need_program(program, debian)
-    done = subprocess.run(
-        [sys.executable, "-m", "distribution.deb", "amd64"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return ROOT / done.stdout.split()[0]
 
 
 @pytest.fixture
@@ -63,20 +38,7 @@ def newer(package: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
     """A clean machine with both packages in its folder, not started."""
-    depends = subprocess.run(
-        ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True
-    ).stdout
-    named = {entry.split("|")[0].split("(")[0].strip() for entry in depends.split(",")}
-
-    def freight(path: Path) -> None:
-        with tarfile.open(path, "w") as archive:
-            archive.add(package, "old.deb")
-            archive.add(newer, "new.deb")
-
-    disk = tmp_path / "disk.ext4"
-    image = clean_disk(newest_kernel(), (*sorted(named - {"systemd"}), *NODE_PACKAGES))
-    subprocess.run(["cp", "--sparse=always", str(image), str(disk)], check=True)
-    machine = Machine(tmp_path, disk=disk, freight=freight)
+    machine = clean_machine(tmp_path, package, {"old.deb": package, "new.deb": newer})
     try:
         yield machine
     finally:

@@ -45,15 +45,16 @@ class DockerError(AssertionError):
 
 
 class Engine:
-    """A running dockerd; a context manager. With `builds`, one that only builds images."""
+    """A running dockerd; a context manager. With `builds`, one that only builds. `data` is where it keeps images."""
 
-    def __init__(self, host: Host | None = None, *, builds: bool = False) -> None:
+    def __init__(self, host: Host | None = None, *, builds: bool = False, data: Path = DATA) -> None:
         need_root()
         self._program = need_program("dockerd", "docker.io")
         self._client = need_program("docker", "docker.io")
         self._compose = need_program("docker-compose", "docker-compose")
         self.host: Host = host or ThisMachine()
         self._builds = builds
+        self._data = data
         # Short, for the sockets in it.
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-engine-"))
         self._log = self.directory / "log"
@@ -95,10 +96,10 @@ class Engine:
 
     def start(self) -> Self:
         """Start it; returns when it answers."""
-        DATA.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(DATA.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._data.mkdir(parents=True, exist_ok=True)
+        self._lock = os.open(self._data.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)  # the data is for one engine at a time
-        command = [self._program, "--data-root", str(DATA), "--exec-root", str(self.directory / "exec")]
+        command = [self._program, "--data-root", str(self._data), "--exec-root", str(self.directory / "exec")]
         command += ["--pidfile", str(self.directory / "pid"), "--host", self.address]
         if self._builds:
             # Should the tests be killed, nobody else would end it (the lab ends what lives on its hosts).
@@ -182,6 +183,15 @@ class Engine:
         with contextlib.suppress(DockerError):
             self.clear()
         self.stop()
+
+
+class MachineInside:
+    """The engine's machine as a host of nodes, by the address at which the appliance of compose.host.yaml sees it."""
+
+    address = "172.29.76.1"
+
+    def __init__(self, machine: Host) -> None:
+        self.popen = machine.popen
 
 
 class Compose:

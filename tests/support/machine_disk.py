@@ -81,9 +81,12 @@ def machine_disk(kernel: Kernel) -> Path:
     return _disk("disk", kernel, _packages(), environment=True)
 
 
-def clean_disk(kernel: Kernel, packages: tuple[str, ...]) -> Path:
-    """The image of a Debian that knows nothing of the project: these packages, systemd, and the agent."""
-    return _disk("clean", kernel, (*packages, *_MACHINES_OWN), environment=False)
+def clean_disk(kernel: Kernel, packages: tuple[str, ...], *, name: str = "clean") -> Path:
+    """The image of a Debian that knows nothing of the project: these packages, systemd, and the agent.
+
+    The newest of each `name` is kept.
+    """
+    return _disk(name, kernel, (*packages, *_MACHINES_OWN), environment=False)
 
 
 def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: bool) -> Path:

@@ -7,24 +7,15 @@ from pathlib import Path
 import pytest
 
 from appliance.network.scan import scan
-from tests.support.docker import Compose, project
+from tests.support.docker import Compose, MachineInside, project
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.system.containers.conftest import Site
 
 pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
 
-APPLIANCE, MACHINE = "172.29.76.2", "172.29.76.1"
+APPLIANCE, MACHINE = "172.29.76.2", MachineInside.address
 LOCAL_PORTS = range(32768, 61000)
-
-
-class MachineInside:
-    """The machine, by the address at which the appliance sees it."""
-
-    address = MACHINE
-
-    def __init__(self, site: Site) -> None:
-        self.popen = site.machine.popen
 
 
 @pytest.fixture
@@ -49,7 +40,7 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     def nft(*arguments: str, text: str = "") -> None:
         subprocess.run(["nft", *arguments], input=text, text=True, check=True, capture_output=True)
 
-    with RosSession(f"http://{APPLIANCE}:11311", tmp_path, MachineInside(site)) as ros:
+    with RosSession(f"http://{APPLIANCE}:11311", tmp_path, MachineInside(site.machine)) as ros:
         listener = ros.listener("rospy", "/chatter", name="listener")
         ros.talker("roscpp", "/chatter", name="talker")
         listener.wait_for(event="received")

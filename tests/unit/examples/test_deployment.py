@@ -49,6 +49,7 @@ def test_cloud_init_writes_what_is_right(tmp_path: Path) -> None:
 def test_cloud_init_installs_only_what_it_knows() -> None:
     """The package's checksum is looked at before it is installed; as shipped, the example installs nothing."""
     steps = yaml.safe_load(CLOUD.read_text())["runcmd"]
+    assert steps[0] == "set -e", "cloud-init makes one script of them"
     order = [
         next(i for i, step in enumerate(steps) if word in step) for word in ("curl", "sha256sum", "apt-get")
     ]
