@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from appliance.supervisor.roles import ROSMASTER, ROSOUT
 from tests.integration.supervisor.actors import CROWD
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
-from tests.support.waiting import allowed
+from tests.support.waiting import allowed, eventually
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = Path(__file__).parent / "program.py"
@@ -43,6 +44,15 @@ class Running:
         self.process.wait_for(event="ready", timeout=60)
         for role in ALL:
             self.pid(role)
+        return self
+
+    def until_confined(self) -> "Running":
+        """Wait until everything runs and each process has given up what it must not have: nodes may connect before."""
+        self.until_ready()
+        for role in ALL:
+            pid = self.pid(role)
+            # The filter of system calls is the last that it takes upon itself.
+            eventually(partial(_is_filtered, pid), f"{role} is confined")
         return self
 
     def pid(self, role: str, *, restarts: int = 0) -> int:
@@ -299,7 +309,7 @@ def test_nothing_is_served_when_others_can_reach_the_hidden_master(start: Any) -
 def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None:
     """As root: the ids of the design, no groups, no capability in any set, no way to gain one."""
     need_root()
-    running = start().until_ready()
+    running = start().until_confined()
     running.process.wait_for_text("subscribed to /rosout")
     users = {"control": "rosrv", "relay": "rosrv-relay", "signer": "rosrv-signer", "rosmaster": "rosmaster"}
     ids = {role: _status(running.pid(role))["Uid"].split() for role in users}
@@ -327,7 +337,7 @@ def test_the_supervisor_keeps_few_capabilities(start: Any) -> None:
 def test_the_signer_has_no_network(start: Any) -> None:
     """As root: the signer is alone in a network namespace of its own."""
     need_root()
-    running = start().until_ready()
+    running = start().until_confined()
     own = Path(f"/proc/{os.getpid()}/ns/net").readlink()
     assert Path(f"/proc/{running.pid('signer')}/ns/net").readlink() != own
     assert Path(f"/proc/{running.pid('relay')}/ns/net").readlink() == own
@@ -335,7 +345,7 @@ def test_the_signer_has_no_network(start: Any) -> None:
 
 def test_each_part_of_the_state_is_its_owners_only(start: Any, state: Path) -> None:
     """Nobody can look around in the state directory, and each part is closed to the other roles."""
-    running = start().until_ready()
+    running = start().until_confined()
     assert stat.S_IMODE(state.stat().st_mode) == 0o711
     for part in ("control", "relay", "signer", "rosmaster"):
         found = (state / part).stat()
@@ -347,7 +357,7 @@ def test_each_part_of_the_state_is_its_owners_only(start: Any, state: Path) -> N
 
 def test_a_child_has_only_the_files_it_was_given(start: Any) -> None:
     """No descriptor of the supervisor (lock, kept sockets, other lifelines) leaks into a child."""
-    running = start().until_ready()
+    running = start().until_confined()
     supervisors, relays = (_open_files(pid) for pid in (running.process.pid, running.pid("relay")))
     assert [
         one for one in supervisors & relays if one.startswith(("socket:", "/")) and one != "/dev/null"
@@ -362,6 +372,10 @@ def test_the_hidden_master_listens_on_loopback_only(start: Any, state: Path) -> 
     addresses = {row.split()[1] for row in listening[1:] if row.split()[3] == "0A"}
     assert f"0100007F:{port:04X}" in addresses
     assert f"00000000:{port:04X}" not in addresses
+
+
+def _is_filtered(pid: int) -> bool:
+    return _status(pid)["Seccomp"] == "2"
 
 
 def _status(pid: int) -> dict[str, str]:
