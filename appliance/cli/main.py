@@ -45,6 +45,11 @@ VERBS: dict[str, Verb | Group] = {
                 "appliance.cli.monitor.learning:learn_monitors",
                 "Propose specifications out of recordings of a robot that behaves, for a person to edit.",
             ),
+            "coverage": Verb(
+                "appliance.cli.monitor.coverage:coverage",
+                "Say which events, branches, handlers, states and transitions recordings exercised, and what never"
+                " happened.",
+            ),
             "list": Verb(
                 "appliance.cli.monitor.running:list_monitors",
                 "Show every monitor: enabled or not, what it listens to, what it did.",

@@ -20,7 +20,7 @@ Theory of operation:
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
@@ -197,6 +197,12 @@ class MonitorSet:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
+
+    def value(self, name: str, variable: str) -> Any:
+        """What a shared variable of a running specification is now; raises KeyError."""
+        monitor = self.monitor(name)
+        _come_home(monitor)
+        return self._compiled.namespace[monitor.code.variables[variable]]
 
     # What is done to them
 

@@ -4,7 +4,8 @@ import json
 from pathlib import Path
 
 from examples.landshark.drive import Simulation, record
-from tests.unit.cli.monitor.test_verbs import invoke
+from examples.landshark.messages import MONITORS
+from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number
 
 
 def test_what_is_learnt_is_right_and_finds_nothing_in_its_own_recording(tmp_path: Path) -> None:
@@ -45,3 +46,25 @@ def test_a_bad_bag_is_refused_with_its_name(tmp_path: Path) -> None:
         result = invoke("learn", *arguments)
         assert result.exit_code == 2
         assert said in result.output
+
+
+def test_coverage_says_what_never_happened(tmp_path: Path) -> None:
+    """A table, the lines of what never happened, an object each for scripts, an exit status for pipelines."""
+    bag = tmp_path / "drive.bag"
+    record(Simulation().run(), bag)
+    text = MONITORS / "logging.rv"
+    result = invoke("coverage", text, "--bag", bag, "--fail-under", "80")
+    assert result.exit_code == 0
+    assert f"{text}:12: never: branch if of logging" in result.output
+    assert "logging" in result.output.splitlines()[1] and "4/4" in result.output.splitlines()[1]
+    assert invoke("coverage", text, "--bag", bag, "--fail-under", "100").exit_code == 1
+    rows = [json.loads(line) for line in invoke("coverage", text, "--bag", bag, "--json").output.splitlines()]
+    assert {(row["kind"], row["what"]): row["count"] > 0 for row in rows}["event", "shot"]
+
+
+def test_coverage_refuses_a_recording_of_another_type(tmp_path: Path) -> None:
+    """Messages that the monitors would not see are no coverage."""
+    bag = make_bag(tmp_path / "a.bag", [("/landshark/gps", "std_msgs/Int32", 1.0, number(1))])
+    result = invoke("coverage", MONITORS / "logging.rv", "--bag", bag)
+    assert result.exit_code == 2
+    assert "/landshark/gps carries std_msgs/Int32" in result.output

@@ -1,0 +1,88 @@
+"""`rosrv monitor coverage`: what of specifications recordings ever exercised, and what never happened."""
+
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from appliance.cli.monitor.bag import Recorded, open_bag, refusals
+from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
+from appliance.cli.output import Json, printable, say, say_json
+from appliance.learning.coverage import Item, covered
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_KINDS = ("event", "branch", "function", "handler", "state", "transition")
+
+
+def coverage(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
+    ],
+    *,
+    bags: Annotated[
+        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
+    ],
+    msg: Annotated[
+        list[Path] | None,
+        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+    ] = None,
+    fail_under: Annotated[
+        float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit status 1 below it")
+    ] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Say which events, branches, handlers, states and transitions recordings exercised, and what never happened.
+
+    Example: rosrv monitor coverage monitors/*.rv --bag drive.bag --fail-under 80
+    """
+    recordings = [Recorded(bag, ["*"]) for bag in bags]
+    try:
+        definitions = read_definitions(files, msg or [])
+        for recording in recordings:
+            definitions = recording.definitions.extended(definitions)
+        texts = read_specifications(files)
+        monitors = MonitorSet.load(texts, definitions)
+        for bag in bags:
+            with closing(open_bag(bag)) as reader:
+                for text in refusals(monitors, reader):
+                    raise usage_error(f"{bag}: {text}")
+        counts = covered(texts, definitions, recordings)
+    except SpecificationError as error:
+        for finding in error.findings:
+            typer.echo(printable(str(finding)), err=True)
+        raise typer.Exit(1) from None
+    exercised = sum(count > 0 for count in counts.values())
+    percent = 100 * exercised / len(counts) if counts else 100.0
+    if as_json:
+        for item, count in counts.items():
+            say_json({
+                "specification": item.specification, "kind": item.kind, "what": item.what,
+                "file": item.position.file, "line": item.position.line, "count": count,
+            })  # fmt: skip
+    else:
+        _show(counts)
+        say(f"{exercised} of {len(counts)} exercised: {percent:.1f} %")
+    raise typer.Exit(1 if percent < fail_under else 0)
+
+
+def _show(counts: dict[Item, int]) -> None:
+    columns = (Column(kind, justify="right") for kind in _KINDS)
+    table = Table("monitor", *columns, box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for name in dict.fromkeys(item.specification for item in counts):
+        own = [(item, count) for item, count in counts.items() if item.specification == name]
+        table.add_row(name, *(_share(count for item, count in own if item.kind == kind) for kind in _KINDS))
+    Console(highlight=False).print(table)
+    for item, count in counts.items():
+        if not count:
+            place = f"{item.position.file}:{item.position.line}"
+            say(f"{place}: never: {item.kind} {item.what} of {item.specification}", "yellow")
+
+
+def _share(counts: Iterable[int]) -> str:
+    found = list(counts)
+    return f"{sum(count > 0 for count in found)}/{len(found)}" if found else "-"
