@@ -53,6 +53,7 @@ def state_of(machine: Machine) -> dict[str, str]:
         "namespaces": ("ip", "netns", "list"),
         "interfaces": ("ip", "-brief", "link"),
         "forwarding": ("cat", "/proc/sys/net/ipv4/ip_forward"),
+        "users at work": ("sh", "-c", "ps -eo user:20= | sort -u | grep -E '^(rosrv|rosmaster)'"),
         "units": ("systemctl", "list-unit-files", "--no-legend", "rosrv*"),
     }
     return {name: machine.run(*command, check=False).output for name, command in looks.items()}
