@@ -144,8 +144,8 @@ class _Proposer:
     def _support(self, rhythm: Rhythm) -> Support:
         return Support(rhythm.count, round(self._known.windows.seconds, 1), len(rhythm.recordings))
 
-    def _upper(self, highs: Highs) -> float | None:
-        return extremes.upper(highs.of.values(), self._windows)
+    def _upper(self, highs: Highs, *, stops: bool = False) -> float | None:
+        return extremes.upper(highs.of.values(), self._windows, stops=stops)
 
     def _rhythm(self, topic: str, rhythm: Rhythm, content: Content, support: Support) -> Iterator[Candidate]:
         most = self._upper(content.counts)
@@ -288,7 +288,7 @@ class _Proposer:
                 condition=same + (" && !isinf({v})" if series.infinite else ""),
             )  # fmt: skip
             return
-        top, bottom = self._upper(series.highs), self._upper(series.lows)
+        top, bottom = (self._upper(each, stops=True) for each in (series.highs, series.lows))
         if top is None or bottom is None:
             return
         width = high - low

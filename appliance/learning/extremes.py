@@ -21,14 +21,18 @@ _TAIL = 4  # the highest of so many windows
 _EULER = 0.5772156649015329
 
 
-def upper(highs: Iterable[float], windows: float) -> float | None:
-    """The level that the highest value of a window passes once in so many windows; None of too few windows."""
+def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
+    """The level that the highest value of a window passes once in so many windows; None of too few windows.
+
+    `stops`: the quantity may have one. What is calculated of it has none: differences of rounded numbers are equal by
+    chance.
+    """
     values = sorted(highs)
     count = len(values)
     if count < FEWEST_WINDOWS:
         return None
     top = values[-1]
-    if top - values[-_STOP] <= _SAME * abs(top):
+    if stops and top - values[-_STOP] <= _SAME * abs(top):
         return top
     first = sum(values) / count
     second = sum(index * value for index, value in enumerate(values)) / (count * (count - 1))
@@ -41,7 +45,7 @@ def upper(highs: Iterable[float], windows: float) -> float | None:
     return max(level, threshold + excess * math.log(max(windows * highest / count, 1.0)), top)
 
 
-def lower(lows: Iterable[float], windows: float) -> float | None:
+def lower(lows: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
     """The same for the lowest values."""
-    found = upper((-low for low in lows), windows)
+    found = upper((-low for low in lows), windows, stops=stops)
     return None if found is None else -found

@@ -85,6 +85,8 @@ class Recorded:
         with closing(open_bag(path)) as reader:
             self.began, self.ended = reader.start_time, reader.end_time - 1
             self.message_count = reader.message_count
+            if not self.message_count:
+                raise usage_error(f"the bag {path} has no messages")
             self.definitions = definitions_of(reader)
             for connection in reader.connections:
                 if not any(fnmatchcase(connection.topic, pattern) for pattern in patterns):

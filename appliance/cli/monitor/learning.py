@@ -48,6 +48,7 @@ def learn_monitors(
     recordings = [Recorded(bag, topics or ["*"]) for bag in bags]
     recorded = Definitions({})
     for recording in recordings:
+        _check_same(recording, recorded)
         recorded = recorded.extended(recording.definitions)
     definitions = standard_definitions().extended(recorded)
     total = sum(recording.message_count for recording in recordings)
@@ -68,6 +69,15 @@ def learn_monitors(
         widened = sum(1 for each in learnt.candidates if each.widened)
         if learnt.held_out:
             say(f"alarms on what was held out: {widened} widened, {len(learnt.left_out)} left out")
+
+
+def _check_same(recording: Recorded, others: Definitions) -> None:
+    """A type has one definition in all recordings, or their messages would be read wrongly."""
+    for kind in set(recording.topics.values()) & set(recording.definitions.message_types):
+        if kind in others.message_types and others.md5sum(kind) != recording.definitions.md5sum(kind):
+            raise usage_error(
+                f"{recording.name} has another definition of {kind} than the recordings before it"
+            )
 
 
 def _say_rows(learnt: Learnt) -> None:

@@ -30,7 +30,10 @@ def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
 
 def test_what_several_windows_reach_exactly_is_the_bound() -> None:
     """A joint that is stopped at 0.6 has no margin."""
-    assert upper([0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4], 1e6) == 0.6
+    highs = [0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4]
+    assert upper(highs, 1e6, stops=True) == 0.6
+    margin = upper(highs, 1e6)
+    assert margin is not None and margin > 1.0
 
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_WINDOWS - 1])

@@ -38,7 +38,9 @@ def test_a_bad_bag_is_refused_with_its_name(tmp_path: Path) -> None:
     """A file that is no bag, one that is not there, and one given twice."""
     bad = tmp_path / "bad.bag"
     bad.write_bytes(b"no bag at all")
+    empty = make_bag(tmp_path / "empty.bag", [])
     for arguments, said in (
+        (["--bag", empty], "empty.bag has no messages"),
         (["--bag", bad], "bad.bag"),
         (["--bag", tmp_path / "none.bag"], "none.bag"),
         (["--bag", bad, "--bag", bad], "given twice"),
