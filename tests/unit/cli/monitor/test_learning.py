@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+from rosbags.rosbag1 import Writer
+
 from examples.landshark.drive import Simulation, record
 from examples.landshark.messages import MONITORS
 from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number
@@ -70,3 +72,15 @@ def test_coverage_refuses_a_recording_of_another_type(tmp_path: Path) -> None:
     result = invoke("coverage", MONITORS / "logging.rv", "--bag", bag)
     assert result.exit_code == 2
     assert "/landshark/gps carries std_msgs/Int32" in result.output
+
+
+def test_a_type_that_recordings_define_differently_is_refused(tmp_path: Path) -> None:
+    """Read by another definition, messages would teach nonsense."""
+    for name, text in (("a", "int32 data"), ("b", "int32 other")):
+        with Writer(tmp_path / f"{name}.bag") as writer:
+            connection = writer.add_connection("/t", "robot_msgs/msg/Count", msgdef=text, md5sum="*")
+            for place in range(3):
+                writer.write(connection, place, bytes(4))
+    result = invoke("learn", "--bag", tmp_path / "a.bag", "--bag", tmp_path / "b.bag")
+    assert result.exit_code == 2
+    assert "b.bag has another definition of robot_msgs/Count" in result.output
