@@ -6,6 +6,7 @@ Of each topic only so many are kept (`MOST`); those that most messages exercised
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +19,7 @@ from appliance.learning.topics import Content, Rhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""Of each kind for one topic; of the others there is one or none."""
+"""Of each kind for one topic; of the others there are as many as there are fields, or one."""
 
 _FEWEST = 20  # messages that something said of all of them stands on
 _FEWEST_SET = 10
@@ -90,6 +91,8 @@ class Knowledge:
     contents: Mapping[str, Content]
     orders: Orders
     windows: Windows
+    trimmed: Counter[str] = field(default_factory=Counter)
+    """How many conditions of each topic `candidates` left out because there are more than `MOST`."""
 
     @property
     def short(self) -> Mapping[str, str]:
@@ -102,12 +105,15 @@ class Knowledge:
         """All that is worth saying, topic by topic."""
         bounds = sum(3 * len(content.types) for content in self.contents.values()) + len(self.orders.pairs)
         proposer = _Proposer(self, QUIET_HOURS * 3600 / self.windows.mean * max(bounds, 1))
+        self.trimmed.clear()
         for topic in sorted(self.contents):
-            found: dict[str, int] = {}
+            found: Counter[str] = Counter()
             for candidate in proposer.of_topic(topic):
-                found[candidate.kind] = found.get(candidate.kind, 0) + 1
-                if found[candidate.kind] <= MOST.get(candidate.kind, 1):
+                found[candidate.kind] += 1
+                if found[candidate.kind] <= MOST.get(candidate.kind, len(self.contents[topic].types)):
                     yield candidate
+                else:
+                    self.trimmed[topic] += 1
         yield from proposer.of_orders()
 
 

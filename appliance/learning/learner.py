@@ -97,7 +97,7 @@ class _Learner:
                 left_out.append(replace(candidate, alarms=count))
         rows = list(specifications(kept, known))
         names = {each.key: name for name, _, group in rows for each in group}
-        text = "\n".join([self._head(kept, left_out), *(row[1] for row in rows)])
+        text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
         MonitorSet.load({"learnt.rv": text}, self._definitions)
         return Learnt(
             text,
@@ -175,7 +175,7 @@ class _Learner:
                     found.update(_warned(each, groups))
         return found
 
-    def _head(self, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
+    def _head(self, known: Knowledge, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
         seconds = sum(part.seconds for part in self._trained)
         held = sum(part.seconds for part in self._held_out)
         lines = [
@@ -197,6 +197,12 @@ class _Learner:
             for each in left_out
         ]
         lines += [f"Not looked at: {text}" for text in self._skipped]
+        lines += [
+            f"{count} conditions more on {topic} are not here: they are many"
+            for topic, count in known.trimmed.items()
+        ]
+        if known.orders.left_out:
+            lines.append(f"Not compared with other topics: {', '.join(known.orders.left_out)}")
         return "".join(f"// {' '.join(line.split())}\n" for line in lines)
 
 

@@ -2,6 +2,7 @@
 
 import math
 import random
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -188,3 +189,21 @@ def test_nothing_to_learn_from_is_an_error() -> None:
     broken = replace(DRIVES[0], rows=(("/speed", START, b"abc"), *DRIVES[0].rows[1:]))
     with pytest.raises(LearningError, match="drive 1: a message on /speed is no std_msgs/Float64"):
         learn([broken, DRIVES[1]], standard_definitions(), 0.3, lambda _: None)
+
+
+def test_what_is_left_out_to_keep_the_text_short_is_said() -> None:
+    """Eighteen numbers of one topic get no more conditions than a person reads; the comment counts the others."""
+    chance = random.Random(7)  # noqa: S311  no secret
+
+    def joints() -> bytes:
+        arrays = {name: [chance.gauss(0, 1) for _ in range(6)] for name in ("position", "velocity", "effort")}
+        return message("sensor_msgs/JointState", name=[f"joint{number}" for number in range(6)], **arrays)
+
+    rows = tuple(("/arm", START + tick * 50_000_000, joints()) for tick in range(600))
+    learnt = learn(
+        [Recorded("arm", rows, {"/arm": "sensor_msgs/JointState"})], standard_definitions(), 0, lambda _: None
+    )
+    kinds = [each.kind for each in learnt.candidates]
+    assert (kinds.count("range"), kinds.count("length")) == (10, 4)
+    assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
+    assert "// Nothing was held out: it is untested." in learnt.text
