@@ -84,6 +84,14 @@ class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services with who is connected to whom and how much flows."""
 
 
+class TopicLook(AdminRequest[graph.TopicMessages], frozen=True, tag="topic look"):
+    """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds."""
+
+    topic: str
+    messages: int = 1
+    seconds: float = 2.0
+
+
 class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics"):
     """The status, and everything that control counts."""
 
@@ -332,7 +340,7 @@ HostRequest = (
 _Common = (
     StatusWanted | InventoryWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted
     | PolicyRevisions
-    | RegistrationsWanted | GraphWanted | MetricsWanted | MonitorsWanted | MonitorRevisions
+    | RegistrationsWanted | GraphWanted | TopicLook | MetricsWanted | MonitorsWanted | MonitorRevisions
     | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke
     | HostRequest
 )  # fmt: skip

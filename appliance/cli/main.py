@@ -106,6 +106,19 @@ VERBS: dict[str, Verb | Group] = {
             ),
         },
     ),
+    "topic": Group(
+        "What is said on the topics of the running robot.",
+        {
+            "echo": Verb(
+                "appliance.cli.topic:echo",
+                "Show the next messages of a topic as subscribers get them, after the monitors; it is recorded who"
+                " looked.",
+            ),
+            "info": Verb(
+                "appliance.cli.topic:info", "Show who publishes a topic, who hears it, and how much flows."
+            ),
+        },
+    ),
     "sign": Verb(
         "appliance.cli.sign:sign",
         "Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.",

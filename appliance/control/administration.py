@@ -12,7 +12,7 @@ from typing import Any
 
 from appliance.channel import admin
 from appliance.channel.admin import A
-from appliance.control.errors import UnknownThingError
+from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.host_orders import HostOrders
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
@@ -26,6 +26,7 @@ from appliance.hosts.table import (
     HostsChangedError,
     UnknownHostError,
 )
+from appliance.master.reach.topic_looks import TooManyLooksError
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import MonitorsChangedError, UnknownMonitorError
 
@@ -34,6 +35,8 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     RevisionChangedError: "conflict",
     HostsChangedError: "conflict",
     UnknownThingError: "unknown",
+    SenselessError: "request",
+    TooManyLooksError: "busy",
     UnknownMonitorError: "unknown",
     UnknownHostError: "unknown",
     HostForbiddenError: "forbidden",

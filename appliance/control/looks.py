@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 import msgspec
 
 import appliance
+from appliance.audit.record import Severity
 from appliance.channel import admin
-from appliance.channel.answers.graph import Graph, Registration, Registrations
+from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import AuditState, PolicyState, Status
 from appliance.control.assembly import Parts
+from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.measures import measures_of
 from appliance.control.monitor_orders import monitors_status
 from appliance.control.overview import graph_of
@@ -23,6 +25,10 @@ from appliance.hosts.hosts import Hosts
 from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy import Live
+
+MOST_MESSAGES = 20
+LONGEST_LOOK = 10.0
+"""Seconds."""
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
@@ -62,6 +68,41 @@ class Looks:
     async def graph(self, _request: admin.GraphWanted) -> Graph:
         """Nodes, topics and services, and what flows."""
         return graph_of(self.parts)
+
+    async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
+        """The next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyLooksError`."""
+        if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
+            raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
+        topic = next((topic for topic in graph_of(self.parts).topics if topic.name == request.topic), None)
+        if topic is None:
+            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}")
+        if not topic.mediated:
+            raise SenselessError(
+                f"the messages of {topic.name} go past the appliance (relaying: monitored), which cannot show them"
+            )
+        seen = await self.parts.relay.look(topic.name, request.messages, request.seconds)
+        self.parts.trail.happened(
+            "topic looked into",
+            f"messages of {topic.name} were shown: {len(seen)}",
+            severity=Severity.NOTICE,
+            category="topic",
+            resource=topic.name,
+            who=who,
+            messages=len(seen),
+        )
+        registry = self.parts.registry
+        rows = []
+        for message in seen:
+            node = registry.by_key(message.key)
+            name = node.name if node is not None else ""
+            rows.append(TopicMessage(message.time, name, message.size, message.fields, message.why))
+        return TopicMessages(
+            topic.name,
+            seen[0].type if seen else topic.type,
+            [publisher.node for publisher in topic.publishers],
+            topic.subscribers,
+            rows,
+        )
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         """The status, and everything that is counted."""

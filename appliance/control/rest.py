@@ -3,7 +3,7 @@
 Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
 
 1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
-   nodes. Those that wait for charon or the signer (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
+   nodes. Those that wait for others (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
 4. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
@@ -29,6 +29,7 @@ from appliance.channel.admin import (
     HostRenewed,
     HostRenewItself,
     HostToken,
+    TopicLook,
     encode,
     verb_of,
 )
@@ -44,7 +45,7 @@ _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
 _CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-_SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself
+_SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | TopicLook
 _MOST_SLOW = 16
 
 
@@ -121,9 +122,9 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel, made: messages.RequestMade) -> None:
-        """Serve beside the others what waits for charon or the signer."""
+        """Serve beside the others what waits for charon, the signer or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
-            text = "too many hosts are being enrolled: try again"
+            text = "too many requests that take a while are under way: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
             return
         task = asyncio.get_running_loop().create_task(self._serve(channel, made))

@@ -34,6 +34,7 @@ from appliance.relay.connections.visitor import Farewell, Visitor
 from appliance.relay.context import RelayContext
 from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
+from appliance.relay.looks import Looks
 from appliance.relay.loop import Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.own import OwnPublisher
@@ -79,6 +80,7 @@ class Engine:
         self._link: Link | None = None
         self._last_rows: list[messages.TopicTraffic] = []
         self._flows = Flows(loop.clock)
+        self._looks = Looks(self._reporter.send)
         self._later: deque[tuple[messages.Message, tuple[int, ...]]] = deque()
         loop.after(limits.report_every, self._tick)
 
@@ -86,6 +88,7 @@ class Engine:
         """Speak to this control from now on; what is stated stays until it restates."""
         self._link = link
         self._reporter.attach(link)
+        self._looks.end_all()
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         """Carry out one message of control."""
@@ -101,16 +104,16 @@ class Engine:
             self._restated(message.epoch)
         elif isinstance(message, Statement):
             self._state(message, descriptors)
-        elif isinstance(message, messages.UpstreamFound):
-            self._upstream_found(message)
-        elif isinstance(message, messages.UpstreamRefused):
-            self._upstream_refused(message)
+        elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
+            self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated):
             self._middle.state(message)
         elif isinstance(message, messages.MonitorSwitched):
             self._middle.switch(message.name, message.enabled)
         elif isinstance(message, messages.MonitorResumed):
             self._ask_for_latched(self._middle.resume(message.name))
+        elif isinstance(message, messages.LookWanted | messages.LookEnded):
+            self._look(message)
         elif isinstance(message, messages.OwnHeaderStated):
             self._state_header(message)
         elif isinstance(message, messages.OwnPublished):
@@ -315,15 +318,21 @@ class Engine:
         if row is not None:
             self._last_rows.append(row)
 
-    def _upstream_found(self, message: messages.UpstreamFound) -> None:
+    def _upstream_answered(self, message: messages.UpstreamFound | messages.UpstreamRefused) -> None:
         placed = self._topics.get((message.key, message.topic))
-        if placed is not None:
+        if placed is None:
+            return
+        if isinstance(message, messages.UpstreamFound):
             placed[1].found(message.host, message.port)
-
-    def _upstream_refused(self, message: messages.UpstreamRefused) -> None:
-        placed = self._topics.get((message.key, message.topic))
-        if placed is not None:
+        else:
             placed[1].refused()
+
+    def _look(self, message: messages.LookWanted | messages.LookEnded) -> None:
+        if isinstance(message, messages.LookWanted):
+            topics = [topic for topic, _publisher in self._topics.values() if topic.topic == message.topic]
+            self._looks.begin(message, topics)
+        else:
+            self._looks.end(message.number)
 
     # --- peers --------------------------------------------------------------------------------------------
 

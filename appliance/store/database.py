@@ -20,6 +20,8 @@ from appliance.store.ahead import Parameter, Parameters, WriteAhead
 _GROUP = 2_000
 _GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for company: it is safe in `ahead`
 
+_CATCH_UP_SECONDS = 1.0
+
 
 class _Queued(NamedTuple):
     sql: str
@@ -59,7 +61,15 @@ class Database:
         self._thread.start()
 
     def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
-        """Read rows; for start-up and rare look-ups, not for the hot path."""
+        """Read rows, with what was queued before; for start-up and rare look-ups, not for the hot path.
+
+        What cannot be written in `_CATCH_UP_SECONDS` (a full disk) is not among them.
+        """
+        written = threading.Event()
+        self._queue.put(written.set)
+        self._hurry.set()
+        if self._thread.is_alive():
+            written.wait(_CATCH_UP_SECONDS)
         try:
             with contextlib.closing(sqlite3.connect(self._path)) as reader:
                 return reader.execute(sql, parameters).fetchall()

@@ -1,6 +1,6 @@
 """The graph: who talks to whom, through the appliance or past it, and how much."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -71,6 +71,31 @@ class Graph(msgspec.Struct, frozen=True):
     nodes: list[Node]
     topics: list[Topic]
     services: list[Service]
+
+
+class TopicMessage(msgspec.Struct, frozen=True):
+    """A message of a topic as subscribers get it, after the monitors."""
+
+    time: Annotated[int, told("when the relay passed it on, nanoseconds since 1970")]
+    node: Annotated[str, told("that published it")]
+    size: Annotated[int, told("bytes, without those of its length")]
+    fields: Annotated[
+        dict[str, Any],
+        told(
+            "by name; long strings and arrays are cut (`…`), bytes are hexadecimal, NaN and infinity are strings"
+        ),
+    ]
+    why: Annotated[str, told("why there are no fields but the first bytes; else empty")]
+
+
+class TopicMessages(msgspec.Struct, frozen=True):
+    """The next messages of a topic, fewer than asked for where no more came in time."""
+
+    topic: str
+    type: str
+    publishers: list[str]
+    subscribers: list[str]
+    messages: list[TopicMessage]
 
 
 class Registration(msgspec.Struct, frozen=True):

@@ -393,11 +393,41 @@ class MonitorsCounted(Message):
     rows: list[MonitorRow]
 
 
+class LookWanted(Message):
+    """Somebody wants to see the next messages of a topic, so many at most."""
+
+    number: int
+    topic: str
+    messages: int
+
+
+class LookEnded(Message):
+    """The look of this number is over."""
+
+    number: int
+
+
+class MessageSeen(Message):
+    """A message of a look, as subscribers get it: `time` in nanoseconds since 1970, its type and size in bytes.
+
+    `fields` are shortened where they are long; `why` says why there are none but the first bytes.
+    """
+
+    number: int
+    key: str
+    time: int
+    type: str
+    size: int
+    fields: dict[str, Any]
+    why: str = ""
+
+
 RelayLink = (
     StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
     | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | LatchRefused | ConnectionOpened
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
     | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
-    | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted
+    | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
+    | MessageSeen
 )  # fmt: skip

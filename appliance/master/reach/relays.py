@@ -19,6 +19,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.carried import Carried, Connection, Traffic
 from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.places import Places
+from appliance.master.reach.topic_looks import TopicLooks
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
 from appliance.ros.xmlrpc import Value
@@ -115,6 +116,7 @@ class RelayControl:
         self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
         self._asking: set[asyncio.Task[None]] = set()
         self._own_header = own_header
+        self._looks = TopicLooks()
 
     @property
     def presence(self) -> str:
@@ -171,6 +173,10 @@ class RelayControl:
     def publish(self, message: messages.OwnPublished) -> None:
         """Publish as the appliance's own publisher, to whoever subscribes now."""
         self._post(TOPIC, message.topic).send(message)
+
+    async def look(self, topic: str, count: int, seconds: float) -> list[messages.MessageSeen]:
+        """The next messages of a topic, as its subscribers get them. Raises `TooManyLooksError`."""
+        return await self._looks.look(topic, count, seconds, self._post(TOPIC, topic).send)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
         """Whether a topic or service is carried by this relay."""
@@ -324,6 +330,8 @@ class RelayControl:
                 self.carried.closed(post.index, message)
             case messages.ConnectionRefused():
                 self.carried.refused(message)
+            case messages.MessageSeen():
+                self._looks.seen(message)
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:

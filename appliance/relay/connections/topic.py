@@ -141,6 +141,7 @@ class RelayedTopic:
         self._paused = False
         self._connected = False
         self._through: Through | None = None
+        self._looks: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
         self._next = 1
@@ -169,7 +170,28 @@ class RelayedTopic:
         self._reported = False
         self._forget_header()
         self.relieve()
-        if not self.members and not self._wanted and self.upstream is not None:
+        self._spare_unwanted()
+
+    @property
+    def header(self) -> Mapping[str, str] | None:
+        """The publisher's header, as subscribers have it; None while it is not known."""
+        return self._header
+
+    def look(self, look: Callable[[Batch], None]) -> None:
+        """Somebody looks at what subscribers get from now on, the latched message first; `look` keeps no batch."""
+        self._looks += (look,)
+        if self._latched is not None:
+            look(self._latched)
+        if self.upstream is not None:
+            self.upstream.want()
+
+    def look_away(self, look: Callable[[Batch], None]) -> None:
+        """Whoever looked has seen enough."""
+        self._looks = tuple(other for other in self._looks if other != look)
+        self._spare_unwanted()
+
+    def _spare_unwanted(self) -> None:
+        if not (self.members or self._wanted or self._looks) and self.upstream is not None:
             self.upstream.spare()
 
     def monitor(self, through: Through | None, *, wanted: bool) -> None:
@@ -182,8 +204,7 @@ class RelayedTopic:
             return
         if wanted:
             self.upstream.want()
-        elif not self.members:
-            self.upstream.spare()
+        self._spare_unwanted()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
         """The publisher has answered with its header."""
@@ -199,7 +220,7 @@ class RelayedTopic:
         for member in waiting:
             self._serve(member, header)
         self._announce()
-        if (self.members or self._wanted) and self.upstream is not None:
+        if (self.members or self._wanted or self._looks) and self.upstream is not None:
             self.upstream.want()
 
     @property
@@ -248,6 +269,8 @@ class RelayedTopic:
         self._pass_on(batch)
 
     def _pass_on(self, batch: Batch) -> None:
+        for look in self._looks:
+            look(batch)
         if self._latching:
             self._latch(batch)
         if self._first_words is not None:

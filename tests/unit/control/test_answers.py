@@ -8,6 +8,7 @@ import pytest
 
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
+from appliance.channel.answers.graph import TopicMessage
 from appliance.control import host_orders, looks, monitor_orders, policy_orders, token_orders
 from appliance.control.administration import request_of
 
@@ -26,7 +27,12 @@ REQUESTS: tuple[type[Any], ...] = tuple(
     dict.fromkeys([*get_args(admin.AnyRequest), *get_args(admin.RestRequest)])
 )
 # The fields of a record, which each event has of its own; what a child has ready, which each role has of its own.
-OPEN = {(messages.MonitorEvent, "detail"), (messages.Ready, "detail")}
+OPEN = {
+    (messages.MonitorEvent, "detail"),
+    (messages.Ready, "detail"),
+    (messages.MessageSeen, "fields"),  # a message of whatever type
+    (TopicMessage, "fields"),
+}
 
 
 def taken(method: Any) -> Any:

@@ -8,6 +8,7 @@ import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Rule } from "../parts/rule.js";
 import { Link } from "../router.js";
+import { Messages } from "./messages.js";
 import { Rates } from "./rates.js";
 
 const MOST = 60;
@@ -34,7 +35,7 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
     <div><h3>${counted(row.publishers.length, "publisher")}</h3><ul class="plain-list">${row.publishers.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.node}><button class="link" onClick=${() => choose(`n${one.node}`)}><${Given} value=${one.node} mono /></button>${" "}
       <span class="muted small">${rate(one.messages_per_second)} messages/s, ${bytes(one.bytes_per_second)}/s, ${count(one.messages)} in all${one.dropped ? `, ${count(one.dropped)} dropped` : ""}</span></li>`)}</ul></div>
     <${Names} title="Subscribers" names=${row.subscribers} letter="n" choose=${choose} />
-    ${row.mediated && row.publishers.length > 0 && html`<${Rates} key=${row.name} topic=${row} />`}`;
+    ${row.mediated && row.publishers.length > 0 && html`<${Rates} key=${row.name} topic=${row} /><${Messages} key=${`m${row.name}`} topic=${row.name} />`}`;
 }
 
 function Names(/** @type {{title: string, names: string[], letter: string, choose: (key: string) => void}} */ { title, names, letter, choose }) {

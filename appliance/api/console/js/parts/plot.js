@@ -10,17 +10,20 @@ const TOP = 6;
 
 /** @typedef {{name: string, colour: "c1" | "c2" | "c3" | "c4", points: {time: number, value: number | null}[]}} Series */
 
-/** @param {{label: string, series: Series[], span?: number, height?: number, unit?: string}} given `span`: seconds shown */
-export function Plot({ label, series, span = 900, height = 148, unit = "/s" }) {
+/** @param {{label: string, series: Series[], span?: number, height?: number, unit?: string, say?: (value: number | null) => string}} given `span`: seconds shown */
+export function Plot({ label, series, span = 900, height = 148, unit = "/s", say = rate }) {
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const width = useWidth(box);
   const [at, setAt] = useState(/** @type {number | null} */ (null));
   const end = Math.max(0, ...series.map((one) => one.points.at(-1)?.time ?? 0)) || Date.now() / 1000;
   const start = end - span;
   const within = series.map((one) => ({ ...one, points: one.points.filter((point) => point.time >= start) }));
-  const top = ceiling(Math.max(0, ...within.flatMap((one) => one.points.map((point) => point.value ?? 0))));
+  const values = within.flatMap((one) => one.points.map((point) => point.value ?? 0));
+  const top = ceiling(Math.max(0, ...values));
+  const least = Math.min(0, ...values);
+  const bottom = least < 0 ? -ceiling(-least) : 0;
   const x = (/** @type {number} */ time) => LEFT + ((time - start) / span) * Math.max(1, width - LEFT);
-  const y = (/** @type {number} */ value) => TOP + (1 - value / top) * (height - TOP - BOTTOM);
+  const y = (/** @type {number} */ value) => TOP + (1 - (value - bottom) / (top - bottom)) * (height - TOP - BOTTOM);
   const moment = at === null ? null : start + ((at - LEFT) / Math.max(1, width - LEFT)) * span;
   const move = (/** @type {PointerEvent} */ event) => {
     const place = event.clientX - /** @type {Element} */ (event.currentTarget).getBoundingClientRect().left;
@@ -28,13 +31,13 @@ export function Plot({ label, series, span = 900, height = 148, unit = "/s" }) {
   };
   const said = within.map((one) => ({ ...one, now: nearest(one.points, moment) }));
   return html`<div class="stack-tight">
-    <ul class="plot-legend">${said.map((one) => html`<li key=${one.name}><span class=${`swatch ${one.colour}`}></span>${one.name} <b>${rate(one.now)}</b>${unit}</li>`)}
+    <ul class="plot-legend">${said.map((one) => html`<li key=${one.name}><span class=${`swatch ${one.colour}`}></span>${one.name} <b>${say(one.now)}</b>${unit}</li>`)}
       ${moment !== null && html`<li class="muted">${minute(moment)}</li>`}</ul>
     <div class="plot plot-box" ref=${box}>
-      ${width > 0 && html`<svg height=${height} viewBox=${`0 0 ${width} ${height}`} role="img" aria-label=${`${label}: ${said.map((one) => `${one.name} ${rate(one.now)}${unit}`).join(", ")}`}
+      ${width > 0 && html`<svg height=${height} viewBox=${`0 0 ${width} ${height}`} role="img" aria-label=${`${label}: ${said.map((one) => `${one.name} ${say(one.now)}${unit}`).join(", ")}`}
         onPointerMove=${move} onPointerLeave=${() => setAt(null)}>
-        ${[0, 0.5, 1].map((part) => html`<line key=${part} class="grid-line" x1=${LEFT} x2=${width} y1=${y(top * part)} y2=${y(top * part)} />
-          <text class="tick" x=${LEFT - 8} y=${y(top * part) + 4} text-anchor="end">${rate(top * part)}</text>`)}
+        ${[bottom, (bottom + top) / 2, top].map((line) => html`<line key=${line} class="grid-line" x1=${LEFT} x2=${width} y1=${y(line)} y2=${y(line)} />
+          <text class="tick" x=${LEFT - 8} y=${y(line) + 4} text-anchor="end">${say(line)}</text>`)}
         ${ticks(start, end, width).map((time) => html`<text key=${time} class="tick" x=${x(time)} y=${height - 4} text-anchor="middle">${minute(time)}</text>`)}
         ${within.map((one) => html`<path key=${`a${one.name}`} class=${`area ${one.colour}`} d=${area(one.points, x, y)} /><path key=${one.name} class=${`curve ${one.colour}`} d=${curve(one.points, x, y)} />`)}
         ${at !== null && html`<line class="cursor" x1=${at} x2=${at} y1=${TOP} y2=${height - BOTTOM} />`}

@@ -1,0 +1,63 @@
+/** Looking into a topic: its last message as subscribers get it, and one of its numbers over time. Each look is recorded. */
+
+import { html, useEffect, useState } from "../html.js";
+import { Moment } from "../moments.js";
+import { Button } from "../parts/button.js";
+import { Given } from "../parts/given.js";
+import { Failure } from "../parts/notice.js";
+import { Plot } from "../parts/plot.js";
+import { get } from "../rest.js";
+
+const SECONDS = 60; // that are shown, and after which the look ends by itself
+const EACH = { messages: 20, seconds: 2 };
+
+/** @param {{topic: string}} given */
+export function Messages({ topic }) {
+  const [until, setUntil] = useState(0);
+  const [seen, setSeen] = useState(/** @type {any[]} */ ([]));
+  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const [number, setNumber] = useState("");
+  useEffect(() => {
+    if (!until) return undefined;
+    const controller = new AbortController();
+    const look = async () => {
+      while (Date.now() < until && !controller.signal.aborted) {
+        const body = /** @type {any} */ (await get("/v1/messages", { topic, ...EACH }, controller.signal));
+        setSeen((seen) => [...seen, ...body.messages].filter((one) => one.time / 1e9 > Date.now() / 1000 - 2 * SECONDS).slice(-1200));
+      }
+      setUntil(0);
+    };
+    setError(null);
+    look().catch((problem) => {
+      if (controller.signal.aborted) return;
+      setError(problem);
+      setUntil(0);
+    });
+    return () => controller.abort();
+  }, [topic, until]);
+  const last = seen.at(-1);
+  const names = last ? numbers(last.fields, "") : [];
+  const chosen = names.includes(number) ? number : "";
+  const points = chosen ? seen.map((one) => ({ time: one.time / 1e9, value: at(one.fields, chosen) })) : [];
+  return html`<div><h3>Messages</h3><div class="row"><${Button} small role="operator" onClick=${() => setUntil(until ? 0 : Date.now() + SECONDS * 1000)}>${until ? "Stop" : "Look"}</${Button}>
+      <span class="muted small">${until ? "As subscribers get them, after the monitors." : "For a minute. It is recorded who looked."}</span></div>
+    ${error ? html`<${Failure} error=${error} />` : null}
+    ${!last && until ? html`<p class="muted small" role="status">No message yet.</p>` : null}
+    ${last && html`<p class="small"><${Moment} at=${new Date(last.time / 1e6).toISOString()} /> <${Given} value=${last.node} mono /> <span class="muted">${last.size} bytes</span></p>
+      ${last.why && html`<p class="small"><${Given} value=${last.why} most=${400} /></p>`}
+      <pre class="bytes" aria-label="The last message"><${Given} value=${JSON.stringify(last.fields, null, 1)} most=${6000} /></pre>
+      ${names.length > 0 && html`<label class="row small">Draw <select value=${chosen} onChange=${(/** @type {any} */ event) => setNumber(event.target.value)}><option value="">nothing</option>${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}</select></label>`}
+      ${chosen && html`<${Plot} label=${chosen} unit="" say=${(/** @type {number | null} */ value) => (value === null ? "–" : String(Number(value.toPrecision(4))))} span=${SECONDS} height=${120} series=${[{ name: chosen, colour: "c1", points }]} />`}`}</div>`;
+}
+
+/** The paths of numbers in a message, the first of them. @returns {string[]} */
+function numbers(/** @type {any} */ value, /** @type {string} */ path) {
+  if (typeof value === "number") return [path];
+  if (typeof value !== "object" || value === null) return [];
+  return Object.entries(value).flatMap(([name, inner]) => numbers(inner, path ? `${path}.${name}` : name)).slice(0, 100);
+}
+
+function at(/** @type {any} */ fields, /** @type {string} */ path) {
+  const value = path.split(".").reduce((inner, name) => inner?.[name], fields);
+  return typeof value === "number" ? value : null;
+}

@@ -1,0 +1,137 @@
+"""`rosrv topic echo|info`: what is said on a topic of the running robot, by whom and to whom."""
+
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from appliance.channel import admin
+from appliance.channel.answers.graph import Topic, TopicMessage
+from appliance.cli.output import Json, printable, say, say_json, usage_error
+from appliance.cli.running import Appliance, speaks
+
+_AT_ONCE = 20  # messages of one look
+_Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False)]
+
+
+@speaks
+def echo(
+    appliance: Appliance,
+    topic: _Topic,
+    *,
+    count: Annotated[
+        int, typer.Option("-n", "--count", min=1, max=100_000, help="How many messages to wait for")
+    ] = 1,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=10.0, help="How long the next message is waited for")
+    ] = 5.0,
+    field: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Only this field, such as pose.position.x or ranges.3")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show the next messages of a topic as subscribers get them, after the monitors; it is recorded who looked.
+
+    Long strings and arrays are cut, bytes are hexadecimal. Exit status 1 when no message came in time.
+
+    Example: rosrv topic echo /odom -n 3 --field pose.pose.position
+    """
+    shown = 0
+    while shown < count:
+        request = admin.TopicLook(topic, min(count - shown, _AT_ONCE), seconds)
+        body = appliance.ask_or_exit(request, as_json=as_json)
+        for message in body.messages:
+            _show(message, field, as_json=as_json)
+        shown += len(body.messages)
+        if not body.messages:
+            typer.echo(f"rosrv topic: no message of {printable(topic)} in {seconds:g} s", err=True)
+            raise typer.Exit(1)
+
+
+@speaks
+def info(appliance: Appliance, topic: _Topic, as_json: Json = False) -> None:
+    """Show who publishes a topic, who hears it, and how much flows.
+
+    Example: rosrv topic info /scan
+    """
+    body = appliance.ask_or_exit(admin.GraphWanted(), as_json=as_json)
+    found = next((row for row in body.topics if row.name == topic), None)
+    if found is None:
+        raise usage_error(f"no node publishes or subscribes to {printable(topic)}")
+    if as_json:
+        say_json(found)
+    else:
+        for line in _described(found):
+            say(line)
+
+
+def _described(topic: Topic) -> Iterator[str]:
+    yield f"{printable(topic.name)}  {printable(topic.type)}"
+    for publisher in topic.publishers:
+        rate = f"{publisher.messages_per_second:.1f} Hz, {publisher.bytes_per_second:.0f} bytes/s"
+        delay = f"{publisher.delay_seconds * 1e6:.0f} µs in the relay"
+        yield f"  published by {printable(publisher.node)}: {rate}, {delay}, {publisher.dropped} not delivered"
+    for node in topic.subscribers:
+        yield f"  heard by {printable(node)}"
+    if not topic.mediated:
+        yield "  its messages go past the appliance"
+
+
+def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
+    value = message.fields if field is None else _part(message.fields, field)
+    if as_json:
+        say_json({**msgspec.structs.asdict(message), "fields": value})
+        return
+    at = datetime.fromtimestamp(message.time / 1e9, UTC).isoformat(timespec="milliseconds")
+    words = [at, printable(message.node), f"{message.size} bytes", printable(message.why)]
+    say("  ".join(filter(None, words)), "dim")
+    for line in _lines(value, 0):
+        say(line)
+
+
+def _part(fields: Any, path: str) -> Any:
+    """A field of a field. Ends the program with 2 where there is none."""
+    value = fields
+    for name in path.split("."):
+        if isinstance(value, Mapping) and name in value:
+            value = value[name]
+        elif isinstance(value, list) and name.isdecimal() and int(name) < len(value):
+            value = value[int(name)]
+        else:
+            known = ", ".join(map(str, value)) if isinstance(value, Mapping) else "no fields"
+            raise usage_error(
+                f"there is no field {printable(path)}: {printable(name)} is not among {printable(known)}"
+            )
+    return value
+
+
+def _lines(value: Any, depth: int) -> Iterator[str]:
+    """A value as rostopic shows it: a field a line."""
+    indent = "  " * depth
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            if _is_deep(inner):
+                yield f"{indent}{printable(str(name))}:"
+                yield from _lines(inner, depth + 1)
+            else:
+                yield f"{indent}{printable(str(name))}: {_plain(inner)}"
+    elif _is_deep(value):
+        for row in value:
+            first, *rest = _lines(row, 0)
+            yield f"{indent}- {first}"
+            yield from (f"{indent}  {line}" for line in rest)
+    else:
+        yield indent + _plain(value)
+
+
+def _is_deep(value: Any) -> bool:
+    """Whether it has fields, which take a line each."""
+    return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_plain, value))}]"
+    return printable(str(value))

@@ -1,0 +1,118 @@
+"""Looks into topics: what subscribers get is shown, few messages at a time, whatever the bytes are."""
+
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.channel.messages import LookEnded, LookWanted, MessageSeen
+from appliance.relay.looks import MOST_LOOKS, MOST_MESSAGES
+from appliance.ros.tcpros import encode_frame, encode_header
+from tests.unit.relay.world import ASK, HEADER, Peer, World
+
+TOLD = HEADER | {"message_definition": "string data\n"}
+
+
+def text(word: str) -> bytes:
+    """A std_msgs/String."""
+    return struct.pack("<I", len(word)) + word.encode()
+
+
+def seen(world: World, word: str) -> MessageSeen:
+    """The report of this message."""
+    found: MessageSeen = world.until(
+        lambda: next(
+            (one for one in world.told if isinstance(one, MessageSeen) and one.fields == {"data": word}), None
+        )
+    )
+    return found
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    """A publisher of /chatter, and a subscriber with a grant."""
+    world = World()
+    yield world
+    world.close()
+
+
+def subscribed(world: World) -> tuple[Peer, Peer]:
+    """As `World.subscribed`, with a publisher that tells its definition."""
+    subscriber = world.connect(encode_header(ASK))
+    publisher = world.upstream(TOLD)
+    world.gets_header(subscriber)
+    return publisher, subscriber
+
+
+def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
+    """As many as were asked for, with their type, size and fields; subscribers notice nothing."""
+    publisher, subscriber = subscribed(world)
+    world.state(LookWanted(1, "/chatter", 2))
+    frames = [encode_frame(text(word)) for word in ("one", "two", "three")]
+    publisher.send(b"".join(frames))
+    world.gets(subscriber, b"".join(frames))
+    first = seen(world, "one")
+    assert (first.number, first.key, first.type, first.size, first.why) == (1, "k", "std_msgs/String", 7, "")
+    assert seen(world, "two").time >= first.time
+    publisher.send(encode_frame(text("four")))
+    world.gets(subscriber, encode_frame(text("four")))
+    assert [one.fields["data"] for one in world.told if isinstance(one, MessageSeen)] == ["one", "two"]
+
+
+def test_a_topic_without_subscribers_is_looked_into(world: World) -> None:
+    """The publisher is connected to for the look, and let go behind it."""
+    world.state(LookWanted(1, "/chatter", MOST_MESSAGES))
+    publisher = world.upstream(TOLD)
+    publisher.send(encode_frame(text("alone")))
+    assert seen(world, "alone").number == 1
+    world.state(LookEnded(1))
+    world.ends(publisher)
+
+
+def test_the_latched_message_comes_first(world: World) -> None:
+    """Who looks sees what a subscriber that comes now would get."""
+    subscriber = world.connect(encode_header(ASK))
+    publisher = world.upstream(TOLD | {"latching": "1"})
+    world.gets_header(subscriber)
+    publisher.send(encode_frame(text("kept")))
+    world.gets(subscriber, encode_frame(text("kept")))
+    world.state(LookWanted(1, "/chatter", 1))
+    assert seen(world, "kept").number == 1
+
+
+@pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
+def test_a_definition_that_cannot_be_read_is_said(world: World, definition: str) -> None:
+    """The first bytes are shown instead, and why."""
+    subscriber = world.connect(encode_header(ASK))
+    publisher = world.upstream(HEADER | {"message_definition": definition})
+    world.gets_header(subscriber)
+    world.state(LookWanted(1, "/chatter", 1))
+    publisher.send(encode_frame(text("word")))
+    shown = world.hears(MessageSeen)
+    assert shown.fields == {"data": text("word").hex()}
+    assert "the definition in the publisher's header cannot be read" in shown.why
+
+
+def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None:
+    """A string that says it is longer than the message."""
+    publisher, _subscriber = subscribed(world)
+    world.state(LookWanted(1, "/chatter", 1))
+    publisher.send(encode_frame(struct.pack("<I", 1 << 31) + b"x"))
+    assert world.hears(MessageSeen).fields == {"data": "…"}
+
+
+def test_looks_are_few_and_end_with_control(world: World) -> None:
+    """Beyond `MOST_LOOKS` nothing is seen; a control that is gone leaves none behind."""
+    publisher, subscriber = subscribed(world)
+    for number in range(MOST_LOOKS + 1):
+        world.state(LookWanted(number, "/chatter", 1))
+    publisher.send(encode_frame(text("word")))
+    world.until(lambda: sum(isinstance(one, MessageSeen) for one in world.told) == MOST_LOOKS)
+    world.gets(subscriber, encode_frame(text("word")))
+    world.engine.attach(None)
+    world.link.close()
+    world.control.close()
+    world.connect_control()
+    world.state(LookWanted(99, "/chatter", 1))
+    publisher.send(encode_frame(text("again")))
+    assert seen(world, "again").number == 99
