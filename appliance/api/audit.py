@@ -17,8 +17,9 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
+from appliance.api.judgement import granted
 from appliance.api.problems import ProblemError
-from appliance.api.roles import OPERATOR, VIEWER, Viewer
+from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of
@@ -34,6 +35,9 @@ from appliance.audit.schema import json_schema
 from appliance.audit.search import Follower, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verify import verify
+from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.policy import Granted
+from appliance.policy.grant import UngrantableError
 from appliance.shares.table import REST_EXPORTS, REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
@@ -248,9 +252,25 @@ def routes(services: Services) -> Routes:
         around = {"before": list(map(as_object, shown.before)), "after": list(map(as_object, shown.after))}
         return JSONResponse({"record": as_object(shown.entry), **around})
 
+    @router.get("/{record_id}/grant", operation_id="grant_of_record", responses=_UNKNOWN | _NO_GRANT)
+    async def grant_of_record(
+        record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")], bearer: Viewer
+    ) -> Granted:
+        """The smallest change of the policy in force that grants what this record says was refused."""
+        shown = await desk.read(show, desk.path, record_id, 0)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        known = await ask(services.control, PolicyWanted(), bearer)
+        async with services.judging:
+            try:
+                return await asyncio.to_thread(granted, shown.entry.record, known)
+            except UngrantableError as error:
+                raise ProblemError(409, "not-by-a-policy", str(error)) from None
+
     return router
 
 
+_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
 _UNKNOWN: Responses = {404: {"description": "There is no such record."}}
 
 

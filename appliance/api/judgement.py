@@ -11,9 +11,10 @@ from typing import Any
 import msgspec
 
 from appliance.api.problems import Finding, ProblemError
+from appliance.audit.record import Record
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph import Registration
-from appliance.channel.answers.policy import PolicyKnown
+from appliance.channel.answers.policy import Granted, PolicyKnown
 from appliance.policy import (
     Category,
     Difference,
@@ -31,6 +32,7 @@ from appliance.policy import (
     judge,
 )
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
+from appliance.policy.grant import asked, grant
 from appliance.policy.rights import needs_node
 
 
@@ -54,6 +56,23 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
     live = [Live.of(msgspec.structs.asdict(row)) for row in registrations]
     changes = diff(before, policy, (request for thing in live for request in thing.requests()))
     return Judgement(_findings_of(policy.warnings), changes, endings(policy, live))
+
+
+def granted(record: Record, current: PolicyKnown) -> Granted:
+    """What would grant what a record says was refused. Raises `UngrantableError` where no line of a policy does."""
+    known = Known.of(msgspec.structs.asdict(current))
+    wanted = asked(
+        record.host or "", record.caller_id or "", record.category or "", record.resource or "", record.detail
+    )
+    found = grant(current.text, current.file, known, wanted)
+    return Granted(
+        revision=current.revision,
+        reason=record.reason,
+        added=list(found.added),
+        diff=found.diff(current.text, current.file),
+        text=found.text,
+        findings=found.findings("policy", known) if found.added else [],
+    )
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:

@@ -72,3 +72,17 @@ class Confirmed(msgspec.Struct, frozen=True):
 
     confirmed: bool
     revision: int
+
+
+class Granted(msgspec.Struct, frozen=True, kw_only=True):
+    """The smallest change of the policy in force that grants what a record says was refused. Nothing is changed."""
+
+    revision: Annotated[int, told("of the policy that it was worked out for")]
+    reason: Annotated[str, told("of the record")]
+    added: Annotated[
+        list[str],
+        told("a line for each right that is missing; none: the policy grants it, and it was refused else"),
+    ]
+    diff: Annotated[list[str], told("unified, a line each")]
+    text: Annotated[str, told("the whole policy with it, to be loaded")]
+    findings: Annotated[list[str], told("why it would be refused: test cases that it fails")]

@@ -24,7 +24,7 @@ def reload(
     Example: rosrv policy reload --confirm-within 5m
     """
     order = PolicyReload(seconds_within(confirm_within, "policy"))
-    _say_loaded(appliance.answer_or_exit(order, as_json=as_json))
+    say_loaded(appliance.answer_or_exit(order, as_json=as_json))
 
 
 @speaks
@@ -39,7 +39,7 @@ def rollback(
 
     Example: rosrv policy rollback 7
     """
-    _say_loaded(appliance.answer_or_exit(PolicyRollback(revision), as_json=as_json))
+    say_loaded(appliance.answer_or_exit(PolicyRollback(revision), as_json=as_json))
 
 
 @speaks
@@ -61,7 +61,8 @@ def revisions(appliance: Appliance, as_json: Json = False) -> None:
     say_revisions(body.revisions, as_json=as_json)
 
 
-def _say_loaded(body: Loaded) -> None:
+def say_loaded(body: Loaded) -> None:
+    """What a change of the policy did."""
     for warning in body.warnings:
         say(warning, "yellow")
     say(

@@ -13,6 +13,7 @@ import typer
 
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.policy.granting import grant
 from appliance.cli.policy.input import (
     Enrolled,
     Robot,
@@ -48,7 +49,7 @@ app = typer.Typer(
     help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
 )
 app.command("learn")(learn_policy)
-for _verb in (reload, rollback, confirm, revisions):
+for _verb in (reload, rollback, confirm, revisions, grant):
     app.command()(_verb)
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]

@@ -200,3 +200,21 @@ def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) 
     page = opened().go("audit")
     page.get_by_role("button", name="Changes by people").click()
     expect(page.get_by_role("row", name="monitor disabled").first).to_contain_text("operator")
+
+
+def test_grant_this_leads_to_the_editor(
+    opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
+) -> None:
+    """The smallest change is shown beside the record, and stands in the editor after a click; nothing is loaded."""
+    attempt("registerPublisher", "/eager", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
+    [record, *_] = appliance.recorded(
+        "--event", "decision", "--deny", resource="/guarded", caller_id="/eager"
+    )
+    page = opened().go(f"audit/{record['id']}")
+    page.get_by_role("button", name="Grant this").click()
+    expect(page.get_by_role("region", name="What would grant it")).to_contain_text(
+        "+/guarded = 10.9.9.9 robot"
+    )
+    page.get_by_role("button", name="Open in the editor").click()
+    expect(page.locator(".cm-content")).to_contain_text("/guarded = 10.9.9.9 robot")
+    assert appliance.status()["policy"]["revision"] == 1

@@ -1,0 +1,34 @@
+/** "Grant this": the smallest change of the policy that grants what a record says was refused, and the way to its editor. */
+
+import { html, useState } from "../html.js";
+import { Button } from "../parts/button.js";
+import { Given } from "../parts/given.js";
+import { Failure } from "../parts/notice.js";
+import { look, write } from "../policy/draft.js";
+import { get } from "../rest.js";
+import { go } from "../router.js";
+
+/** @param {{id: string}} given */
+export function Grant({ id }) {
+  const [found, setFound] = useState(/** @type {any} */ (null));
+  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const ask = async () => {
+    setError(null);
+    try {
+      setFound(await get(`/v1/audit/${id}/grant`));
+    } catch (problem) {
+      setError(problem);
+    }
+  };
+  const edit = async () => {
+    await look();
+    write(found.text);
+    go("/console/policy");
+  };
+  if (error) return html`<${Failure} error=${error} retry=${ask} />`;
+  if (!found) return html`<div class="row"><${Button} onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;
+  if (!found.added.length) return html`<p role="status">The policy in force grants it: it was refused for another reason, or before this revision.</p>`;
+  return html`<section class="stack-tight" aria-label="What would grant it"><pre class="bytes"><${Given} value=${found.diff.join("\n")} most=${4000} /></pre>
+    ${found.findings.length > 0 && html`<p>The policy's tests refuse it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
+    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>Open in the editor</${Button}><span class="muted small">A dry run there says whom it touches; load it on trial.</span></div></section>`;
+}

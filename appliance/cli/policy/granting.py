@@ -1,0 +1,103 @@
+"""`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.channel.admin import PolicyLoad, PolicyWanted
+from appliance.channel.answers.policy import Granted
+from appliance.cli.audit.errors import Errors, fail
+from appliance.cli.output import Json, printable, say, say_json, usage_error
+from appliance.cli.policy.running import say_loaded
+from appliance.cli.running import Appliance, speaks
+from appliance.cli.trials import ConfirmWithin, seconds_within
+
+
+@speaks
+def grant(
+    appliance: Appliance,
+    record: Annotated[str, typer.Argument(metavar="RECORD", help="The id of a refusal's audit record")],
+    *,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the whole policy with the change to this file")
+    ] = None,
+    load: Annotated[bool, typer.Option("--load", help="Bring the policy with the change into force")] = False,
+    confirm_within: ConfirmWithin = None,
+    as_json: Json = False,
+) -> None:
+    """Show the smallest change of the policy in force that grants what a record says was refused.
+
+    It is tried against the policy's tests; nothing is changed unless --write or --load says so. Exit status 1 when no
+    line of a policy grants it, or a test fails.
+
+    Example: rosrv policy grant 18e9aa02efc40abb0e51 --load --confirm-within 5m
+    """
+    within = seconds_within(confirm_within, "policy")
+    if within is not None and not load:
+        raise usage_error("--confirm-within is for --load")
+    found = _granted(appliance, record)
+    if as_json:
+        say_json(found)
+    else:
+        _show(found)
+    if found.findings or not found.added:
+        raise typer.Exit(1)
+    if write is not None:
+        try:
+            write.write_text(found.text, encoding="utf-8")
+        except OSError as error:
+            raise usage_error(f"cannot write {write}: {error.strerror}") from None
+    if load:
+        order = PolicyLoad(found.text, f"grants record {record[:100]}", within, found.revision)
+        body = appliance.ask_or_exit(order, as_json=as_json)
+        if as_json:
+            say_json(body)
+        else:
+            say_loaded(body)
+
+
+def _show(found: Granted) -> None:
+    say(f"refused: {printable(found.reason)}")
+    if not found.added:
+        say(
+            "the policy in force grants it: it was refused for another reason, or before this revision",
+            "yellow",
+        )
+    for line in found.diff:
+        say(printable(line), {"+": "green", "-": "red"}.get(line[:1], ""))
+    for finding in found.findings:
+        say(printable(finding), "red")
+
+
+def _granted(appliance: Appliance, record: str) -> Granted:
+    """Over REST the appliance works it out, over the socket this program."""
+    if appliance.place is not None:
+        return _over_rest(appliance, record)
+    from appliance.api.judgement import granted  # noqa: PLC0415  not for every verb
+    from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
+
+    with Errors():
+        shown = appliance.audit().show(record, 0)
+        if shown is None:
+            fail(f"no record with the id {record!a} is in the log", 1)
+        known = appliance.ask_or_exit(PolicyWanted(), as_json=False)
+        try:
+            return granted(shown.entry.record, known)
+        except UngrantableError as error:
+            fail(str(error), 1)
+
+
+def _over_rest(appliance: Appliance, record: str) -> Granted:
+    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
+
+    assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
+    if not record.isalnum():
+        raise usage_error(f"{printable(record)} is no id of a record")
+    try:
+        return msgspec.convert(appliance.way.client.call("GET", f"/v1/audit/{record}/grant"), Granted)
+    except ProblemError as problem:
+        typer.echo(f"rosrv policy: {problem.lines[0]}", err=True)
+        raise typer.Exit(1) from None

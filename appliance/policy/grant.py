@@ -1,0 +1,176 @@
+"""The smallest change of a policy's text that grants what was refused. Pure.
+
+One line for each right that is missing: where the section has the very key, the host is added to it; else a line for
+that key is added, with everybody whom the deciding rule names, so that nobody loses or gains anything but this host.
+Comments, order and blanks of the text stay.
+"""
+
+import difflib
+import ipaddress
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import Findings, PolicyError
+from appliance.policy.judging import Known, judge
+from appliance.policy.model import Address, Category, Request
+from appliance.policy.policy import Policy
+from appliance.policy.reader import Entry, SectionText, Word, read
+from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
+from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, PARAMETERS
+
+_MOST_LINES = 8  # that one grant changes
+
+
+class UngrantableError(Exception):
+    """No line of a policy grants it; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request that was decided, and all that it needs."""
+
+    request: Request
+    rights: list[Right]
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A text that grants what was asked, and a line for each right that it adds; both as before if none is missing."""
+
+    text: str
+    added: tuple[str, ...]
+
+    def findings(self, file: str, known: Known) -> list[str]:
+        """Why the text would be refused: the test cases beside the policy that it fails."""
+        try:
+            unsigned = replace(known, site_keys=())  # what is being written cannot be signed yet
+            judge(self.text, file, unsigned).accepted()
+        except PolicyError as error:
+            return [str(finding) for finding in error.findings]
+        return []
+
+    def diff(self, before: str, file: str) -> list[str]:
+        """What changed, as a unified diff."""
+        old, new = before.splitlines(), self.text.splitlines()
+        return list(difflib.unified_diff(old, new, file, f"{file} (granted)", lineterm=""))
+
+
+def grant(text: str, file: str, known: Known, asked: Asked) -> Grant:
+    """The smallest change of a policy that grants all that was asked to the host that asked.
+
+    Raises `UngrantableError`, and `PolicyError` where the text is no policy as it is.
+    """
+    word = _word(text, known, asked.request.host)
+    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+    added: list[str] = []
+    while (
+        missing := next((right for right in asked.rights if not _granted(policy, right)), None)
+    ) is not None:
+        reason = decide_right(policy, missing).reason
+        if len(added) == _MOST_LINES:
+            raise UngrantableError(f"more than {_MOST_LINES} lines would have to change: {reason}")
+        text, line = _changed(policy, text, missing, word)
+        added.append(line)
+        try:
+            policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+        except PolicyError:  # the line would be none: there is no such call, or no key for it
+            raise UngrantableError(f"no line of a policy grants it: {reason}") from None
+    return Grant(text, tuple(added))
+
+
+def _granted(policy: Policy, right: Right) -> bool:
+    if right.request.category in PARAMETERS and not policy.has_section(right.request.category):
+        return True
+    decision = decide_right(policy, right)
+    return decision.allowed and not decision.would_deny
+
+
+def _word(text: str, known: Known, host: Address) -> str:
+    """What to call the host: a name of its own where there is one, else its address."""
+    enrolled = next((name for name, address in known.hosts.items() if address == host), None)
+    if enrolled is not None:
+        return f"host:{enrolled}"
+    groups = next((section for section in _sections(text) if section.name.text == GROUPS), None)
+    for entry in groups.entries if groups is not None else ():
+        if [word.text for word in entry.values] == [str(host)]:
+            return entry.key.text
+    alone = [
+        place for place in known.robot if str(place).removesuffix("/32").removesuffix("/128") == str(host)
+    ]
+    return "robot" if alone else str(host)
+
+
+def _sections(text: str) -> list[SectionText]:
+    return read(text, Findings(""))
+
+
+def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
+    """The text with one line more or one word more, and that line."""
+    request = right.request
+    decision = decide_right(policy, right)
+    key = request.resource
+    if policy.decide(request).allowed and not policy.decide(request).would_deny:
+        # What is refused is below the key: by a rule of its own there, or by the one for all that has none.
+        below = decision.rule is not None and _key_of(decision.rule.key, request).startswith(f"{key}/")
+        key = _key_of(decision.rule.key, request) if below and decision.rule is not None else f"{key}/**"
+    written = f"{request.category.value} {key}" if request.category in PARAMETERS else key
+    section = next(
+        (one for one in _sections(text) if one.name.text == BY_CATEGORY[request.category].name), None
+    )
+    entry = None if section is None else _entry(section, written)
+    if entry is not None:
+        return _with_word(text, entry, word)
+    holders = [] if section is None or decision.rule is None else _holders(section, decision.rule.key)
+    return _with_line(
+        text, section, BY_CATEGORY[request.category].name, f"{written} = {' '.join([*holders, word])}"
+    )
+
+
+def _key_of(key: str, request: Request) -> str:
+    """The key of a rule without the word that says what it is for (`read /x`)."""
+    return key.split(" ", 1)[-1] if request.category in PARAMETERS else key
+
+
+def _entry(section: SectionText, key: str) -> Entry | None:
+    return next((entry for entry in section.entries if " ".join(entry.key.text.split()) == key), None)
+
+
+def _holders(section: SectionText, key: str) -> list[str]:
+    entry = _entry(section, key)
+    return [] if entry is None else [word.text for word in entry.values]
+
+
+def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
+    lines = text.split("\n")
+    line = lines[entry.key.line - 1]
+    last: Word | None = entry.values[-1] if entry.values else None
+    end = line.index("=") + 1 if last is None else last.column - 1 + len(last.text)
+    comma = "," if last is not None and "," in line[:end] else ""
+    lines[entry.key.line - 1] = f"{line[:end]}{comma} {word}{line[end:]}"
+    return "\n".join(lines), lines[entry.key.line - 1].strip()
+
+
+def _with_line(text: str, section: SectionText | None, name: str, line: str) -> tuple[str, str]:
+    lines = text.split("\n")
+    if section is None:
+        while lines and not lines[-1].strip():
+            lines.pop()
+        return "\n".join([*lines, "", f"[{name}]", line, ""]), f"[{name}] {line}"
+    last = section.entries[-1].key.line if section.entries else section.name.line
+    # `default` is what people write last: before it, where it is.
+    if section.entries and section.entries[-1].key.text.endswith(DEFAULT):
+        last -= 1
+    return "\n".join([*lines[:last], line, *lines[last:]]), line
+
+
+def asked(host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]) -> Asked:
+    """What a record of a decision was about. Raises `UngrantableError` for another record."""
+    try:
+        request = Request(ipaddress.ip_address(host), caller_id, Category(category), resource)
+    except ValueError:
+        raise UngrantableError("it is no record of a decision about a host's call") from None
+    call, key = str(detail.get("call", resource)), detail.get("key")
+    if request.category is Category.COMMAND:
+        return Asked(request, rights_of_call(request, call, str(key) if key is not None else None))
+    return Asked(request, rights_of(request))

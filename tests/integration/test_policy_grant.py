@@ -1,0 +1,69 @@
+"""A refusal of the running appliance is granted: by its record, on the command line and over REST."""
+
+from collections.abc import Iterator
+from xmlrpc.client import ServerProxy
+
+import pytest
+
+from tests.support.appliance import Appliance
+
+POLICY = """
+[Groups]
+ocu = 10.9.9.9
+[Nodes]
+default = ocu 127.0.0.1
+[Publishers]
+/cmd* = ocu   # only they
+default = 127.0.0.1
+[Subscribers]
+default = ocu
+[Commands]
+default = ocu, 127.0.0.1
+"""
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with REST; only the operator's station may command."""
+    with Appliance(policy=POLICY, options=("--api", "127.0.0.1:0")) as appliance:
+        yield appliance
+
+
+def refused(appliance: Appliance, method: str, *arguments: str) -> str:
+    """The id of the record of a call that is refused."""
+    with ServerProxy(appliance.master_uri) as master:
+        code, text, _value = getattr(master, method)(*arguments)
+    assert code == 0
+    record = str(text).rpartition("[")[2].rstrip("]")
+    appliance.recorded("--event", "decision", id=record)
+    return record
+
+
+def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:
+    """Shown as a diff, over REST alike; loaded with the time limit of any change; the node gets it without more ado."""
+    call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", "http://127.0.0.1:4000/")
+    record = refused(appliance, *call)
+    shown = appliance.rosrv("policy", "grant", record).stdout
+    assert "+/cmd_vel = ocu robot" in shown.splitlines()
+    rest = appliance.rest().get(f"/v1/audit/{record}/grant").json
+    assert rest["added"] == ["/cmd_vel = ocu robot"]
+    assert rest["findings"] == []
+    done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
+    assert "unless you say: rosrv policy confirm" in done.stdout
+    with ServerProxy(appliance.master_uri) as master:
+        answer = getattr(master, call[0])(*call[1:])
+    assert answer[0] == 1
+    again = appliance.rosrv("policy", "grant", record, check=False)
+    assert (again.returncode, "the policy in force grants it" in again.stdout) == (1, True)
+
+
+def test_what_no_policy_grants_is_said(appliance: Appliance) -> None:
+    """A call that the appliance does not know; a record that is not there, or of something else."""
+    record = refused(appliance, "bogus", "/base")
+    done = appliance.rosrv("policy", "grant", record, check=False)
+    assert (done.returncode, "is not a call that the appliance knows" in done.stderr) == (1, True)
+    rest = appliance.rest()
+    assert rest.get(f"/v1/audit/{record}/grant").status == 409
+    assert rest.get("/v1/audit/ffffffffffffffffffff/grant").status == 404
+    started = appliance.recorded("--event", "appliance started")[0]["id"]
+    assert "no record of a decision" in appliance.rosrv("policy", "grant", started, check=False).stderr

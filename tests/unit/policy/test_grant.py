@@ -1,0 +1,129 @@
+"""The smallest change that grants what was refused: it grants that, and nothing else to anybody."""
+
+import ipaddress
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from appliance.policy.compiler import compile_policy
+from appliance.policy.grant import Asked, UngrantableError, asked, grant
+from appliance.policy.judging import Known
+from appliance.policy.model import Category, Request
+from appliance.policy.policy import Policy
+from appliance.policy.rights import decide, rights_of
+
+POLICIES = sorted((Path(__file__).parents[3] / "policies").glob("*.ini"))
+ROBOT = ipaddress.ip_network("10.84.0.2/32")
+HOST, OTHER = ipaddress.ip_address("10.0.0.9"), ipaddress.ip_address("10.0.0.10")
+KNOWN = Known({"laptop": ipaddress.ip_address("10.0.0.77")}, [ROBOT])
+NAMES = ("/cmd_vel", "/arm", "/arm/max", "/landshark_control/base_velocity", "/a/b/c")
+CALLS = ("lookupService", "getParam", "setParam", "shutdown", "getSystemState", "getRVState")
+
+
+def request(category: Category, resource: str, host: object = HOST) -> Request:
+    """A request of the node /it."""
+    return Request(host, "/it", category, resource)  # type: ignore[arg-type]  # an address
+
+
+def everything(host: object) -> list[Request]:
+    """What a host may ask for."""
+    named = [category for category in Category if category is not Category.COMMAND]
+    return [request(category, name, host) for category, name in product(named, NAMES)] + [
+        request(Category.COMMAND, call, host) for call in CALLS
+    ]
+
+
+def compiled(text: str) -> Policy:
+    """The policy."""
+    return compile_policy(text, file="p.ini", hosts=KNOWN.hosts, robot=KNOWN.robot)
+
+
+@pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
+@pytest.mark.parametrize("wanted", everything(HOST), ids=lambda one: f"{one.category} {one.resource}")
+def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
+    """In every shipped policy: nobody loses anything, another host gains nothing, the rest of the text stays."""
+    text = file.read_text(encoding="utf-8")
+    found = grant(text, "p.ini", KNOWN, Asked(wanted, rights_of(wanted)))
+    before, after = compiled(text), compiled(found.text)
+    assert decide(after, rights_of(wanted)).allowed
+    needed = {(right.request.category, right.request.resource) for right in rights_of(wanted)}
+    for host in (HOST, OTHER, ipaddress.ip_address("10.84.0.2"), ipaddress.ip_address("127.0.0.1")):
+        for one in everything(host):
+            was, now = before.decide(one).allowed, after.decide(one).allowed
+            gained = host == HOST and (one.category, one.resource) in needed
+            assert now is (True if gained else was), (one, found.added)
+    kept = [line for line in found.text.splitlines() if line not in found.added]
+    assert len(text.splitlines()) - len(kept) <= len(found.added)
+    assert bool(found.added) is not decide(before, rights_of(wanted)).allowed
+
+
+def changed(text: str, category: str, resource: str, host: str = str(HOST), **detail: object) -> list[str]:
+    """The lines that are added or written anew."""
+    found = grant(text, "p.ini", KNOWN, asked(host, "/it", category, resource, detail))
+    return [line[1:] for line in found.diff(text, "p.ini") if line[:1] == "+" and line[:3] != "+++"]
+
+
+BASE = (
+    "[Nodes]\ndefault = *\n[Publishers]\n/x = 10.0.0.1, 10.0.0.2  # the two\n/y* = 10.0.0.1\n[Subscribers]\n"
+)
+
+
+def test_the_host_is_added_to_the_very_key() -> None:
+    """As the line is written: its commas, its comment."""
+    assert changed(BASE, "publish", "/x") == ["/x = 10.0.0.1, 10.0.0.2, 10.0.0.9  # the two"]
+
+
+def test_a_new_key_keeps_whom_the_deciding_rule_names() -> None:
+    """Who had it by a pattern has it still; a section without any rule gets its first."""
+    assert changed(BASE, "publish", "/yes") == ["/yes = 10.0.0.1 10.0.0.9"]
+    assert changed(BASE, "subscribe", "/z") == ["/z = 10.0.0.9"]
+    assert changed("[Nodes]\ndefault = *\n", "publish", "/z") == ["", "[Publishers]", "/z = 10.0.0.9"]
+
+
+def test_a_host_is_called_what_it_is_called() -> None:
+    """By a group that is it alone, by its certificate, as the robot; else by its address."""
+    grouped = "[Groups]\nocu = 10.0.0.9\nall = 10.0.0.9 10.0.0.1\n" + BASE
+    assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
+    assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]
+    assert changed(BASE, "subscribe", "/z", "10.84.0.2") == ["/z = robot"]
+
+
+def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
+    """The command and the key; what denies below the key gets the host as well."""
+    text = (
+        "[Nodes]\ndefault=*\n[Commands]\nsetParam = 10.0.0.1\n"
+        "[Parameters]\nwrite /arm/max = 10.0.0.1\nwrite default = 10.0.0.1\n"
+    )
+    added = changed(text, "command", "setParam", call="setParam", key="/arm")
+    assert added == [
+        "setParam = 10.0.0.1 10.0.0.9",
+        "write /arm/max = 10.0.0.1 10.0.0.9",
+        "write /arm = 10.0.0.1 10.0.0.9",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("host", "category", "resource", "why"),
+    [
+        (str(HOST), "command", "bogus", "not a call that the appliance knows"),
+        ("", "publish", "/x", "no record of a decision"),
+        (str(HOST), "monitor", "/x", "no record of a decision"),
+        (str(HOST), "publish", "no name", "is not a resolved ROS name"),
+    ],
+)
+def test_what_no_policy_grants(host: str, category: str, resource: str, why: str) -> None:
+    """It is said, with the reason."""
+    with pytest.raises(UngrantableError, match=why):
+        changed(BASE, category, resource, host)
+
+
+def test_cases_that_fail_are_told() -> None:
+    """A policy that says in its tests that this host may not."""
+    known = Known(
+        cases_file="p.tests.yaml", cases="cases:\n  - {host: 10.0.0.9, node: /it, deny: [subscribe /z]}\n"
+    )
+    found = grant(BASE, "p.ini", known, asked(str(HOST), "/it", "subscribe", "/z", {}))
+    [finding] = found.findings("p.ini", known)
+    assert finding.startswith("p.tests.yaml:2:")
+    assert "expected deny" in finding
