@@ -45,12 +45,21 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components = document.setdefault("components", {}).setdefault("schemas", {})
     for name in ("HTTPValidationError", "ValidationError"):
         components.pop(name, None)
-    components |= CONTRACT.components()
+    components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
     for path in document["paths"].values():
         for operation in path.values():
             _complete(operation)
     return document
+
+
+def _plain(schema: Any) -> Any:
+    """A schema in words that generators of clients know: a tuple's length is said by `maxItems` alone."""
+    if isinstance(schema, list):
+        return [_plain(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
 
 
 def _complete(operation: dict[str, Any]) -> None:

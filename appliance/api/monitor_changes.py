@@ -27,7 +27,7 @@ from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers import monitors as answers
-from appliance.channel.answers.monitors import Confirmed, Switched
+from appliance.channel.answers.monitors import MonitorsConfirmed, Switched
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
@@ -125,7 +125,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         return await _replaced(control, admin.MonitorRollback(to.revision, _expected(if_match)), bearer)
 
     @router.post("/confirm", operation_id="confirm_monitors", responses=_CHANGES)
-    async def confirm_monitors(bearer: Operator, if_match: IfMatch = None) -> Tagged[Confirmed]:
+    async def confirm_monitors(bearer: Operator, if_match: IfMatch = None) -> Tagged[MonitorsConfirmed]:
         """Keep specifications that were loaded with `confirm_within`."""
         done = await _ordered(control, admin.MonitorConfirm(_expected(if_match)), bearer)
         return Tagged(done, done.tag)

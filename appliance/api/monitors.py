@@ -19,7 +19,7 @@ from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
 from appliance.audit.search import Page, search
 from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
-from appliance.channel.answers.monitors import Monitors, MonitorState, Revisions, RevisionTexts
+from appliance.channel.answers.monitors import MonitorRevisionList, Monitors, MonitorState, RevisionTexts
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE: Responses = {
@@ -70,7 +70,7 @@ def routes(services: Services) -> Routes:
         return Tagged(loaded, loaded.tag)
 
     @router.get("/revisions", operation_id="monitor_revisions")
-    async def revisions(bearer: Viewer) -> Revisions:
+    async def revisions(bearer: Viewer) -> MonitorRevisionList:
         """The kept revisions of the specifications, the newest first."""
         return await ask(services.control, MonitorRevisions(), bearer)
 

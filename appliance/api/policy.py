@@ -22,7 +22,7 @@ from appliance.api.routing import Responses, Routes, Tagged, body
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.policy import PolicyInForce, Revisions, RevisionText
+from appliance.channel.answers.policy import PolicyInForce, PolicyRevisionList, RevisionText
 from appliance.policy.explain import Explanation
 from appliance.policy.model import Category, Rule
 
@@ -74,7 +74,7 @@ def routes(services: Services) -> Routes:
         return Tagged(msgspec.convert(known, PolicyInForce, from_attributes=True), known.revision)
 
     @router.get("/revisions", operation_id="policy_revisions")
-    async def revisions(bearer: Viewer) -> Revisions:
+    async def revisions(bearer: Viewer) -> PolicyRevisionList:
         """The kept revisions, the newest first."""
         return await ask(control, PolicyRevisions(), bearer)
 

@@ -19,7 +19,7 @@ from appliance.api.roles import Operator, ask
 from appliance.api.routing import Responses, Routes, Tagged, body
 from appliance.api.services import Services
 from appliance.channel import admin
-from appliance.channel.answers.policy import Confirmed, Loaded
+from appliance.channel.answers.policy import Loaded, PolicyConfirmed
 
 _CHANGES: Responses = {
     412: {"description": "Another policy is in force than If-Match names."},
@@ -81,7 +81,7 @@ def routes(services: Services) -> Routes:
         return Tagged(loaded, loaded.revision)
 
     @router.post("/confirm", operation_id="confirm_policy", responses=_CHANGES)
-    async def confirm(bearer: Operator, if_match: IfMatch = None) -> Tagged[Confirmed]:
+    async def confirm(bearer: Operator, if_match: IfMatch = None) -> Tagged[PolicyConfirmed]:
         """Keep a policy that was loaded with `confirm_within`."""
         confirmed = await ask(services.control, admin.PolicyConfirm(expected_revision(if_match)), bearer)
         return Tagged(confirmed, confirmed.revision)

@@ -50,7 +50,7 @@ class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollb
     expected: int | None = None
 
 
-class PolicyConfirm(AdminRequest[policy.Confirmed], frozen=True, tag="policy confirm"):
+class PolicyConfirm(AdminRequest[policy.PolicyConfirmed], frozen=True, tag="policy confirm"):
     """Keep a change that would go back by itself."""
 
     expected: int | None = None
@@ -72,7 +72,7 @@ class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
     revision: int | None = None
 
 
-class PolicyRevisions(AdminRequest[policy.Revisions], frozen=True, tag="policy revisions"):
+class PolicyRevisions(AdminRequest[policy.PolicyRevisionList], frozen=True, tag="policy revisions"):
     """The kept revisions."""
 
 
@@ -157,13 +157,13 @@ class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor
     expected: str | None = None
 
 
-class MonitorConfirm(AdminRequest[monitors.Confirmed], frozen=True, tag="monitor confirm"):
+class MonitorConfirm(AdminRequest[monitors.MonitorsConfirmed], frozen=True, tag="monitor confirm"):
     """Keep specifications that would go back by themselves."""
 
     expected: str | None = None
 
 
-class MonitorRevisions(AdminRequest[monitors.Revisions], frozen=True, tag="monitor revisions"):
+class MonitorRevisions(AdminRequest[monitors.MonitorRevisionList], frozen=True, tag="monitor revisions"):
     """The kept revisions of the specifications."""
 
 

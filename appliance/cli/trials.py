@@ -29,7 +29,7 @@ def say_deadline(confirm_by: float | None, noun: str) -> None:
         say(f"it goes back by itself at {_time(confirm_by)} unless you say: rosrv {noun} confirm", "yellow")
 
 
-def say_confirmed(body: policy.Confirmed | monitors.Confirmed, *, as_json: bool) -> None:
+def say_confirmed(body: policy.PolicyConfirmed | monitors.MonitorsConfirmed, *, as_json: bool) -> None:
     """Whether there was something to confirm. Ends the program: with 1 when there was not."""
     if as_json:
         say_json(body)
@@ -39,13 +39,15 @@ def say_confirmed(body: policy.Confirmed | monitors.Confirmed, *, as_json: bool)
     raise typer.Exit(0 if body.confirmed else 1)
 
 
-def say_revisions(rows: Sequence[policy.Revision] | Sequence[monitors.Revision], *, as_json: bool) -> None:
+def say_revisions(
+    rows: Sequence[policy.PolicyRevision] | Sequence[monitors.MonitorRevision], *, as_json: bool
+) -> None:
     """The kept revisions, a line each."""
     for row in rows:
         if as_json:
             say_json(row)
             continue
-        files = row.file if isinstance(row, policy.Revision) else " ".join(row.names)
+        files = row.file if isinstance(row, policy.PolicyRevision) else " ".join(row.names)
         mark = "in force" if row.in_force else ""
         say(f"{row.revision:>5}  {_time(row.loaded)}  {row.who}: {row.note}  {files}  {mark}".rstrip())
 

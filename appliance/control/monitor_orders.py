@@ -91,15 +91,15 @@ class MonitorOrders:
         done = await self._monitors.rollback(request.revision, who=who, expected=request.expected)
         return self._replaced(done)
 
-    async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.Confirmed:
+    async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep a change that would go back by itself."""
         confirmed = await self._monitors.confirm(who=who, expected=request.expected)
-        return answers.Confirmed(confirmed, self._monitors.revision, self._monitors.tag)
+        return answers.MonitorsConfirmed(confirmed, self._monitors.revision, self._monitors.tag)
 
-    async def revisions(self, _request: admin.MonitorRevisions) -> answers.Revisions:
+    async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
         """The kept revisions."""
         rows = await self._monitors.revisions()
-        return answers.Revisions([answers.Revision(**self._revision(row)) for row in rows])
+        return answers.MonitorRevisionList([answers.MonitorRevision(**self._revision(row)) for row in rows])
 
     async def revision(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
         """A revision with its texts. Raises `UnknownThingError`."""
@@ -110,7 +110,7 @@ class MonitorOrders:
         raise UnknownThingError(f"there is no revision {request.revision} of the specifications")
 
     def _revision(self, row: MonitorRevisionRow) -> dict[str, Any]:
-        """The fields of `Revision`."""
+        """The fields of `MonitorRevision`."""
         return {
             "revision": row.revision,
             "loaded": row.loaded,

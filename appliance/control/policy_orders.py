@@ -51,15 +51,15 @@ class PolicyOrders:
             loaded = self._policies.rollback(request.revision, who=who)
         return answers.Loaded(**asdict(loaded))
 
-    async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.Confirmed:
+    async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         """Keep a change that would go back by itself."""
         async with self._changing(request.expected):
-            return answers.Confirmed(self._policies.confirm(who=who), self._policies.revision)
+            return answers.PolicyConfirmed(self._policies.confirm(who=who), self._policies.revision)
 
-    async def revisions(self, _request: admin.PolicyRevisions) -> answers.Revisions:
+    async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
         """The kept revisions."""
         rows = self._policies.revisions()
-        return answers.Revisions([answers.Revision(**self._revision(row)) for row in rows])
+        return answers.PolicyRevisionList([answers.PolicyRevision(**self._revision(row)) for row in rows])
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
         """A revision, and with what its text is judged. Raises `UnknownThingError`."""
@@ -91,7 +91,7 @@ class PolicyOrders:
         )
 
     def _revision(self, row: RevisionRow) -> dict[str, Any]:
-        """The fields of `Revision`."""
+        """The fields of `PolicyRevision`."""
         return {
             "revision": row.revision,
             "file": row.file,

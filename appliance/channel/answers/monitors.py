@@ -77,7 +77,7 @@ class Replaced(msgspec.Struct, frozen=True):
     confirm_by: float | None
 
 
-class Confirmed(msgspec.Struct, frozen=True):
+class MonitorsConfirmed(msgspec.Struct, frozen=True):
     """Whether there was something to confirm."""
 
     confirmed: bool
@@ -85,7 +85,7 @@ class Confirmed(msgspec.Struct, frozen=True):
     tag: Tag
 
 
-class Revision(msgspec.Struct, frozen=True):
+class MonitorRevision(msgspec.Struct, frozen=True):
     """Specifications that came into force; `loaded` is seconds since the epoch."""
 
     revision: int
@@ -96,13 +96,13 @@ class Revision(msgspec.Struct, frozen=True):
     names: Annotated[list[str], told("of its files")]
 
 
-class Revisions(msgspec.Struct, frozen=True):
+class MonitorRevisionList(msgspec.Struct, frozen=True):
     """The kept revisions, the newest first."""
 
-    revisions: list[Revision]
+    revisions: list[MonitorRevision]
 
 
-class RevisionTexts(Revision, frozen=True):
+class RevisionTexts(MonitorRevision, frozen=True):
     """A kept revision with its texts."""
 
     files: Annotated[dict[str, str], told("specifications by file name")]

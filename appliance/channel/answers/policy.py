@@ -7,7 +7,7 @@ import msgspec
 from appliance.channel.answers.field_docs import told
 
 
-class Revision(msgspec.Struct, frozen=True):
+class PolicyRevision(msgspec.Struct, frozen=True):
     """A policy that came into force; `loaded` is seconds since the epoch."""
 
     revision: int
@@ -18,13 +18,13 @@ class Revision(msgspec.Struct, frozen=True):
     in_force: bool
 
 
-class Revisions(msgspec.Struct, frozen=True):
+class PolicyRevisionList(msgspec.Struct, frozen=True):
     """The kept revisions, the newest first."""
 
-    revisions: list[Revision]
+    revisions: list[PolicyRevision]
 
 
-class RevisionText(Revision, frozen=True):
+class RevisionText(PolicyRevision, frozen=True):
     """A kept revision with its text, and the signature of the site (empty: it came without one)."""
 
     text: str
@@ -67,7 +67,7 @@ class Loaded(msgspec.Struct, frozen=True):
     ]
 
 
-class Confirmed(msgspec.Struct, frozen=True):
+class PolicyConfirmed(msgspec.Struct, frozen=True):
     """Whether there was something to confirm."""
 
     confirmed: bool
