@@ -21,6 +21,7 @@ A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]
 ETAG = {"ETag": {"description": "what If-Match takes of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
+_MOST_ERRORS = 50
 _PLACE = re.compile(r"(?s)(.*) - at `(?:key in )?\$(.*)`")
 
 
@@ -85,13 +86,13 @@ class _Body:
         try:
             return msgspec.convert({"text": text}, self.kind)
         except msgspec.ValidationError as error:
-            raise _bad_input(error) from None
+            raise _bad_input([error]) from None
 
     def _of_json(self, text: str) -> Any:
         try:
             return msgspec.json.decode(text, type=self.kind)
         except msgspec.ValidationError as error:
-            raise _bad_input(error) from None
+            raise _bad_input(_all_wrong(msgspec.json.decode(text), self.kind) or [error]) from None
         except (msgspec.DecodeError, RecursionError) as error:
             raise _not_json(text, error) from None
 
@@ -117,11 +118,39 @@ def _text(data: bytes) -> str:
         raise ProblemError(422, "bad-input", f"the body is not UTF-8 (byte {error.start})") from None
 
 
-def _bad_input(error: msgspec.ValidationError) -> ProblemError:
+def _all_wrong(given: Any, kind: Any) -> list[msgspec.ValidationError]:
+    """What is wrong with each field of a body, where msgspec ends with the first."""
+    if not isinstance(given, dict):
+        return []
+    known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+    wrong = [
+        msgspec.ValidationError(f"Object missing required field `{name}`")
+        for name, field in known.items()
+        if field.required and name not in given
+    ]
+    for name, value in given.items():
+        if name not in known:
+            wrong.append(msgspec.ValidationError(f"Object contains unknown field `{name[:100]}`"))
+            continue
+        try:
+            msgspec.convert(value, known[name].type)
+        except msgspec.ValidationError as error:
+            text, place = _parted(error)
+            wrong.append(msgspec.ValidationError(f"{text} - at `$.{name}{place}`"))
+    return wrong[:_MOST_ERRORS]
+
+
+def _parted(error: msgspec.ValidationError) -> tuple[str, str]:
+    """What is wrong, and where."""
     found = _PLACE.fullmatch(str(error))
-    text, place = (found[1], found[2]) if found is not None else (str(error), "")
-    bad = BadInput(f"body{place}", text)
-    return ProblemError(422, "bad-input", f"{bad.where}: {bad.text}", errors=[bad])
+    return (found[1], found[2]) if found is not None else (str(error), "")
+
+
+def _bad_input(errors: list[msgspec.ValidationError]) -> ProblemError:
+    bad = [BadInput(f"body{place}", text) for text, place in map(_parted, errors)]
+    return ProblemError(
+        422, "bad-input", "; ".join(f"{one.where}: {one.text}" for one in bad[:5]), errors=bad
+    )
 
 
 def _not_json(text: str, error: Exception) -> ProblemError:

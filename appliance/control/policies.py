@@ -156,10 +156,14 @@ class Policies:
     ) -> Loaded:
         """Bring a text that is not the file's into force, as `reload` does.
 
+        What was loaded so already, and is in force, stays as it is: the same text twice is one revision.
         Raises `PolicyRefusedError`, `RevisionChangedError`. Its rules are cited as `revision N:line`, for the file
         says something else.
         """
         before = self.revision
+        now = self.in_force
+        if now.who != _DISK and (now.text, now.signature) == (text, signature):
+            return Loaded(before, before, [str(one) for one in self.current.warnings], 0, self.confirm_by)
         policy, _ = await self._prepared(lambda: (text, signature), f"revision {self._next_number()}", who)
         self._trial.announce(before, confirm_within)
         revoked = self._keep(policy, signature, who=who, note=note or "posted")

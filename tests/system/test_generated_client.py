@@ -1,4 +1,4 @@
-"""A client generated from the contract, as an integrator makes one: every operation is in it, and what it reads is right.
+"""A client generated from the contract, as an integrator makes one: every operation is in it, and it reads answers.
 
 The generator lives in an environment of its own (`generated-client.lock`): its dependencies are not ours.
 """
@@ -52,7 +52,7 @@ def appliance() -> Iterator[Appliance]:
 def test_every_operation_can_be_generated_and_read(
     generator: Path, appliance: Appliance, tmp_path: Path
 ) -> None:
-    """No part of the contract is left out but bodies that are no JSON; answers of the appliance are read into its types."""
+    """Nothing is left out but bodies that are no JSON; the appliance's answers are read into the client's types."""
     contract = appliance.rest().get("/v1/openapi.json").json
     operations = [one for path in contract["paths"].values() for one in path.values()]
     assert not [name for name in contract["components"]["schemas"] if "." in name], "no module's name leaks"

@@ -269,3 +269,14 @@ async def test_keys_are_changed_over_with_both_in_force(tmp_path: Path) -> None:
         assert (policies.revision, policies.in_force.signature) == (2, signed(OPEN, OTHER_KEY))
     with appliance.started(restarted=True, site_keys=[OTHER_LINE]) as policies:
         assert policies.revision == 2
+
+
+async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
+    """Who repeats an order changes nothing; a time limit that runs goes on; another text is another revision."""
+    with Appliance(tmp_path).started() as policies:
+        first = await policies.load_text(OTHER, "", who="adam", note="", confirm_within=100.0)
+        again = await policies.load_text(OTHER, "", who="eve", note="once more")
+        assert (first.revision, again.revision, again.replaced) == (2, 2, 2)
+        assert again.confirm_by == first.confirm_by
+        assert policies.in_force.who == "adam"
+        assert (await policies.load_text(OPEN, "", who="adam", note="")).revision == 3

@@ -130,6 +130,8 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     replaced = await again.load(Sources({"b.rv": B}), who="eve", note="")
     assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
     assert replaced.began == ["b"]
+    repeated = await again.load(Sources({"b.rv": B}), who="adam", note="")
+    assert (repeated.revision, repeated.replaced, repeated.changed, again.who) == (2, 2, [], "eve")
     restarted = desk.monitors()
     assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
     back = await restarted.reload(who="operator", prune=True)

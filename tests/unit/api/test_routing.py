@@ -1,0 +1,76 @@
+"""Bodies of REST: what is wrong with one is said whole, each field with its place."""
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+import httpx
+import msgspec
+import pytest
+from fastapi import FastAPI, Request
+from fastapi.responses import Response
+
+from appliance.api.problems import ProblemError
+from appliance.api.routing import Routes, body
+
+
+class Part(msgspec.Struct, forbid_unknown_fields=True):
+    """A part of a body."""
+
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)]
+
+
+class Wanted(msgspec.Struct, forbid_unknown_fields=True):
+    """A body."""
+
+    name: Annotated[str, msgspec.Meta(min_length=2)]
+    count: int
+    parts: list[Part] = []
+
+
+@pytest.fixture
+def app() -> FastAPI:
+    """A route that takes such a body."""
+    app, routes = FastAPI(), Routes()
+
+    @routes.post("/")
+    async def take(wanted: Annotated[Wanted, body(Wanted)]) -> Response:
+        return Response(wanted.name)
+
+    async def problem(_request: Request, error: Exception) -> Response:
+        assert isinstance(error, ProblemError)
+        return error.response()
+
+    app.include_router(routes)
+    app.add_exception_handler(ProblemError, problem)
+    return app
+
+
+def posted(app: FastAPI, sent: Any) -> httpx.Response:
+    """The answer to a body."""
+
+    async def ask() -> httpx.Response:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://x") as client:
+            return await client.post(
+                "/", content=json.dumps(sent), headers={"content-type": "application/json"}
+            )
+
+    return asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    ("sent", "places"),
+    [
+        ({"name": "x", "count": "one"}, ["body.name", "body.count"]),
+        ({"nmae": "xy"}, ["body", "body", "body"]),
+        ({"name": "xy", "count": 1, "parts": [{"port": 1}, {"port": 0}]}, ["body.parts[1].port"]),
+        ({"name": 1, "count": 1, "parts": [{"prot": 1}]}, ["body.name", "body.parts[0]"]),
+        ([], ["body"]),
+    ],
+)
+def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) -> None:
+    """With its place, in one answer; what is missing and what is unknown, too."""
+    answer = posted(app, sent)
+    assert answer.status_code == 422
+    assert [one["where"] for one in answer.json()["errors"]] == places
+    assert posted(app, {"name": "xy", "count": 1}).text == "xy"
