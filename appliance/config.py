@@ -397,6 +397,13 @@ class Settings(_Section):
         default=[],
         description="names and addresses for the certificate; other names are refused, addresses are not",
     )
+    api_notice: str = Field(
+        default="", max_length=4000, description="what the console shows before it asks for a token"
+    )
+    api_lock_seconds: Seconds = Field(
+        default=900,
+        description="without use, after which the console forgets the token and asks for it again",
+    )
     hosts: Path = Field(
         default=Path("ipsec/hosts.yaml"),
         description="the hosts that are meant to be enrolled; may be missing",

@@ -70,7 +70,7 @@ def build_app(services: Services) -> FastAPI:
         whoami,
     ):
         app.include_router(part.routes(services))
-    app.include_router(console.routes())
+    app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:

@@ -2,14 +2,16 @@
 
 Invariants:
 
-1. What is served here is part of the program and the same for everybody: it needs no token and knows no secret. What
-   the page shows it asks of `/v1`, with the token its reader brings.
+1. What is served here is part of the program, but for the notice of the site and the time after which the page locks,
+   and the same for everybody: it needs no token and knows no secret. What the page shows it asks of `/v1`, with the
+   token its reader brings.
 2. Only files that were there at start are served, by an exact name: a path never reaches the file system.
 3. Its headers let the page load and connect to nothing but this origin, run no script but these files, and let no
    string become markup (Trusted Types).
 """
 
 import hashlib
+import html
 import mimetypes
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -19,6 +21,7 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from appliance.api.problems import ProblemError
+from appliance.config import Settings
 
 VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts")
 _PREFIX = "/console/static/"
@@ -48,11 +51,14 @@ def is_console(path: str) -> bool:
     return path in ("/", "/console") or path.startswith("/console/")
 
 
-def routes() -> APIRouter:
+def routes(settings: Settings) -> APIRouter:
     """The routes; none is of the contract."""
     router = APIRouter(include_in_schema=False)
     served = _collect(files("appliance.api") / "console", "")
-    page = served["index.html"]
+    page = served["index.html"] = _stating(
+        served["index.html"],
+        {"lock-seconds": f"{settings.api_lock_seconds:g}", "notice": settings.api_notice},
+    )
 
     async def index(request: Request) -> Response:
         """The page; which view it shows is said by its address."""
@@ -89,11 +95,23 @@ def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
         if entry.is_dir():
             found |= _collect(entry, f"{prefix}{entry.name}/")
             continue
-        body = entry.read_bytes()
-        found[prefix + entry.name] = _File(
-            body, _media_type(entry.name), f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-        )
+        found[prefix + entry.name] = _file(entry.read_bytes(), _media_type(entry.name))
     return found
+
+
+def _stating(page: _File, said: dict[str, str]) -> _File:
+    """The page with what the site has it say and do, in its `meta` elements."""
+    body = page.body.decode()
+    for name, text in said.items():
+        empty = f'<meta name="rosrv:{name}" content="'
+        before, found, after = body.partition(empty)
+        assert found, name  # noqa: S101  the page has a place for each
+        body = f"{before}{found}{html.escape(text)}{after}"
+    return _file(body.encode(), page.media_type)
+
+
+def _file(body: bytes, media_type: str) -> _File:
+    return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
 
 
 def _media_type(name: str) -> str:

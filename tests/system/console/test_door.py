@@ -74,6 +74,71 @@ def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Ca
     expect(reader.page.get_by_role("status").filter(has_text="Signed out")).to_contain_text("rosrv token add")
 
 
+def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """The token is forgotten, nothing is shown or asked, no key opens it; the same token finds all as it was."""
+    reader = opened()
+    reader.page.clock.install()
+    page = reader.go("policy")
+    reader.write("[Nodes]\n# not finished")
+    page.get_by_role("button", name="Load", exact=True).click()
+    page.get_by_role("dialog").get_by_label("Comment").fill("ticket 812")
+    page.clock.fast_forward("14:00")
+    page.mouse.move(10, 10)
+    page.clock.fast_forward("14:00")
+    expect(page.get_by_label("Comment")).to_be_visible()
+    page.clock.fast_forward("15:00")
+    expect(page.get_by_role("status").filter(has_text="Locked")).to_contain_text(
+        "first was doing is still here"
+    )
+    expect(page.get_by_label("Comment")).to_be_hidden()
+    expect(reader.editor()).to_be_hidden()
+    assert page.evaluate("sessionStorage.getItem('rosrv.token')") is None
+    assert reader.axe() == []
+    before = len(reader.asked)
+    for key in ("Escape", "Escape", "4"):
+        page.keyboard.press(key)
+    page.clock.fast_forward("10:00")
+    expect(page.get_by_label("Access token")).to_be_visible()
+    assert reader.asked[before:] == []
+    page.get_by_label("Access token").fill(str(appliance.ready["token"]))
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_label("Comment")).to_have_value("ticket 812")
+    page.keyboard.press("Escape")
+    expect(reader.editor()).to_contain_text("# not finished")
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+
+
+def test_a_tab_that_is_loaded_anew_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:
+    """A browser may put a tab away: the time in which nobody used it counts."""
+    reader = opened()
+    page = reader.go("now")
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+    assert page.evaluate("sessionStorage.getItem('rosrv.used')") is not None
+    page.evaluate("sessionStorage.setItem('rosrv.used', String(Date.now() - 16 * 60000))")
+    page.reload()
+    expect(page.get_by_label("Access token")).to_be_visible()
+    assert page.evaluate("sessionStorage.getItem('rosrv.token')") is None
+
+
+def test_a_locked_page_is_nobody_elses(
+    appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
+) -> None:
+    """Whoever comes with another token begins anew: what the first one wrote is gone."""
+    reader = opened()
+    reader.page.clock.install()
+    page = reader.go("policy")
+    reader.write("[Nodes]\n# not finished")
+    page.clock.fast_forward("15:00")
+    page.get_by_label("Access token").fill(token("operator", "colleague"))
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.locator(".who-name")).to_have_text("colleague")
+    expect(reader.editor()).to_contain_text("/operator = 10.9.9.9")
+    expect(reader.editor()).not_to_contain_text("# not finished")
+    assert appliance.rest().get("/v1/policy").json["revision"] == 1
+
+
 def test_what_a_viewer_may_not_do_is_said_and_not_done(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:

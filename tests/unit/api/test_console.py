@@ -13,6 +13,7 @@ from fastapi import FastAPI
 import appliance.api
 from appliance.api.console import VIEWS, is_console, routes
 from appliance.api.problems import ProblemError
+from appliance.config import Settings
 
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
@@ -27,9 +28,9 @@ NAMESPACES = re.compile(
 class Client:
     """Asks the console's routes alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Settings) -> None:
         app = FastAPI(exception_handlers={ProblemError: lambda _request, error: error.response()})
-        app.include_router(routes())
+        app.include_router(routes(settings))
         self._transport = httpx.ASGITransport(app)
 
     def get(self, path: str, headers: dict[str, str] | None = None) -> httpx.Response:
@@ -45,14 +46,25 @@ class Client:
 @pytest.fixture
 def client() -> Client:
     """A client."""
-    return Client()
+    return Client(Settings())
 
 
 def test_the_page_is_served_at_every_view(client: Client) -> None:
     """`/`, `/console` and each view, deeper addresses too, are the page; what is no view is nothing."""
     paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
-    assert {client.get(path).text for path in paths} == {(FILES / "index.html").read_text()}
+    page = (
+        (FILES / "index.html").read_text().replace('lock-seconds" content=""', 'lock-seconds" content="900"')
+    )
+    assert {client.get(path).text for path in paths} == {page}
     assert client.get("/console/elsewhere").status_code == 404
+
+
+def test_the_page_says_what_the_site_configured() -> None:
+    """The notice is text, whatever stands in it; another notice is another page for a browser that knows one."""
+    told = Client(Settings(api_notice='<b>"Staff" only</b>\n&', api_lock_seconds=60)).get("/console")
+    assert 'name="rosrv:lock-seconds" content="60"' in told.text
+    assert 'name="rosrv:notice" content="&lt;b&gt;&quot;Staff&quot; only&lt;/b&gt;\n&amp;"' in told.text
+    assert told.headers["etag"] != Client(Settings()).get("/console").headers["etag"]
 
 
 def test_the_headers_close_the_page(client: Client) -> None:

@@ -1,6 +1,6 @@
 /** The console: the door, or the shell with the view that the address names. */
 
-import { Door } from "./door.js";
+import { Door, Lock } from "./door.js";
 import { html, useEffect } from "./html.js";
 import { retry, start, stop, live } from "./live.js";
 import { Nav } from "./nav.js";
@@ -22,8 +22,9 @@ import { NotLive } from "./standing.js";
 const SHOWN = { now: Now, graph: GraphView, audit: Audit, policy: PolicyView, monitors: Monitors, hosts: Hosts };
 
 export function App() {
-  const { current } = useStore(session);
-  return current ? html`<${Shell} key=${current.token} />` : html`<${Door} />`;
+  const { current, locked, number } = useStore(session);
+  return html`${!current && (locked ? html`<${Lock} key="lock" />` : html`<${Door} key="door" />`)}
+    ${(current || locked) && html`<div key=${number} hidden=${!current}><${Shell} /></div>`}`;
 }
 
 function Shell() {

@@ -5,6 +5,7 @@
 
 import { Problem } from "./problem.js";
 import { send } from "./rest.js";
+import { session } from "./session.js";
 
 const SILENCE = 40_000; // the appliance says something every 15 s at least
 const FIRST_PAUSE = 1000;
@@ -69,9 +70,12 @@ export function follow(path, heard, stands, last = null) {
     }
   }
 
+  const leave = session.subscribe(() => {
+    if (session.get().locked) running.abort(); // the next try waits until somebody is there again
+  });
   run();
   return {
-    stop: () => ((stopped = true), running.abort(), wake()),
+    stop: () => ((stopped = true), leave(), running.abort(), wake()),
     retry: () => ((pause = FIRST_PAUSE), wake()),
   };
 }

@@ -8,6 +8,6 @@ import { kept, session } from "./session.js";
 const token = kept();
 if (token) {
   session.update({ checking: true });
-  enter(token, true).catch((error) => session.set({ current: null, ended: error.message, checking: false }));
+  enter(token, true).catch((error) => session.update({ ended: error.message, checking: false }));
 }
 render(html`<${App} />`, /** @type {Element} */ (document.getElementById("console")));

@@ -2,7 +2,7 @@
 
 import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
-import { end, session } from "./session.js";
+import { end, session, unlocked } from "./session.js";
 
 /**
  * @typedef {{query?: Record<string, any>, json?: any, text?: string, match?: string, token?: string,
@@ -14,6 +14,7 @@ import { end, session } from "./session.js";
  * @param {string} method @param {string} path @param {Options} [options]
  */
 export async function send(method, path, { query, json, text, match, token, headers = {}, signal } = {}) {
+  if (!token) await unlocked();
   const holder = token ?? session.get().current?.token;
   const at = new URL(path + queryText(query), location.origin);
   const body = json !== undefined ? JSON.stringify(json) : text;

@@ -17,7 +17,8 @@ export const draft = createStore({
 });
 
 session.subscribe(() => {
-  if (!session.get().current) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], report: null, tested: null });
+  const { current, locked } = session.get();
+  if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], report: null, tested: null });
 });
 
 /** Ask for the policy in force. A text that was changed here stays, and keeps what it was begun from. */

@@ -1,28 +1,43 @@
-"""Where the site signs: the console takes a policy and a specification with the signature that is pasted beside it."""
+"""What a site has of its own: a notice at the door, and signatures without which nothing is loaded."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from tests.support.appliance import Appliance
 from tests.support.site_key import LINE, signed
 from tests.system.console.conftest import CONFIG, POLICY
 from tests.system.console.reader import Reader
 
+NOTICE = 'For staff of "Example" only.\nWhat you do is <b>recorded</b>.'
 SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
 
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance with a key of the site."""
+    """An appliance with a key of the site, and its notice."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
-    config.write_text(f"{CONFIG}site_keys: [{LINE}]\n")
+    config.write_text(f"{CONFIG}site_keys: [{LINE}]\napi_notice: {json.dumps(NOTICE)}\n")
     running = Appliance(policy=POLICY, options=("--config", str(config)))
     Path(f"{running.policy_file}.sig").write_text(signed(POLICY))
     with running:
         yield running
+
+
+def test_the_notice_of_the_site_is_shown_before_a_token_is_given(
+    browser: Browser, appliance: Appliance
+) -> None:
+    """As it was written, line by line; what looks like markup is text."""
+    with Reader(browser, str(appliance.ready["api"])) as reader:
+        reader.page.goto(reader.url)
+        notice = reader.page.get_by_role("note", name="Notice of the site")
+        expect(notice).to_be_visible()
+        assert notice.inner_text() == NOTICE
+        expect(reader.page.get_by_label("Access token")).to_be_visible()
+        assert reader.axe() == []
 
 
 def test_a_policy_is_loaded_with_its_signature_only(
