@@ -1,4 +1,4 @@
-"""`rosrv backup` and `rosrv restore`: the state directory in one file, and back."""
+"""`rosrv backup`, `restore` and `purge`: the state directory in one file, and back; and its end."""
 
 import json
 import sys
@@ -10,6 +10,7 @@ import typer
 from appliance.audit.output import printable
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
+from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
 from appliance.cli.running import DEFAULT_STATE, State
 
@@ -62,6 +63,39 @@ def restore(
         return
     place = printable(str(state))
     sys.stdout.write(f"{place}: {len(names)} files; prove the log: rosrv audit verify --state {place}\n")
+
+
+def purge(
+    state: State = DEFAULT_STATE,
+    confirm: Annotated[
+        str | None,
+        typer.Option(metavar="DIR", help="The state directory once more, for scripts; else it is asked for"),
+    ] = None,
+    as_json: _Json = False,
+) -> None:
+    """Remove a state directory for good: audit log, policies, keys of the appliance and of its hosts. It must not run.
+
+    Keys and other small files are written over first; what the disk itself keeps of them is not reached.
+
+    Example: rosrv purge --state /var/lib/rosrv
+    """
+    if confirm is None:
+        text = (
+            f"Everything in {printable(str(state))} is lost for good. Write the path once more to remove it"
+        )
+        confirm = str(typer.prompt(text, err=True))
+    if Path(confirm).absolute() != state.absolute():
+        _fail(f"{confirm} is not {state}: nothing was removed")
+    try:
+        files, written = remove(state)
+    except BackupError as error:
+        _fail(str(error))
+    if as_json:
+        sys.stdout.write(json.dumps({"state": str(state), "files": files, "written_over": written}) + "\n")
+    else:
+        sys.stdout.write(
+            f"{printable(str(state))} is gone: {files} files, {written} of them written over first\n"
+        )
 
 
 def _fail(text: str) -> NoReturn:

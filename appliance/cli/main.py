@@ -136,6 +136,11 @@ VERBS: dict[str, Verb | Group] = {
         "appliance.cli.backup:restore",
         "Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.",
     ),
+    "purge": Verb(
+        "appliance.cli.backup:purge",
+        "Remove a state directory for good: audit log, policies, keys of the appliance and of its hosts. It must not"
+        " run.",
+    ),
     "token": Verb("appliance.cli.token:app", "Make, list and revoke access tokens for REST."),
 }
 

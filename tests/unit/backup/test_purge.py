@@ -1,0 +1,75 @@
+"""The end of a state directory: all of it goes, and nothing beside it; not while an appliance uses it."""
+
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from appliance.backup.contents import BackupError
+from appliance.backup.purge import purge
+from appliance.cli.main import app
+from appliance.supervisor.state import StateDirectory
+
+KEY = b"-----BEGIN PRIVATE KEY-----"
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """A state directory with a key, a log, a link to a file that is not its own, and a second name of that."""
+    place = tmp_path / "state"
+    StateDirectory(place).close()
+    (place / "signer").mkdir()
+    (place / "signer" / "audit.key").write_bytes(KEY)
+    (place / "control").mkdir()
+    (place / "control" / "audit.db").write_bytes(b"x" * (1 << 20))
+    outside = tmp_path / "mine"
+    outside.write_bytes(KEY)
+    (place / "control" / "link").symlink_to(outside)
+    os.link(outside, place / "control" / "second")
+    return place
+
+
+def test_all_of_it_goes_and_nothing_else(state: Path, tmp_path: Path) -> None:
+    """A key that somebody has open already reads as noise; what only has a name here stays as it is elsewhere."""
+    with (state / "signer" / "audit.key").open("rb") as still:
+        files, written = purge(state)
+        kept = still.read()
+    assert kept != KEY
+    assert len(kept) == len(KEY)
+    assert (files, written) == (5, 2)  # with the lock
+    assert not state.exists()
+    assert (tmp_path / "mine").read_bytes() == KEY
+
+
+def test_not_while_an_appliance_uses_it(state: Path) -> None:
+    """Nothing is touched then, and its process is named."""
+    held = StateDirectory(state)
+    try:
+        with pytest.raises(BackupError, match=f"uses the state directory .* already .process {os.getpid()}"):
+            purge(state)
+    finally:
+        held.close()
+    assert (state / "signer" / "audit.key").read_bytes() == KEY
+
+
+def test_only_a_state_directory(tmp_path: Path) -> None:
+    """Not a folder with something else in it, not an empty one, not one that is not there."""
+    (tmp_path / "home").mkdir()
+    for place, why in ((tmp_path / "home", "empty"), (tmp_path / "nothing", "there is no state directory")):
+        with pytest.raises(BackupError, match=why):
+            purge(place)
+    (tmp_path / "home" / "letter").write_text("dear")
+    with pytest.raises(BackupError, match="is no state directory of an appliance"):
+        purge(tmp_path / "home")
+    assert (tmp_path / "home" / "letter").exists()
+
+
+def test_the_command_wants_the_path_once_more(state: Path) -> None:
+    """From a script by --confirm, else it is asked; another path removes nothing."""
+    run = CliRunner().invoke
+    refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
+    assert (refused.exit_code, "nothing was removed" in refused.output) == (1, True)
+    done = run(app, ["purge", "--state", str(state)], input=f"{state}\n")
+    assert (done.exit_code, "is gone: 5 files" in done.output) == (0, True)
+    assert not state.exists()
