@@ -7,6 +7,7 @@ import typer
 
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.tokens import TokenRole
+from appliance.cli import completion
 from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
@@ -64,7 +65,12 @@ def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
 @speaks
 def revoke(
     appliance: Appliance,
-    name: Annotated[str, typer.Argument(help="The name it was made with", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="The name it was made with", show_default=False, autocompletion=completion.tokens
+        ),
+    ],
     as_json: Json = False,
 ) -> None:
     """End a token now; exit status 1 when there is none of this name.

@@ -12,6 +12,7 @@ import setproctitle
 import structlog
 import typer
 
+from appliance.cli import completion
 from appliance.cli.up_inputs import read_inputs
 from appliance.config import Settings
 from appliance.config_sources import resolve
@@ -47,7 +48,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         str | None, typer.Option(help="HOST:PORT where nodes find their master; port 0: any")
     ] = None,
     rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROSMaster; 0: any")] = None,
-    isolation: Annotated[str | None, typer.Option(help="container, netns or none")] = None,
+    isolation: Annotated[
+        str | None, typer.Option(help="container, netns or none", autocompletion=completion.isolations)
+    ] = None,
     relay: Annotated[
         str | None, typer.Option(help="all, or monitored: only what [Monitor] or a specification names")
     ] = None,

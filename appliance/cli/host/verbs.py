@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from appliance.api.kits import Wishes
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.channel.answers.hosts import Host, PortsSeen
+from appliance.cli import completion
 from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
 from appliance.cli.output import Json, moment, say, say_json
@@ -17,7 +18,12 @@ from appliance.cli.spans import span_given
 
 app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
 
-_Name = Annotated[str, typer.Argument(help="The host's name: `host:NAME` in the policy", show_default=False)]
+_Name = Annotated[
+    str,
+    typer.Argument(
+        help="The host's name: `host:NAME` in the policy", show_default=False, autocompletion=completion.hosts
+    ),
+]
 _Endpoint = Annotated[
     str | None,
     typer.Option(

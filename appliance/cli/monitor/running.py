@@ -13,13 +13,16 @@ from rich.table import Column, Table
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced
+from appliance.cli import completion
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
 _WIDE = 200  # columns where nobody looks at them through a window
 
-_Names = Annotated[list[str], typer.Argument(metavar="MONITOR…", show_default=False)]
+_Names = Annotated[
+    list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
+]
 
 
 @speaks

@@ -1,0 +1,47 @@
+"""What the shell completes: names that the running appliance knows, where its admin socket can be asked; else nothing.
+
+Whoever presses Tab is told no errors: an appliance that does not run, or is not his, has no names to offer.
+"""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import typer
+
+from appliance.channel import admin
+from appliance.channel.admin import A, AdminRequest
+from appliance.cli.admin_socket import AdminSocket, NotRunningError
+
+Complete = Callable[[typer.Context, str], list[str]]
+_ISOLATIONS = {
+    "netns": "a network namespace of its own on this host",
+    "container": "it is in a container, which is its namespace",
+    "none": "no namespace and no firewall: for development",
+}
+
+
+def isolations(incomplete: str) -> list[tuple[str, str]]:
+    """Where the appliance may live, each with what it is."""
+    return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
+
+
+def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Complete:
+    """Completes names in the answer to a question."""
+
+    def complete(context: typer.Context, incomplete: str) -> list[str]:
+        state = context.params.get("state") or "/var/lib/rosrv"
+        try:
+            answer = AdminSocket(Path(state)).ask(request)
+        except (NotRunningError, OSError):
+            return []
+        said = context.params.get("names") or ()
+        names = of(answer.given()) if answer.ok else ()
+        return sorted(name for name in names if name.startswith(incomplete) and name not in said)
+
+    return complete
+
+
+monitors = _names(admin.MonitorsWanted(), lambda body: [row.name for row in body.monitors])
+hosts = _names(admin.HostList(), lambda body: [row.name for row in body.hosts])
+tokens = _names(admin.TokenList(), lambda body: [row.name for row in body.tokens])
+topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topics])

@@ -1,0 +1,51 @@
+"""What the shell completes: names of the running appliance; nothing, and no error, where there is none."""
+
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import ROSRV, Appliance
+
+WORDS = "words() {\n    event said() /chatter std_msgs/String '{}' { }\n}\n"
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """An appliance with a monitor and two tokens."""
+    with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)  # the appliance's users may read it
+        (folder / "words.rv").write_text(WORDS)
+        with Appliance(options=("--monitors", name, "--api", "127.0.0.1:0")) as appliance:
+            appliance.rosrv("token", "add", "olga", "--role", "viewer")
+            yield appliance
+
+
+def completed(words: str, state: str) -> list[str]:
+    """What bash is told for these words, the last of which is being written."""
+    place = len(words.split(" ")) - 1
+    environment = {
+        **os.environ, "_ROSRV_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place),
+        "ROSRV_STATE": state,
+    }  # fmt: skip
+    done = subprocess.run([ROSRV], env=environment, capture_output=True, text=True, timeout=30, check=False)
+    assert not done.stderr
+    return done.stdout.split()
+
+
+def test_names_of_the_running_appliance(appliance: Appliance) -> None:
+    """Monitors and tokens by what is written of them; one that is given already is not offered again."""
+    state = str(appliance.state)
+    assert completed("rosrv monitor disable wo", state) == ["words"]
+    assert completed("rosrv monitor disable x", state) == []
+    assert "olga" in completed("rosrv token revoke ", state)
+    assert completed("rosrv up --isolation n", state) == ["netns", "none"]
+
+
+def test_nothing_where_no_appliance_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """No names, no error in the middle of a line."""
+    assert completed("rosrv monitor disable ", str(tmp_path_factory.mktemp("nobody"))) == []
