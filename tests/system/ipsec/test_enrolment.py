@@ -4,6 +4,7 @@ The laptop is a network namespace with its own /etc and /run, without systemd; s
 Debian's. REST is reached before the tunnel from the management network.
 """
 
+import contextlib
 import datetime
 import json
 import os
@@ -346,6 +347,17 @@ def seconds_of(record: dict[str, Any]) -> float:
     return datetime.datetime.fromisoformat(str(record["time"])[:26] + "+00:00").timestamp()
 
 
+@contextlib.contextmanager
+def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
+    """These shell commands on the laptop, again and again, whatever they say."""
+    loop = laptop.popen(["sh", "-c", f"while :; do {commands}; done >/dev/null 2>&1"], start_new_session=True)
+    try:
+        yield
+    finally:
+        os.killpg(loop.pid, signal.SIGKILL)
+        loop.wait()
+
+
 def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
     """While keys are made anew without pause, by the host's own will: within a second it is out, and stays out."""
     script = tmp_path / "join.sh"
@@ -358,28 +370,26 @@ def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost,
         talker = on_laptop.talker("rospy", "/orders", "--rate", "50", name="boss")
         listener = on_robot.listener("rospy", "/orders", name="arm")
         listener.wait_for(event="received")
-        rekey = (
-            "while :; do swanctl --rekey --ike rosrv; swanctl --rekey --child ros;"
-            " swanctl --initiate --child ros --timeout 2; done >/dev/null 2>&1"
-        )
-        rekeying = laptop.popen(["sh", "-c", rekey], start_new_session=True)
+        rekey = "swanctl --rekey --ike rosrv; swanctl --rekey --child ros"
         try:
-            listener.wait_for(event="received", since=len(listener.events) + 20)
-            mark = site.mark
-            site.appliance.rosrv("host", "revoke", "other")
-            revoked = site.recorded(mark, event="host revoked")
-            closed = site.recorded(mark, event="connection closed")
-            down = site.recorded(mark, event="tunnel down")
-            assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < 1.0
-            heard = len(listener.seen(event="received"))
-            # It goes on trying. The first count may have begun before, with another host of this machine.
-            site.recorded(mark, event="denials folded", host=OCU)
-            site.recorded(site.mark, event="denials folded", host=OCU)
+            with endless(laptop, f"{rekey}; swanctl --initiate --child ros --timeout 2"):
+                listener.wait_for(event="received", since=len(listener.events) + 20)
+                mark = site.mark
+                site.appliance.rosrv("host", "revoke", "other")
+                revoked = site.recorded(mark, event="host revoked")
+                closed = site.recorded(mark, event="connection closed")
+                down = site.recorded(mark, event="tunnel down")
+                assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < 1.0
+                heard = len(listener.seen(event="received"))
+            # It goes on trying, each time from nothing: what it had begun before may wait for its answer for minutes.
+            anew = "swanctl --terminate --ike rosrv --force; swanctl --initiate --child ros --timeout 2"
+            with endless(laptop, anew):
+                # The first count may have begun before, with another host of this machine.
+                site.recorded(mark, event="denials folded", host=OCU)
+                site.recorded(site.mark, event="denials folded", host=OCU)
             assert len(listener.seen(event="received")) == heard
             assert row(site, "other")["state"] == "revoked"
             assert row(site, "other")["remote"] is None
         finally:
-            os.killpg(rekeying.pid, signal.SIGKILL)
-            rekeying.wait()
             talker.kill()  # it cannot say good-bye to anybody
     laptop.run("/etc/rosrv/leave.sh")
