@@ -2,7 +2,8 @@
 
 Lone surrogates (undecodable bytes), integers beyond 64 bits and objects that are no data cannot be stored in
 SQLite or JSON: they become their escaped or printed form. A record is bounded: texts past `LONGEST_TEXT`
-characters are cut and say how long they were; details past `LARGEST_DETAIL` bytes keep their first parts.
+characters are cut and say how long they were; of details past `LARGEST_DETAIL` bytes the smallest are kept, and the
+names of the others.
 """
 
 from typing import Any
@@ -16,6 +17,7 @@ LARGEST_DETAIL = 65_536
 LONGEST_TEXT = 4_096
 _DEEPEST = 16
 _MOST_ITEMS = 256
+_MOST_KEYS = 128
 _LARGEST_INTEGER = (1 << 63) - 1
 _NONE = type(None)
 _KINDS: tuple[tuple[type, ...], ...] = (
@@ -90,7 +92,7 @@ def plain_record(record: Record) -> Record:
     if not isinstance(detail, dict):
         detail = {"value": detail}
     if len(_encoder.encode(detail)) > LARGEST_DETAIL:
-        detail = {"cut": "the details were too large to keep", "keys": [key[:64] for key in detail]}
+        detail = _shortened(detail)
     return Record(
         id=_text(record.id), time=_integer(record.time) or 0, event=_text(record.event),
         severity=record.severity if isinstance(record.severity, Severity) else Severity.NOTICE,
@@ -100,6 +102,18 @@ def plain_record(record: Record) -> Record:
         reason=_text(record.reason), duration_us=_integer(record.duration_us), detail=detail,
         stranger=record.stranger, folds=record.folds,
     )  # fmt: skip
+
+
+def _shortened(detail: dict[str, Any]) -> dict[str, Any]:
+    """The smallest details, and the names of those that are left out."""
+    sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
+    kept, room = {}, LARGEST_DETAIL // 4
+    for key in sorted(sizes, key=sizes.__getitem__):
+        room -= sizes[key]
+        if room >= 0:
+            kept[key] = detail[key]
+    left_out = [key[:64] for key in detail if key not in kept]
+    return {**kept, "cut": "the details were too large to keep", "keys": left_out[:_MOST_KEYS]}
 
 
 def _optional(value: object) -> str | None:

@@ -13,7 +13,7 @@ EVENTS: dict[str, str] = {
     "node returned": "A lost node answers again.",
     "replaced": "A node registered again under its name from the same host: the one before was told to shut down.",
     "takeover": "A node registered under a name that another host holds.",
-    "policy loaded": "A policy came into force; `detail` has who, from where and what changed.",
+    "policy loaded": "A policy came into force; `detail` has who, from where, and the hash of its text.",
     "policy confirmed": "A policy that was loaded on trial was confirmed and stays in force.",
     "policy refused": "A new policy has errors and was refused whole; the last good one stays in force.",
     "host enrolled": "A host got a certificate and its virtual address; `detail` has both and who asked.",
@@ -34,7 +34,8 @@ EVENTS: dict[str, str] = {
     "tunnel refused": "Somebody asked for a tunnel and was refused; `host` is the real address, `reason` says why.",
     "packets refused": "Packets of tunnels were dropped: sent again, or under another's address (user-space ESP only).",
     "specifications confirmed": "Specifications that were loaded on trial were confirmed and stay in force.",
-    "specifications loaded": "Specifications of monitors came into force; `detail` has who, and which files changed.",
+    "specifications loaded": "Specifications of monitors came into force; `detail` has who, which files changed, and"
+    " the hash of all of them.",
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",
     "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who.",

@@ -15,10 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from appliance.audit.chain import parse_checkpoint
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.record import Record, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.signatures import Signatures
+from appliance.audit.waiters import Waiter, answer
 from appliance.audit.writer import ChainWriter
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
@@ -76,6 +78,8 @@ class Housekeeping:
         self.writer: ChainWriter | None = None
         self.unsealed = 0  # records after the last checkpoint
         self._failing: str | None = None
+        self._waiting: list[Waiter] = []  # until what is written now is sealed
+        self._sealed: list[tuple[int, Waiter]] = []  # until the checkpoint with this number is signed
 
     @property
     def degraded(self) -> str | None:
@@ -113,6 +117,8 @@ class Housekeeping:
         """Seal if it is time to, and let the index not fall too far behind: what it lacks every search has to read."""
         if written and self._seal_is_due():
             self.attempt(self.seal)
+        if written and self._waiting:
+            self.attempt(self._answer_sealed)
         self.attempt(self._index_backlog)
 
     def at_rest(self, *, quiet_since: float, busy: Callable[[], bool]) -> None:
@@ -130,8 +136,26 @@ class Housekeeping:
     def _seal_is_due(self) -> bool:
         waited = time.monotonic() - self._at.sealed
         return self.unsealed >= self._checkpoints.records or (
-            self.unsealed > 0 and waited >= self._checkpoints.seconds
+            self.unsealed > 0 and (waited >= self._checkpoints.seconds or bool(self._waiting))
         )
+
+    def seal_now(self, waiter: Waiter) -> None:
+        """Seal with the next batch; the waiter is answered when that is signed."""
+        self._waiting = [one for one in self._waiting if not one.future.done()] + [waiter]
+
+    def _answer_sealed(self) -> None:
+        """What was to be sealed now is: its waiters wait for the signature, if it is not there yet."""
+        if self.writer is None or self.unsealed:
+            return
+        number = self.writer.checkpoint_number
+        self._sealed += [(number, waiter) for waiter in self._waiting]
+        self._waiting = []
+        if (newest := self.writer.newest_signed()) and parse_checkpoint(newest).number >= number:
+            self._answer(lambda awaited: awaited <= number, None)
+
+    def _answer(self, which: Callable[[int], bool], result: str | None) -> None:
+        answer([waiter for number, waiter in self._sealed if which(number)], result)
+        self._sealed = [(number, waiter) for number, waiter in self._sealed if not which(number)]
 
     def seal(self) -> None:
         """Make a checkpoint over everything written, record it, and have it signed."""
@@ -163,10 +187,13 @@ class Housekeeping:
         refusal = self._signatures.keep(self.writer, number, signature, public_key)
         if refusal is not None:
             self.refused(number, refusal)
+        else:
+            self._answer(lambda awaited: awaited <= number, None)
 
     def refused(self, number: int, reason: str) -> None:
         """A checkpoint was not signed, or wrongly."""
         self._hold(self._make("signature refused", Severity.ALARM, reason, {"number": number}))
+        self._answer(lambda awaited: awaited >= number, reason)
 
     # --- index and retention ----------------------------------------------------------------------------------
 

@@ -155,6 +155,14 @@ class AuditLog:
             self._hurry.set()
         return await future
 
+    async def wait_signed(self) -> str | None:
+        """Wait until a signed checkpoint, made now, seals all that was recorded; the reason when it is refused."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str | None] = loop.create_future()
+        self._put(partial(self._house.seal_now, Waiter(loop, future)))
+        self._hurry.set()
+        return await future
+
     @property
     def failed(self) -> str | None:
         """Why the log cannot be written now; None when it can."""

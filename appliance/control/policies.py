@@ -14,6 +14,7 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
+from appliance.fingerprints import fingerprint
 from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
 from appliance.policy.model import Address
@@ -283,6 +284,7 @@ class Policies:
             severity=Severity.NOTICE,
             who=by or who,
             file=policy.file,
+            sha256=fingerprint(policy.text),
             signed_by=signer(self._site_keys, policy.text, signature),
             revoked=revoked,
             warnings=[str(warning) for warning in policy.warnings][:100],

@@ -81,14 +81,15 @@ class Sources(msgspec.Struct, frozen=True):
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
         """The names of files that these add, change and remove; definitions as `msg/package/Type.msg`."""
-        old, new = before._all(), self._all()
+        old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
             [name for name in new if name in old and old[name] != new[name]],
             [name for name in old if name not in new],
         )
 
-    def _all(self) -> dict[str, str]:
+    def named(self) -> dict[str, str]:
+        """All texts by their names below the folder: those of definitions begin with `msg/`."""
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 

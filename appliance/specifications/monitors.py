@@ -31,6 +31,7 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
+from appliance.fingerprints import fingerprint_of_all
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import (
     Checked,
@@ -522,6 +523,7 @@ class Monitors:
             resource="",
             who=by or who,
             revision_of_specifications=row.revision,
+            sha256=fingerprint_of_all(sources.named()),
             monitors=list(checked.monitors),
             added=added,
             changed=changed,

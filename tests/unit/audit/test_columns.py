@@ -65,3 +65,20 @@ def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
     assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
     assert abs(columns.time) < 1 << 63
     assert from_columns(columns).id == "0" * 20
+
+
+def test_of_details_too_large_the_small_ones_stay() -> None:
+    """A load of many files says its revision and hash though their names do not fit, and names what is left out."""
+    names = [f"monitor_{number}" * 20 for number in range(1000)]
+    detail = {
+        "sha256": "a" * 64,
+        "monitors": names,
+        "revision": 7,
+        **{f"key{n}": "é" * 300 for n in range(250)},
+    }
+    columns = to_columns(make(detail=detail), 1)
+    kept = from_columns(columns).detail
+    assert len(columns.detail) <= LARGEST_DETAIL
+    assert (kept["sha256"], kept["revision"]) == ("a" * 64, 7)
+    assert "monitors" in kept["keys"]
+    assert kept["cut"] == "the details were too large to keep"

@@ -363,3 +363,41 @@ def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
     counted = sum(one.detail["count"] for one in denials if one.event == "denials folded")
     assert counted + sum(one.event == "decision" for one in denials) == 51
     assert verify(path).ok
+
+
+def signed_now(log: AuditLog) -> str | None:
+    """Wait until what was recorded is sealed and signed; the reason if it is not."""
+    return asyncio.run(asyncio.wait_for(log.wait_signed(), _LIMIT_SECONDS))
+
+
+def test_who_needs_a_signature_gets_it_now(make_log: MakeLog, path: Path) -> None:
+    """Checkpoints are an hour apart; who waits has one at once, over all that was recorded, and no second."""
+    log = make_log(checkpoint_seconds=3600)
+    for number in range(5):
+        log.record(decision(log, number))
+    assert signed_now(log) is None
+    sealed = verify(path)
+    assert (sealed.ok, sealed.unsealed) == (True, 1)  # the record of the checkpoint itself
+    before = events(path)["checkpoint"]
+    assert signed_now(log) is None
+    assert events(path)["checkpoint"] == before
+    log.record(decision(log))
+    assert signed_now(log) is None
+    assert events(path)["checkpoint"] == before + 1
+
+
+def test_who_waits_for_a_signature_that_is_refused_is_told(make_log: MakeLog) -> None:
+    """The signer's words are the answer; one that never answers leaves the waiting to who waits."""
+    asked: list[int] = []
+    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
+    log.record(decision(log))
+
+    async def refused() -> str | None:
+        waiting = asyncio.create_task(log.wait_signed())
+        while not asked:
+            await asyncio.sleep(0.01)
+        assert not waiting.done()
+        log.refused(asked[-1], "it does not follow")
+        return await waiting
+
+    assert asyncio.run(asyncio.wait_for(refused(), _LIMIT_SECONDS)) == "it does not follow"

@@ -1,6 +1,7 @@
 """The specifications in force: revisions, switches, what the relay is told and what it says."""
 
 import asyncio
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -139,6 +140,13 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
     assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
     assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
+    (desk.folder / "b.rv").write_text(B)
+    lines = [
+        f"{hashlib.sha256((desk.folder / name).read_bytes()).hexdigest()}  {name}\n"
+        for name in ("a.rv", "b.rv")
+    ]
+    of_all = [hashlib.sha256("".join(some).encode()).hexdigest() for some in (lines[:1], lines, lines[:1])]
+    assert [fields["sha256"] for fields in loaded] == of_all, "what sha256sum makes of the files"
 
 
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
