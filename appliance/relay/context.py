@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.memory import Memory
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
@@ -17,5 +18,5 @@ class RelayContext:
     limits: Limits
     reporter: Reporter
     memory: Memory
-    scratch: memoryview
+    scratch: Scratch
     middle: Middle

@@ -21,7 +21,7 @@ from appliance.relay.connections.admission import NOTHING, asked_for, bound_name
 from appliance.relay.connections.anteroom import Anteroom
 from appliance.relay.connections.client import ServiceClient, ServiceTraffic
 from appliance.relay.connections.flow import Flows
-from appliance.relay.connections.frames import SCRATCH
+from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.links import Link
 from appliance.relay.connections.memory import Memory
@@ -50,7 +50,6 @@ class Engine:
         self._loop = loop
         self._limits = limits
         self._reporter = Reporter(limits)
-        scratch = memoryview(bytearray(SCRATCH))
         self._middle = Middle(
             loop,
             self._reporter,
@@ -59,7 +58,7 @@ class Engine:
         )
         self._table = StatedTable()
         self._memory = Memory.of(limits, self._table.standing)
-        self._context = RelayContext(loop, limits, self._reporter, self._memory, scratch, self._middle)
+        self._context = RelayContext(loop, limits, self._reporter, self._memory, Scratch(), self._middle)
         self._anteroom = Anteroom(loop.clock, self._table.standing, self._memory.headers)
         self._ports = Ports(
             loop,
@@ -268,6 +267,8 @@ class Engine:
         relayed.monitor(through, wanted=middle.wants(topic))
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
+        monitors = self._middle.monitors
+        self._context.scratch.move(None if monitors is None else monitors.area)
         for relayed, publisher in list(self._topics.values()):
             publisher.judge_again()
             if isinstance(publisher, Publisher):

@@ -35,7 +35,7 @@ from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
-from appliance.rosmop.walking import Walker, walkers
+from appliance.rosmop.walking import Walker, Walks, walks_of
 
 OnFault = Literal["drop", "pass"]
 Patience = Callable[[], Callable[[], bool]]
@@ -74,7 +74,7 @@ class MonitorSet:
         self._due: int | None = None
         self.began: tuple[str, ...] = ()
         self._timed = False
-        self._walkers: Mapping[str, Walker] = {}
+        self._walks = Walks()
         self._broken = False
         self._index()
 
@@ -177,7 +177,12 @@ class MonitorSet:
 
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
-        self._walkers = walkers(self._compiled, self._monitors)
+        self._walks = walks_of(self._compiled, self._monitors)
+
+    @property
+    def area(self) -> memoryview | None:
+        """Where to receive frames that walks take without a copy; None where there are no walks."""
+        return self._walks.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
         """What the monitors of a topic have left of their budgets after a message of it."""
@@ -185,7 +190,7 @@ class MonitorSet:
 
     def walker(self, topic: str) -> Walker | None:
         """The walk for messages on this topic; None if there is none."""
-        return self._walkers.get(topic) if topic in self._steps else None
+        return self._walks.of_topic.get(topic) if topic in self._steps else None
 
     def walks(self, walker: Walker, time_ns: int) -> bool:
         """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""

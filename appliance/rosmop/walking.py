@@ -6,12 +6,14 @@ Invariants:
   time of the walk: bytes, variables, states of properties, which events happened.
 - The state of specifications that share topics or variables is in one place: in the module's memory from a walk on
   (`Home.enter`), in Python until then, and again before Python looks at it (`Home.leave`).
-- Frames are copied into the module, and back if some were changed. Of a long one only the beginning is: what looks
-  further leaves the message.
+- Frames that were received into the module's memory (`Walks.area`) are looked at and changed where they stand. Of
+  one that stands elsewhere the beginning is copied, and back if it was changed: what looks further leaves the message.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from appliance.rosmop.compile.program import groups
@@ -27,8 +29,8 @@ from appliance.rosmop.types.kinds import Type
 FUEL = 50_000_000
 """Instructions of one call: some hundredths of a second."""
 
-LONG, BEGINNING = 8192, 4096
-"""A message of more bytes than the first is looked at alone, and only so far."""
+BEGINNING = 8192
+"""Bytes that are looked at of a frame that was not received into the module's memory."""
 
 _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
@@ -167,65 +169,79 @@ class Walker:
     ) -> Walked:
         """Take messages from `position` on, as many as need nothing special.
 
-        Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written. What
-        goes on before a dropped message is appended to `pieces`.
+        Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written: the
+        beginning of `Walks.area`, or others. What goes on before a dropped message is appended to `pieces`.
         """
+        if view.obj is not self._memory.obj:
+            return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
         if not self._home.inside:
             self._home.enter()
-        memory, frames, end = self._memory, self._frames, len(view)
+        frames, end, begun = self._frames, len(view), run
         changed: list[tuple[int, int]] = []
-        begun = run
         while position < end:
-            whole, size = 0, end - position
-            if size > LONG:
-                whole = _LENGTH.unpack_from(view, position)[0] + 4
-                if whole > LONG:
-                    size = BEGINNING
-                else:
-                    whole, size = 0, min(size, AREA)
-            memory[frames : frames + size] = view[position : position + size]
-            if whole:
-                _LENGTH.pack_into(memory, frames, size - 4)
             try:
-                answer = self._call(self._name, frames, frames + size, time_ns, *prepared, fuel=FUEL) or 0
+                answer = (
+                    self._call(self._name, frames + position, frames + end, time_ns, *prepared, fuel=FUEL)
+                    or 0
+                )
             except MachineTrap:
-                answer = self._stopped(memory)
-            ahead = (answer & _ADDRESS) - frames
+                answer = self._stopped()
+            position = (answer & _ADDRESS) - frames
             if answer > _ADDRESS:
                 if answer >= LEFT:
-                    self._undo(memory)
-                area = view[position : position + ahead]
-                for first, last in self._carry_out(memory, answer >> 32 & 0xFFFFFF, changed, area):
-                    if position + first > run:
-                        pieces.append(view[run : position + first])
-                    run = position + (whole or last)
-            position += whole if whole and ahead else ahead
-            if answer >= LEFT:
-                break
+                    self._undo()
+                for first, following in self._carry_out(answer >> 32 & 0xFFFFFF, changed):
+                    if first > run:
+                        pieces.append(view[run:first])
+                    run = following
+                if answer >= LEFT:
+                    break
         return Walked(position, run, self._dropped() if run != begun else (), changed)
 
-    def _carry_out(
-        self, memory: memoryview, count: int, changed: list[tuple[int, int]], area: memoryview
-    ) -> list[tuple[int, int]]:
-        """Note what was changed, and put it into `area`; from where to where frames in it were dropped."""
-        dropped, before = [], len(changed)
-        for who, what in _EFFECT.iter_unpack(memory[self._effects : self._effects + count * _EFFECT.size]):
+    def _walk_elsewhere(  # noqa: PLR0917  as `walk`
+        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked:
+        area = self._memory[self._frames : self._frames + BEGINNING]
+        changed: list[tuple[int, int]] = []
+        dropped: Sequence[int] = ()
+        while position < len(view):
+            following = position + 4 + _LENGTH.unpack_from(view, position)[0]
+            size = min(following - position, BEGINNING)
+            area[:size] = view[position : position + size]
+            _LENGTH.pack_into(area, 0, size - 4)
+            walked = self.walk(area[:size], 0, 0, [], time_ns, prepared)
+            if not walked.position:
+                break
+            if walked.changed:
+                view[position + 4 : position + size] = area[4:size]
+                changed += walked.changed
+            elif walked.run:
+                if position > run:
+                    pieces.append(view[run:position])
+                run = following
+                dropped = [sum(counts) for counts in zip_longest(dropped, walked.dropped, fillvalue=0)]
+            position = following
+        return Walked(position, run, dropped, changed)
+
+    def _carry_out(self, count: int, changed: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Note what was changed; from where to where frames were dropped."""
+        dropped = []
+        effects = self._memory[self._effects : self._effects + count * _EFFECT.size]
+        for who, what in _EFFECT.iter_unpack(effects):
             if who == -1:
                 dropped.append(((what & _ADDRESS) - self._frames, (what >> 32) - self._frames))
             else:
                 changed.append((who, what))
-        if len(changed) > before:
-            first = self._frames + 4  # the length of a long one is not its own
-            area[4:] = memory[first : first - 4 + len(area)]
         return dropped
 
-    def _stopped(self, memory: memoryview) -> int:
+    def _stopped(self) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left."""
-        at, effect = _POSITION.unpack_from(memory, POSITION)
+        at, effect = _POSITION.unpack_from(self._memory, POSITION)
         return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT)
 
-    def _undo(self, memory: memoryview) -> None:
+    def _undo(self) -> None:
         """Take back what was done to the message that is left."""
+        memory = self._memory
         for address, kept in self._feed.undo:
             memory[address : address + 8] = memory[kept : kept + 8]
         end = _LENGTH.unpack_from(memory, UNDO)[0]
@@ -239,12 +255,19 @@ class Walker:
         return [now - then for now, then in zip(counts, before, strict=True)]
 
 
-def walkers(compiled: Compiled, monitors: Sequence[Monitor]) -> dict[str, Walker]:
+class Walks(NamedTuple):
+    """The walkers of a set by topic, and the part of their module's memory to receive frames into, if there is one."""
+
+    of_topic: Mapping[str, Walker] = MappingProxyType({})
+    area: memoryview | None = None
+
+
+def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
     module = module_of(compiled.functions, [group.component for group in found])
     if not module.feeds:
-        return {}
+        return Walks()
     machine = Machine(module.code, module.memory)
     walks = {}
     for group, cells in zip(found, module.cells, strict=True):
@@ -260,4 +283,4 @@ def walkers(compiled: Compiled, monitors: Sequence[Monitor]) -> dict[str, Walker
                     for number, index in events
                 ]
                 walks[topic] = Walker(home, module, module.feeds[topic], own, names)
-    return walks
+    return Walks(walks, machine.memory[module.frames : module.frames + AREA])

@@ -3,8 +3,9 @@
 A frame is a 4-byte little-endian length and that many bytes. `FrameReceiver` hands out the buffer to receive
 into and returns all frames that are whole after each read as one `Batch`, walked once and not copied:
 
-- Small frames are received into a scratch area that all receivers of the process share; only the torn frame
-  at the end of a read, if there is one, is set aside until the rest arrives.
+- Small frames are received into a scratch area that all receivers of the process share, in the memory of the
+  monitors' module where there is one; only the torn frame at the end of a read, if there is one, is set aside until
+  the rest arrives.
 - A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 8 MiB is used again
   for the next large frame unless a queue has kept it; a larger one is anonymous memory, so that a length which
   is declared and never sent costs address space only. While memory is short no area is kept.
@@ -102,10 +103,23 @@ class Batch:
         return Batch(last, 1, 0, owned=True)
 
 
+class Scratch:
+    """Where small frames are received; another area may be given between two reads."""
+
+    __slots__ = ("area",)
+
+    def __init__(self) -> None:
+        self.move(None)
+
+    def move(self, area: memoryview | None) -> None:
+        """From the next read on use this area, or (None) one of its own."""
+        self.area = memoryview(bytearray(SCRATCH)) if area is None else area
+
+
 class FrameReceiver:
     """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
 
-    def __init__(self, scratch: memoryview, limit: int, share: HostShare) -> None:
+    def __init__(self, scratch: Scratch, limit: int, share: HostShare) -> None:
         self._scratch = scratch
         self._limit = limit
         self._share = share
@@ -125,11 +139,11 @@ class FrameReceiver:
                 self._count(0)  # who keeps it counts it
             self._delivered = None
             return self._area[self._filled : self._target]
-        torn = self._torn
+        torn, scratch = self._torn, self._scratch.area
         if torn:
-            self._scratch[: len(torn)] = torn
-            return self._scratch[len(torn) :]
-        return self._scratch
+            scratch[: len(torn)] = torn
+            return scratch[len(torn) :]
+        return scratch
 
     def received(self, count: int) -> Batch | None:
         """The frames that are whole now that `count` more bytes are in the buffer.
@@ -140,7 +154,7 @@ class FrameReceiver:
         self._idle = False
         if self._area is not None:
             return self._received_in_area(self._area, count)
-        return self._walk(self._scratch, len(self._torn) + count, owned=False)
+        return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
 
     @property
     def unfinished(self) -> int:

@@ -50,8 +50,8 @@ from appliance.rosmop.runtime.context import BUDGET
 POSITION, EFFECT = 0, 4
 """Where it stands which frame is looked at, and the address of the last effect."""
 
-AREA = 1 << 16
-"""Bytes of frames that are fed together."""
+AREA = 512 << 10
+"""Bytes of frames that are fed together: as many as one read takes."""
 
 LEFT = 1 << 62
 LOUD = 1 << 63

@@ -13,7 +13,7 @@ from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.logics.interface import FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walking import LONG, Walker
+from appliance.rosmop.walking import BEGINNING, Walker
 from tests.unit.rosmop.interpreted import beside
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
@@ -44,6 +44,8 @@ class Fed:
             for monitor in one.monitors:
                 monitor.seen = True
         self.came: Counter[str] = Counter()
+        self._inside = False
+        """Whether messages stand in the module's memory, every other time."""
 
     def walker(self, topic: str = "/plain") -> Walker:
         """The walk of a topic; there is one."""
@@ -59,6 +61,7 @@ class Fed:
             self.came[outcome.result if not outcome.faults else "fault"] += 1
             if outcome.result != "dropped":
                 expected.append(bytes(outcome.buffer))
+        self._inside = not self._inside
         assert self._fed(frames(bodies), topic, time) == frames(expected)
         assert self.state() == _state(self._other)
         return expected
@@ -68,7 +71,10 @@ class Fed:
         return _state(self.monitors)
 
     def _fed(self, given: bytes, topic: str, time: int) -> bytes:
-        view = memoryview(bytearray(given))
+        view, area = memoryview(bytearray(given)), self.monitors.area
+        if self._inside and area is not None and len(given) <= AREA:
+            view = area[: len(given)]
+            view[:] = given
         pieces: list[memoryview | bytes] = []
         position = run = 0
         walker = self.monitors.walker(topic)
@@ -265,14 +271,20 @@ def test_without_fuel_the_message_at_hand_is_left(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_long_message_is_looked_at_where_it_begins() -> None:
-    """Changed and dropped there; a field that is further behind is left, and so is the bytes' number."""
-    picture = bytes(range(256)) * (LONG // 128)
+    """Changed and dropped there; a field that is further behind is left, and so is the bytes' number.
+
+    But not where all of it stands in the module's memory.
+    """
+    picture = bytes(range(256)) * (BEGINNING // 128)
     fed = Fed(event("if (count == 3) { return; } count = count + 1; n++;"))
     fed.check([plain(1, rest=picture), plain(2), plain(3, rest=picture), plain(4, rest=picture), plain(5)])
     assert fed.came["together"] == 1
     behind = Fed("s() { int n = 0; event e(int r) /plain own/Plain '{rest[9000]:r}' { n += r; } }")
-    behind.check([plain(rest=picture), plain(rest=picture)])
-    assert behind.state() == ["n 80"]
+    assert behind.monitors.area is not None
+    for together in (1, 1, 2):
+        behind.check([plain(rest=picture), plain(rest=picture)])
+        assert behind.came["together"] == together
+    assert behind.state() == ["n 240"]
 
 
 def test_more_frames_than_fit_and_more_changes_than_are_noted() -> None:
@@ -389,7 +401,9 @@ def test_a_walk_stops_before_what_is_to_be_told() -> None:
     """While changes are told in full nothing is changed, while drops are nothing is dropped."""
     fed = Fed(event("count = 7; if (n > 2) { return; } n++;"))
     walker, given = fed.walker(), frames([plain()] * 6)
-    view, size = memoryview(bytearray(given)), len(plain()) + 4
+    assert fed.monitors.area is not None
+    view, size = fed.monitors.area[: len(given)], len(plain()) + 4
+    view[:] = given
     walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=True, told=[False]))
     assert (bytes(view), walked.position) == (given, 0)
     walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=False, told=[True]))

@@ -11,6 +11,7 @@ from appliance.relay.connections.frames import (
     SCRATCH,
     Batch,
     FrameReceiver,
+    Scratch,
     boundary_at,
     equal_frames,
     last_frame,
@@ -30,7 +31,7 @@ def frame(size: int, fill: int = 7) -> bytes:
 def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, HostShare]:
     """A receiver with a scratch area of its own."""
     budget = share(memory)
-    return FrameReceiver(memoryview(bytearray(SCRATCH)), limit, budget), budget
+    return FrameReceiver(Scratch(), limit, budget), budget
 
 
 def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
@@ -82,12 +83,23 @@ def test_a_torn_frame_is_never_part_of_a_batch() -> None:
 
 def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
     """A torn frame of one connection survives what another receives meanwhile."""
-    scratch, budget = memoryview(bytearray(SCRATCH)), share(1 << 30)
+    scratch, budget = Scratch(), share(1 << 30)
     one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
     data = frame(100, 1)
     assert feed(one, data[:50], [50]) == []
     assert feed(other, frame(400, 2), [404])[0][0] == frame(400, 2)
     assert feed(one, data[50:], [54])[0][0] == data
+
+
+def test_the_scratch_area_moves_between_two_reads() -> None:
+    """A torn frame goes on in the other area; nothing is received into the first one any more."""
+    scratch, first, other = Scratch(), bytearray(SCRATCH), bytearray(SCRATCH)
+    one = FrameReceiver(scratch, LIMIT, share(1 << 30))
+    scratch.move(memoryview(first))
+    assert feed(one, frame(100, 1)[:50], [50]) == []
+    scratch.move(memoryview(other))
+    assert feed(one, frame(100, 1)[50:], [54]) == [(frame(100, 1), 1, 0)]
+    assert (bytes(first[:60]), bytes(other[:104])) == (frame(100, 1)[:50] + bytes(10), frame(100, 1))
 
 
 @pytest.mark.parametrize("size", [LIMIT + 1, 0xFFFFFFFF])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.memory import Memory
 from appliance.relay.connections.presence import Presences, looks_for_names
 from appliance.relay.context import RelayContext
@@ -45,10 +46,8 @@ def presences(loop: Loop) -> Iterator[Presences]:
     limits = Limits()
     reporter = Reporter(limits)
     memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
-    scratch = memoryview(bytearray(64))
-    context = RelayContext(
-        loop, limits, reporter, memory, scratch, Middle(loop, reporter, publish=_nothing, changed=_nothing)
-    )
+    middle = Middle(loop, reporter, publish=_nothing, changed=_nothing)
+    context = RelayContext(loop, limits, reporter, memory, Scratch(), middle)
     presences = Presences(context, TOPIC)
     yield presences
     presences.close()

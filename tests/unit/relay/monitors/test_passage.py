@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow, SpecificationsStated
-from appliance.relay.connections.frames import FrameReceiver
+from appliance.relay.connections.frames import FrameReceiver, Scratch
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
 from appliance.relay.monitors.lane import Lane
@@ -76,7 +76,9 @@ class Monitored:
 
     def through(self, traffic: Traffic, first: int = 1) -> tuple[int, bytes, bytes]:
         """What is left of the messages: how many, all of them, the last."""
-        receiver = FrameReceiver(memoryview(bytearray(1 << 20)), 1 << 20, share(1 << 30))
+        scratch = Scratch()
+        scratch.move(self.set.area)
+        receiver = FrameReceiver(scratch, 1 << 20, share(1 << 30))
         receiver.buffer()[: len(traffic.frames)] = traffic.frames
         batch = receiver.received(len(traffic.frames))
         assert batch is not None
