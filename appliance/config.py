@@ -171,6 +171,10 @@ class Syslog(_Section):
     send: Literal["all", "denials"] = Field(
         default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
     )
+    format: Literal["fields", "ocsf"] = Field(
+        default="fields",
+        description="fields: as parameters of RFC 5424, the reason as text; ocsf: the text is an event of OCSF 1.6.0",
+    )
     facility: int = Field(
         default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`"
     )

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import appliance
 from appliance.audit.events import EVENTS
 from appliance.audit.kinds import ABOUT
+from appliance.audit.ocsf import class_text
 from appliance.audit.record import Severity
 
 _FIELDS = frozenset(
@@ -58,10 +59,11 @@ _HEAD = """\
 
 Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
 with, and the fields of its `detail`. The fields that every record has are in [audit.md](audit.md). A name is never
-renamed or given another meaning.
+renamed or given another meaning. The last column is the class and activity of the event in OCSF 1.6.0 (`--ocsf`, and
+`audit.syslog.format: ocsf`); activity 99 has the event's name as `activity_name`.
 
-| event | meaning | severity | fields of `detail` |
-|---|---|---|---|
+| event | meaning | severity | fields of `detail` | OCSF class: activity |
+|---|---|---|---|---|
 """
 
 
@@ -131,7 +133,7 @@ def markdown() -> str:
     order = [one.value for one in Severity]
     rows = [
         f"| `{name}` | {meaning} | {', '.join(sorted(severities[name], key=order.index)) or 'by case'} |"
-        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} |"
+        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} | {class_text(name)} |"
         for name, meaning in EVENTS.items()
     ]
     return _HEAD + "\n".join(rows) + "\n"

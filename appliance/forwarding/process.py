@@ -102,7 +102,12 @@ def make_forwarder(settings: Settings, kept: Path) -> Forwarder:
         settings.state / "control" / "audit.db",
         kept,
         receiver_of(wanted),
-        Formatter(facility=wanted.facility, longest=longest, host_name=wanted.host_name),
+        Formatter(
+            facility=wanted.facility,
+            longest=longest,
+            host_name=wanted.host_name,
+            ocsf=wanted.format == "ocsf",
+        ),
         chosen=wanted.send,
     )
 

@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 import msgspec
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
+from appliance.audit.ocsf import as_ocsf_line
 from appliance.audit.output import Entry, printable, rule_text
 from appliance.audit.record import Record, Severity
 
@@ -28,6 +29,7 @@ _SEVERITIES = {
     Severity.WARNING: 4,
     Severity.ALARM: 1,
 }
+_IDENTIFYING = ("sequence", "id", "event")
 _LONGEST_MESSAGE_ID = 32
 _LONGEST_HOST_NAME = 255
 _LONGEST_VALUE = 512
@@ -36,11 +38,17 @@ _CUT = "..."
 
 
 class Formatter:
-    """Makes messages that come from `host_name`, of a facility (0 to 23), at most `longest` bytes each."""
+    """Makes messages that come from `host_name`, of a facility (0 to 23), at most `longest` bytes each.
 
-    def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
+    `ocsf`: the text of a message is an event of OCSF, and its parameters are what identifies the record.
+    """
+
+    def __init__(
+        self, *, facility: int, longest: int, host_name: str | None = None, ocsf: bool = False
+    ) -> None:
         self._facility = facility
         self._longest = longest
+        self._ocsf = ocsf
         self._room = min(_LONGEST_VALUE, (longest - _FIXED) // _OPEN)
         self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
 
@@ -48,6 +56,12 @@ class Formatter:
         """A record of the log."""
         record = entry.record
         head = self._head(record.severity, record.time, record.event)
+        if self._ocsf:
+            named = {
+                name: value for name, value in _parameters(entry).items() if name in _IDENTIFYING and value
+            }
+            room = self._longest - len(_message(head, ELEMENT, named, "")) - 1
+            return _message(head, ELEMENT, named, as_ocsf_line(entry, room))
         named = {name: _value(value, self._room) for name, value in _parameters(entry).items() if value}
         text = _ascii(record.reason or record.event)
         detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else ""
@@ -66,7 +80,14 @@ class Formatter:
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(one).items() if value is not None
         }
-        return _message(head, SYSLOG_ELEMENT, fields, f"checkpoint {one.number} of the audit log")
+        text = f"checkpoint {one.number} of the audit log"
+        if self._ocsf:
+            record = Record(
+                id=one.hash, time=one.time, event="checkpoint", severity=Severity.NOTICE, reason=text,
+                detail={"number": one.number, "sequence": one.sequence, "hash": one.hash},
+            )  # fmt: skip
+            text = as_ocsf_line(Entry(one.sequence, record))
+        return _message(head, SYSLOG_ELEMENT, fields, text)
 
     def _head(self, severity: Severity, time: int, event: str) -> str:
         priority = self._facility * 8 + _SEVERITIES[severity]
