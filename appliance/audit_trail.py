@@ -86,6 +86,8 @@ class AuditTrail:
         detail: dict[str, Any] = {"call": method, **asked_of}
         if asker.node is not None:
             detail["node"] = asker.node
+        if decision.needs:
+            detail["needs"] = decision.needs
         stranger = self._marked(asker.host, word, detail)
         self._log.record(
             Record(

@@ -28,8 +28,11 @@ def routes(services: Services) -> Routes:
         topic: Annotated[str, Query(max_length=500, description="its name", examples=["/scan"])],
         messages: Annotated[int, Query(ge=1, le=20, description="how many at most")] = 1,
         seconds: Annotated[float, Query(gt=0, le=10, description="how long they are waited for")] = 2.0,
+        latched: Annotated[
+            bool, Query(description="a latched message first; false for whoever looks on and has it")
+        ] = True,
     ) -> TopicMessages:
         """The next messages of a topic as subscribers get them, read as fields. It is recorded who looked."""
-        return await ask(services.control, TopicLook(topic, messages, seconds), bearer)
+        return await ask(services.control, TopicLook(topic, messages, seconds, latched=latched), bearer)
 
     return router

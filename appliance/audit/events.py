@@ -49,7 +49,7 @@ EVENTS: dict[str, str] = {
     "monitor log": "A monitor wrote a line.",
     "monitor published": "A monitor published a message.",
     "publication refused": "A publisher or service has another definition than the specifications; it is not carried.",
-    "topic looked into": "Somebody had messages of a topic shown; `detail` has who, and how many.",
+    "topic looked into": "Somebody has messages of a topic shown; `detail` has who, and the `seconds` it covers.",
     "rest call": "A REST call was answered; `detail` has who (the token's name), method and status.",
     "order refused": "RVMaster refused what was asked over REST: no token, role or proof; `detail.verb` says what.",
     "token added": "An access token for REST was made; `detail` has its name, role, id and end.",

@@ -85,11 +85,15 @@ class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
 
 
 class TopicLook(AdminRequest[graph.TopicMessages], frozen=True, tag="topic look"):
-    """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds."""
+    """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds.
+
+    `latched`: what its publishers latched comes first; whoever looks on has it already.
+    """
 
     topic: str
     messages: int = 1
     seconds: float = 2.0
+    latched: bool = True
 
 
 class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics"):

@@ -47,7 +47,9 @@ OPERATIONS = (
     Operation(admin.StatusWanted, "viewer", "GET", "/v1/status"),
     Operation(admin.InventoryWanted, "viewer", "GET", "/v1/inventory"),
     Operation(admin.GraphWanted, "viewer", "GET", "/v1/graph"),
-    Operation(admin.TopicLook, "operator", "GET", "/v1/messages", ("topic", "messages", "seconds")),
+    Operation(
+        admin.TopicLook, "operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched")
+    ),
     Operation(admin.MetricsWanted, None),
     Operation(admin.ChallengeWanted, "viewer", "GET", "/v1/challenge"),
     Operation(admin.RegistrationsWanted, "viewer"),

@@ -41,7 +41,7 @@ def echo(
     """
     shown = 0
     while shown < count:
-        request = admin.TopicLook(topic, min(count - shown, _AT_ONCE), seconds)
+        request = admin.TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)
         body = appliance.ask_or_exit(request, as_json=as_json)
         for message in body.messages:
             _show(message, field, as_json=as_json)

@@ -30,6 +30,9 @@ MOST_MESSAGES = 20
 LONGEST_LOOK = 10.0
 """Seconds."""
 
+ONE_LOOK = 60.0
+"""Seconds in which the looks of one person into one topic are one record."""
+
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
@@ -48,6 +51,7 @@ class Looks:
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[Live]]
     started: float = field(default_factory=time.time)
+    _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
         """Processes, policy, registry, relay, firewall."""
@@ -80,15 +84,9 @@ class Looks:
             raise SenselessError(
                 f"the messages of {topic.name} go past the appliance (relaying: monitored), which cannot show them"
             )
-        seen = await self.parts.relay.look(topic.name, request.messages, request.seconds)
-        self.parts.trail.happened(
-            "topic looked into",
-            f"messages of {topic.name} were shown: {len(seen)}",
-            severity=Severity.NOTICE,
-            category="topic",
-            resource=topic.name,
-            who=who,
-            messages=len(seen),
+        self._record_look(topic.name, who)
+        seen = await self.parts.relay.look(
+            topic.name, request.messages, request.seconds, latched=request.latched
         )
         registry = self.parts.registry
         rows = []
@@ -102,6 +100,24 @@ class Looks:
             [publisher.node for publisher in topic.publishers],
             topic.subscribers,
             rows,
+        )
+
+    def _record_look(self, topic: str, who: str) -> None:
+        """Once for whoever looks on: a plot in the console is one look."""
+        now = time.monotonic()
+        for key in [key for key, since in self._shown.items() if now - since >= ONE_LOOK]:
+            del self._shown[key]
+        if (who, topic) in self._shown:
+            return
+        self._shown[who, topic] = now
+        self.parts.trail.happened(
+            "topic looked into",
+            f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
+            severity=Severity.NOTICE,
+            category="topic",
+            resource=topic,
+            who=who,
+            seconds=ONE_LOOK,
         )
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:

@@ -152,16 +152,16 @@ def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
 
 
 def _with_line(text: str, section: SectionText | None, name: str, line: str) -> tuple[str, str]:
-    lines = text.split("\n")
+    lines, end = text.split("\n"), "\r" if "\r\n" in text else ""
     if section is None:
         while lines and not lines[-1].strip():
             lines.pop()
-        return "\n".join([*lines, "", f"[{name}]", line, ""]), f"[{name}] {line}"
+        return "\n".join([*lines, end, f"[{name}]{end}", f"{line}{end}", ""]), f"[{name}] {line}"
     last = section.entries[-1].key.line if section.entries else section.name.line
     # `default` is what people write last: before it, where it is.
     if section.entries and section.entries[-1].key.text.endswith(DEFAULT):
         last -= 1
-    return "\n".join([*lines[:last], line, *lines[last:]]), line
+    return "\n".join([*lines[:last], f"{line}{end}", *lines[last:]]), line
 
 
 def asked(host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]) -> Asked:
@@ -171,6 +171,14 @@ def asked(host: str, caller_id: str, category: str, resource: str, detail: Mappi
     except ValueError:
         raise UngrantableError("it is no record of a decision about a host's call") from None
     call, key = str(detail.get("call", resource)), detail.get("key")
-    if request.category is Category.COMMAND:
-        return Asked(request, rights_of_call(request, call, str(key) if key is not None else None))
-    return Asked(request, rights_of(request))
+    if request.category is not Category.COMMAND:
+        return Asked(request, rights_of(request))
+    rights = rights_of_call(request, call, str(key) if key is not None else None)
+    category, _, needed = str(detail.get("needs", "")).partition(" ")
+    if (
+        category in PARAMETERS
+    ):  # what the call was about held others, or stood in its way: only the record knows
+        right = replace(request, category=Category(category), resource=needed.removesuffix("/**"))
+        namespace = needed.endswith("/**")
+        rights.append(Right(right, namespace=namespace, alone=not namespace))
+    return Asked(request, rights)

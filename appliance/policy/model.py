@@ -70,6 +70,7 @@ class Decision:
     person, which is in the audit record, `rosrv policy explain` and the console. `told` is the same without other
     hosts' names and addresses, for the answer to the caller; None where the reason has none (`told_of`).
     `would_deny` is set when the section is in audit-only mode: `allowed` is then True although the rules say no.
+    `needs` is the right that was asked for besides the deed itself, where that decided (`write /arm/**`).
     """
 
     allowed: bool
@@ -77,6 +78,7 @@ class Decision:
     reason: str
     would_deny: bool = False
     told: str | None = None
+    needs: str = ""
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:

@@ -13,6 +13,7 @@ A right is a question to one section. All must be granted:
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 from appliance.policy.model import Address, Category, Decision, Request
@@ -53,6 +54,10 @@ class Right(NamedTuple):
     request: Request
     namespace: bool = False
     alone: bool = False
+
+    def __str__(self) -> str:
+        """`write /arm/**` for a namespace, `write /arm` for what is asked alone, `node /it`."""
+        return f"{self.request.category} {self.request.resource}{'/**' if self.namespace else ''}"
 
 
 def category_of(call: str) -> Category:
@@ -134,7 +139,7 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
             continue  # a section that is not there leaves parameters free
         one = decide_right(policy, right)
         if not one.allowed or (one.would_deny and not verdict.would_deny):
-            verdict = one
+            verdict = replace(one, needs=str(right))
     return verdict
 
 

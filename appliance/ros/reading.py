@@ -1,11 +1,12 @@
 """A message as fields and values, for people: as far as its bytes go, and within bounds.
 
-What cannot be read is left out and said (`…`): the bytes may be cut off, or a stranger's. Long strings, arrays and
-messages are shortened; the result is plain values that a log can hold.
+What cannot be read is said (`…`): the bytes may be cut off, or a stranger's. Long strings, arrays and messages are
+shortened, and it is said how much is left out (`… 344 more`); the result is plain values that a log can hold.
 """
 
 import math
 import struct
+from itertools import islice
 from typing import Any
 
 from appliance.ros.definitions import Definitions
@@ -14,7 +15,9 @@ from appliance.ros.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 16
 MOST_CHARACTERS = 200
+MOST_BYTES = 32
 MOST_FIELDS = 200
+_MOST_STEPS = 2_000
 CUT = "…"
 
 _LENGTH = struct.Struct("<I")
@@ -29,47 +32,81 @@ class _Reader:
         self._definitions = definitions
         self._data = data
         self._position = 0
-        self._left = MOST_FIELDS
+        self._left = MOST_FIELDS  # values that are shown
+        self._steps = _MOST_STEPS  # values that are read, shown or not
+        self._sizes: dict[str, int | None] = {}
 
     def message(self, name: str) -> dict[str, Any]:
         fields: dict[str, Any] = {}
-        for field in self._definitions.message(name).fields:
+        following = iter(self._definitions.message(name).fields)
+        for field in following:
             try:
                 fields[field.name] = (
                     self._array(field.type, field.length) if field.is_array else self._value(field.type)
                 )
-            except _EndError:
-                fields[field.name] = CUT
-                raise _CutError(fields) from None
-            except _CutError as cut:
-                fields[field.name] = cut.value
+            except (_EndError, _CutError) as end:
+                fields[field.name] = end.value if isinstance(end, _CutError) else CUT
+                fields |= {after.name: CUT for after in islice(following, MOST_FIELDS)}
                 raise _CutError(fields) from None
         return fields
 
     def _array(self, kind: str, length: int | None) -> Any:
         count = length if length is not None else _LENGTH.unpack(self._take(4))[0]
         if kind in {"uint8", "char"}:
-            return self._take(count)[:MOST_CHARACTERS].hex()
+            return read_bytes(self._take(count))
         values: list[Any] = []
-        for _ in range(count):
+        for _ in range(min(count, MOST_ELEMENTS)):
             try:
-                value = self._value(kind)
-            except _EndError:
-                raise _CutError([*values[:MOST_ELEMENTS], CUT]) from None
-            except _CutError as cut:
-                raise _CutError([*values[:MOST_ELEMENTS], cut.value]) from None
-            if len(values) <= MOST_ELEMENTS:
-                values.append(value)
-        return [*values[:MOST_ELEMENTS], CUT] if count > MOST_ELEMENTS else values
+                values.append(self._value(kind))
+            except (_EndError, _CutError) as end:
+                raise _CutError([*values, end.value if isinstance(end, _CutError) else CUT]) from None
+        if count <= MOST_ELEMENTS:
+            return values
+        values.append(_more(count - MOST_ELEMENTS))
+        try:
+            self._pass_over(kind, count - MOST_ELEMENTS)
+        except (_EndError, _CutError):
+            raise _CutError(values) from None
+        return values
+
+    def _pass_over(self, kind: str, count: int) -> None:
+        """Read this many more values of a type, for what comes after them."""
+        size = self._size(kind)
+        if size is not None:
+            self._take(size * count)
+            return
+        left, self._left = self._left, _MOST_STEPS
+        for _ in range(count):
+            self._value(kind)
+        self._left = left
+
+    def _size(self, kind: str) -> int | None:
+        """The bytes of each value of a type; None where they differ."""
+        if kind in PRIMITIVES:
+            return PRIMITIVES[kind][1]
+        if kind == "string":
+            return None
+        if kind not in self._sizes:
+            self._sizes[kind] = None  # a type that contains itself has no size
+            size: int | None = 0
+            for field in self._definitions.message(kind).fields:
+                inner = self._size(field.type)
+                if size is None or inner is None or (field.is_array and field.length is None):
+                    size = None
+                else:
+                    size += inner * (field.length if field.is_array and field.length is not None else 1)
+            self._sizes[kind] = size
+        return self._sizes[kind]
 
     def _value(self, kind: str) -> Any:
         self._left -= 1
-        if self._left < 0:
+        self._steps -= 1
+        if self._left < 0 or self._steps < 0:
             raise _EndError
         if kind == "string":
             raw = self._take(_LENGTH.unpack(self._take(4))[0])
             text = raw[:MOST_CHARACTERS].decode("utf-8", "backslashreplace")
-            return text + CUT if len(raw) > MOST_CHARACTERS else text
+            return text + _more(len(raw) - MOST_CHARACTERS)
         if kind not in PRIMITIVES:
             return self.message(kind)
         code, size = PRIMITIVES[kind]
@@ -93,6 +130,16 @@ class _CutError(Exception):
     def __init__(self, value: Any) -> None:
         super().__init__()
         self.value = value
+
+
+def read_bytes(data: bytes) -> str:
+    """The first of them as hexadecimal digits, and how many more there are."""
+    return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
+
+
+def _more(count: int) -> str:
+    """How many elements, bytes or characters are left out."""
+    return f"{CUT} {count} more" if count > 0 else ""
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:

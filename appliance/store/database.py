@@ -43,6 +43,7 @@ class Database:
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
         self._path = path
         self._failed = failed
+        self._failing = False
         try:
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA journal_mode=WAL")
@@ -63,12 +64,12 @@ class Database:
     def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
         """Read rows, with what was queued before; for start-up and rare look-ups, not for the hot path.
 
-        What cannot be written in `_CATCH_UP_SECONDS` (a full disk) is not among them.
+        What cannot be written in `_CATCH_UP_SECONDS` is not among them, and is not waited for while the disk is full.
         """
-        written = threading.Event()
-        self._queue.put(written.set)
-        self._hurry.set()
-        if self._thread.is_alive():
+        if self._thread.is_alive() and not self._failing:
+            written = threading.Event()
+            self._queue.put(written.set)
+            self._hurry.set()
             written.wait(_CATCH_UP_SECONDS)
         try:
             with contextlib.closing(sqlite3.connect(self._path)) as reader:
@@ -146,10 +147,12 @@ class Database:
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
+                self._failing = True
                 self._failed(f"{self._path}: {error}")
                 if self._closing.wait(0.5):
                     return
             else:
+                self._failing = False
                 self._ahead.taken(sum(statement.ahead for statement in statements))
                 return
 

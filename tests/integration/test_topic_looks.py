@@ -47,17 +47,21 @@ def test_what_subscribers_get_is_shown_and_recorded(
     ros.talker(client, "/chatter", "--text", "word", name="voice").wait_for(event="ready")
     shown = echoed(appliance, "/chatter", "-n", "3")
     assert [row["node"] for row in shown] == ["/voice"] * 3
+    echoed(appliance, "/chatter")  # whoever looks on is not recorded again
     assert all("word" in str(row["fields"]) for row in shown)
     [record] = appliance.recorded("--event", "topic looked into")
-    assert (record["resource"], record["detail"]["who"], record["detail"]["messages"]) == (
-        "/chatter",
-        "operator",
-        3,
-    )
+    assert (record["resource"], record["detail"]) == ("/chatter", {"who": "operator", "seconds": 60.0})
     specification = tmp_path / "censor.rv"
     specification.write_text(MONITOR)
     appliance.rosrv("monitor", "load", str(specification))
     assert "checked" in str(echoed(appliance, "/chatter", "--field", "data")[0]["fields"])
+
+
+def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
+    """However many more are waited for; what comes after it is a new one."""
+    ros.talker("rospy", "/map", "--latch", "--count", "1", name="server").wait_for(event="ready")
+    done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
+    assert (done.returncode, len(done.stdout.splitlines())) == (1, 1)
 
 
 def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) -> None:

@@ -82,7 +82,8 @@ class TopicMessage(msgspec.Struct, frozen=True):
     fields: Annotated[
         dict[str, Any],
         told(
-            "by name; long strings and arrays are cut (`…`), bytes are hexadecimal, NaN and infinity are strings"
+            "by name; what is left out of long values is counted (`… 344 more`), bytes are hexadecimal, NaN and"
+            " infinity are strings"
         ),
     ]
     why: Annotated[str, told("why there are no fields but the first bytes; else empty")]

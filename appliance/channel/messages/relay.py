@@ -394,11 +394,12 @@ class MonitorsCounted(Message):
 
 
 class LookWanted(Message):
-    """Somebody wants to see the next messages of a topic, so many at most."""
+    """Somebody wants to see the next messages of a topic, so many at most; the `latched` one first, or not again."""
 
     number: int
     topic: str
     messages: int
+    latched: bool
 
 
 class LookEnded(Message):

@@ -174,9 +174,12 @@ class RelayControl:
         """Publish as the appliance's own publisher, to whoever subscribes now."""
         self._post(TOPIC, message.topic).send(message)
 
-    async def look(self, topic: str, count: int, seconds: float) -> list[messages.MessageSeen]:
+    async def look(
+        self, topic: str, count: int, seconds: float, *, latched: bool
+    ) -> list[messages.MessageSeen]:
         """The next messages of a topic, as its subscribers get them. Raises `TooManyLooksError`."""
-        return await self._looks.look(topic, count, seconds, self._post(TOPIC, topic).send)
+        send = self._post(TOPIC, topic).send
+        return await self._looks.look(topic, count, seconds, send, latched=latched)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
         """Whether a topic or service is carried by this relay."""

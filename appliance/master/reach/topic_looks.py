@@ -21,7 +21,13 @@ class TopicLooks:
         self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
 
     async def look(
-        self, topic: str, count: int, seconds: float, send: Callable[[messages.Message], bool]
+        self,
+        topic: str,
+        count: int,
+        seconds: float,
+        send: Callable[[messages.Message], bool],
+        *,
+        latched: bool,
     ) -> list[messages.MessageSeen]:
         """The next messages of a topic, fewer where no more came in time. Raises `TooManyLooksError`."""
         if len(self._open) >= MOST:
@@ -30,7 +36,7 @@ class TopicLooks:
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
         self._open[number] = count, seen, enough
         try:
-            if send(messages.LookWanted(number, topic, count)):
+            if send(messages.LookWanted(number, topic, count, latched)):
                 async with asyncio.timeout(seconds):
                     await enough.wait()
         except TimeoutError:

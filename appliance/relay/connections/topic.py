@@ -177,10 +177,10 @@ class RelayedTopic:
         """The publisher's header, as subscribers have it; None while it is not known."""
         return self._header
 
-    def look(self, look: Callable[[Batch], None]) -> None:
-        """Somebody looks at what subscribers get from now on, the latched message first; `look` keeps no batch."""
+    def look(self, look: Callable[[Batch], None], *, latched: bool) -> None:
+        """Somebody looks at what subscribers get from now on, a `latched` message first; `look` keeps no batch."""
         self._looks += (look,)
-        if self._latched is not None:
+        if latched and self._latched is not None:
             look(self._latched)
         if self.upstream is not None:
             self.upstream.want()

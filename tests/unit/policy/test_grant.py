@@ -11,7 +11,9 @@ from appliance.policy.grant import Asked, UngrantableError, asked, grant
 from appliance.policy.judging import Known
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
-from appliance.policy.rights import decide, rights_of
+from appliance.policy.rights import decide, rights_of, rights_of_call
+from appliance.ros.parameter_tree import Tree
+from appliance.ros.xmlrpc import Value
 
 POLICIES = sorted((Path(__file__).parents[3] / "policies").glob("*.ini"))
 ROBOT = ipaddress.ip_network("10.84.0.2/32")
@@ -101,6 +103,59 @@ def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
         "write /arm/max = 10.0.0.1 10.0.0.9",
         "write /arm = 10.0.0.1 10.0.0.9",
     ]
+
+
+PARAMETERS = (
+    "[Nodes]\ndefault = *\n[Commands]\ndefault = *\n[Parameters]\n"
+    "read /arm = 10.0.0.9\nwrite /arm = 10.0.0.9\nread default = 10.0.0.1\nwrite default = 10.0.0.1\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "key", "value", "tree"),
+    [
+        ("getParam", "/arm", None, {"arm": {"max": 3}}),
+        ("setParam", "/arm", {"max": 3}, {}),
+        ("setParam", "/arm", 1, {"arm": {"max": 3}}),
+        ("setParam", "/leg/max/x", 1, {"leg": {"max": 3}}),
+        ("deleteParam", "/leg", None, {"leg": {"max": 3}}),
+    ],
+)
+def test_what_a_record_alone_knows_of_a_parameter_is_granted(
+    call: str, key: str, value: Value, tree: Tree
+) -> None:
+    """That it held others, that its value does, that it stood in the way of another: refused once, granted for good."""
+    text = PARAMETERS
+    for _ in range(3):
+        policy = compiled(text)
+        decision = decide(
+            policy, rights_of_call(request(Category.COMMAND, call), call, key, value=value, tree=tree)
+        )
+        if decision.allowed:
+            break
+        found = grant(
+            text,
+            "p.ini",
+            KNOWN,
+            asked(str(HOST), "/it", "command", call, {"call": call, "key": key, "needs": decision.needs}),
+        )
+        assert found.added, decision
+        text = found.text
+    assert decision.allowed
+    assert text != PARAMETERS
+
+
+def test_a_text_keeps_how_its_lines_end() -> None:
+    """A policy that was written on another system; a new section, a new line and a longer one."""
+    for resource in ("/x", "/yes", "/new"):
+        found = grant(
+            BASE.replace("\n", "\r\n"), "p.ini", KNOWN, asked(str(HOST), "/it", "publish", resource, {})
+        )
+        assert found.text.count("\n") == found.text.count("\r\n"), resource
+    [*_, section, line, _end] = grant(
+        "[Nodes]\r\ndefault = *\r\n", "p.ini", KNOWN, asked(str(HOST), "/it", "publish", "/z", {})
+    ).text.split("\n")
+    assert (section, line) == ("[Publishers]\r", "/z = 10.0.0.9\r")
 
 
 @pytest.mark.parametrize(

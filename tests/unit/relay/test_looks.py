@@ -47,7 +47,7 @@ def subscribed(world: World) -> tuple[Peer, Peer]:
 def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
     """As many as were asked for, with their type, size and fields; subscribers notice nothing."""
     publisher, subscriber = subscribed(world)
-    world.state(LookWanted(1, "/chatter", 2))
+    world.state(LookWanted(1, "/chatter", 2, latched=True))
     frames = [encode_frame(text(word)) for word in ("one", "two", "three")]
     publisher.send(b"".join(frames))
     world.gets(subscriber, b"".join(frames))
@@ -61,7 +61,7 @@ def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
 
 def test_a_topic_without_subscribers_is_looked_into(world: World) -> None:
     """The publisher is connected to for the look, and let go behind it."""
-    world.state(LookWanted(1, "/chatter", MOST_MESSAGES))
+    world.state(LookWanted(1, "/chatter", MOST_MESSAGES, latched=True))
     publisher = world.upstream(TOLD)
     publisher.send(encode_frame(text("alone")))
     assert seen(world, "alone").number == 1
@@ -76,8 +76,27 @@ def test_the_latched_message_comes_first(world: World) -> None:
     world.gets_header(subscriber)
     publisher.send(encode_frame(text("kept")))
     world.gets(subscriber, encode_frame(text("kept")))
-    world.state(LookWanted(1, "/chatter", 1))
+    world.state(LookWanted(1, "/chatter", 1, latched=True))
     assert seen(world, "kept").number == 1
+    world.state(LookEnded(1))
+    world.state(LookWanted(2, "/chatter", 2, latched=False))
+    publisher.send(encode_frame(text("new")))
+    assert seen(world, "new").number == 2
+    assert [one.number for one in world.told if isinstance(one, MessageSeen)] == [1, 2]
+
+
+def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
+    """While somebody looks, it comes back with another."""
+    publisher, _subscriber = subscribed(world)
+    world.state(LookWanted(1, "/chatter", 5, latched=True))
+    publisher.send(encode_frame(text("one")))
+    assert seen(world, "one").why == ""
+    publisher.sock.close()
+    again = world.upstream(HEADER | {"message_definition": "string word\n"})
+    again.send(encode_frame(text("two")))
+    world.until(
+        lambda: any(isinstance(one, MessageSeen) and one.fields == {"word": "two"} for one in world.told)
+    )
 
 
 @pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
@@ -86,7 +105,7 @@ def test_a_definition_that_cannot_be_read_is_said(world: World, definition: str)
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(HEADER | {"message_definition": definition})
     world.gets_header(subscriber)
-    world.state(LookWanted(1, "/chatter", 1))
+    world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("word")))
     shown = world.hears(MessageSeen)
     assert shown.fields == {"data": text("word").hex()}
@@ -96,7 +115,7 @@ def test_a_definition_that_cannot_be_read_is_said(world: World, definition: str)
 def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None:
     """A string that says it is longer than the message."""
     publisher, _subscriber = subscribed(world)
-    world.state(LookWanted(1, "/chatter", 1))
+    world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(struct.pack("<I", 1 << 31) + b"x"))
     assert world.hears(MessageSeen).fields == {"data": "…"}
 
@@ -105,7 +124,7 @@ def test_looks_are_few_and_end_with_control(world: World) -> None:
     """Beyond `MOST_LOOKS` nothing is seen; a control that is gone leaves none behind."""
     publisher, subscriber = subscribed(world)
     for number in range(MOST_LOOKS + 1):
-        world.state(LookWanted(number, "/chatter", 1))
+        world.state(LookWanted(number, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("word")))
     world.until(lambda: sum(isinstance(one, MessageSeen) for one in world.told) == MOST_LOOKS)
     world.gets(subscriber, encode_frame(text("word")))
@@ -113,6 +132,6 @@ def test_looks_are_few_and_end_with_control(world: World) -> None:
     world.link.close()
     world.control.close()
     world.connect_control()
-    world.state(LookWanted(99, "/chatter", 1))
+    world.state(LookWanted(99, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("again")))
     assert seen(world, "again").number == 99

@@ -3,13 +3,22 @@
 import struct
 
 from appliance.ros.definitions import Definitions
-from appliance.ros.reading import CUT, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
+from appliance.ros.reading import CUT, MOST_BYTES, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
 
 DEFINITIONS = Definitions.from_files(
     {
         "a/Inner.msg": "float64 x\nstring name\n",
         "a/Outer.msg": "time stamp\nInner[] parts\nuint8[] raw\nbool last\n",
         "a/Many.msg": "int32[] values\n",
+    }
+)
+
+LONG = Definitions.from_files(
+    {
+        "a/Long.msg": "float32[] ranges\nfloat32[] intensities\nstring[] names\nuint8[] data\nuint8 last\n",
+        "a/Empty.msg": "",
+        "a/Empties.msg": "Empty[] values\nuint8 last\n",
+        "a/Texts.msg": "string[] values\nuint8 last\n",
     }
 )
 
@@ -47,10 +56,48 @@ def test_what_is_cut_off_is_read_as_far_as_it_goes() -> None:
 def test_long_values_are_shortened() -> None:
     """A log record stays small."""
     many = read_fields(DEFINITIONS, "a/Many", struct.pack("<I100i", 100, *range(100)))
-    assert many == {"values": [*range(MOST_ELEMENTS), CUT]}
+    assert many == {"values": [*range(MOST_ELEMENTS), f"{CUT} {100 - MOST_ELEMENTS} more"]}
     assert read_fields(DEFINITIONS, "a/Inner", inner(float("nan"), "")) == {"x": "nan", "name": ""}
     cut = read_fields(DEFINITIONS, "a/Outer", OUTER[:-9])
-    assert cut == {"stamp": 5.25, "parts": [{"x": 1.5, "name": "one"}, {"x": 2.5, "name": CUT}]}
+    assert cut == {
+        "stamp": 5.25,
+        "parts": [{"x": 1.5, "name": "one"}, {"x": 2.5, "name": CUT}],
+        "raw": CUT,
+        "last": CUT,
+    }
     fields = read_fields(DEFINITIONS, "a/Inner", inner(0, "x" * 1000))
     assert fields is not None
-    assert fields["name"] == "x" * MOST_CHARACTERS + CUT
+    assert fields["name"] == "x" * MOST_CHARACTERS + f"{CUT} {1000 - MOST_CHARACTERS} more"
+
+
+def test_what_is_left_out_of_an_array_does_not_hide_what_follows() -> None:
+    """A laser scan, an image, a list of names: each later field is there, and how much is left out."""
+    scan = struct.pack("<720f", *range(720))
+    names = b"".join(struct.pack("<I", 3) + b"abc" for _ in range(100))
+    data = b"".join(struct.pack("<I", 720) + scan for _ in range(2)) + struct.pack("<I", 100) + names
+    fields = read_fields(LONG, "a/Long", data + struct.pack("<I", 5000) + b"\1" * 5000 + b"\7")
+    assert fields is not None
+    assert (
+        fields["ranges"]
+        == fields["intensities"]
+        == [*range(MOST_ELEMENTS), f"{CUT} {720 - MOST_ELEMENTS} more"]
+    )
+    assert fields["names"] == ["abc"] * MOST_ELEMENTS + [f"{CUT} {100 - MOST_ELEMENTS} more"]
+    assert fields["data"] == "01" * MOST_BYTES + f"{CUT} {5000 - MOST_BYTES} more"
+    assert fields["last"] == 7
+
+
+def test_every_field_is_named_where_the_bytes_end() -> None:
+    """Those that cannot be read any more have the sign of it."""
+    cut = read_fields(LONG, "a/Long", struct.pack("<I", 2**32 - 1) + b"\0" * 4000)
+    assert cut is not None
+    assert list(cut) == ["ranges", "intensities", "names", "data", "last"]
+    assert cut["intensities"] == cut["names"] == cut["data"] == cut["last"] == CUT
+
+
+def test_what_a_stranger_counts_takes_no_time() -> None:
+    """Elements of no size, by the thousand million, and elements of many sizes more than are read."""
+    empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")
+    assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}
+    many = read_fields(LONG, "a/Texts", struct.pack("<I", 100_000) + b"\0" * 400_001)
+    assert many == {"values": [""] * MOST_ELEMENTS + [f"{CUT} {100_000 - MOST_ELEMENTS} more"], "last": CUT}

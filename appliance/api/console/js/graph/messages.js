@@ -21,8 +21,8 @@ export function Messages({ topic }) {
     if (!until) return undefined;
     const controller = new AbortController();
     const look = async () => {
-      while (Date.now() < until && !controller.signal.aborted) {
-        const body = /** @type {any} */ (await get("/v1/messages", { topic, ...EACH }, controller.signal));
+      for (let latched = true; Date.now() < until && !controller.signal.aborted; latched = false) {
+        const [body] = /** @type {any[]} */ (await Promise.all([get("/v1/messages", { topic, latched, ...EACH }, controller.signal), pause(500)]));
         setSeen((seen) => [...seen, ...body.messages].filter((one) => one.time / 1e9 > Date.now() / 1000 - 2 * SECONDS).slice(-1200));
       }
       setUntil(0);
@@ -49,6 +49,8 @@ export function Messages({ topic }) {
       ${names.length > 0 && html`<label class="row small">Draw <select value=${chosen} onChange=${(/** @type {any} */ event) => setNumber(event.target.value)}><option value="">nothing</option>${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}</select></label>`}
       ${chosen && html`<${Plot} label=${chosen} unit="" say=${(/** @type {number | null} */ value) => (value === null ? "–" : String(Number(value.toPrecision(4))))} span=${SECONDS} height=${120} series=${[{ name: chosen, colour: "c1", points }]} />`}`}</div>`;
 }
+
+const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 
 /** The paths of numbers in a message, the first of them. @returns {string[]} */
 function numbers(/** @type {any} */ value, /** @type {string} */ path) {
