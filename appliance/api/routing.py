@@ -90,11 +90,14 @@ class _Body:
 
     def _of_json(self, text: str) -> Any:
         try:
-            return msgspec.json.decode(text, type=self.kind)
-        except msgspec.ValidationError as error:
-            raise _bad_input(_all_wrong(msgspec.json.decode(text), self.kind) or [error]) from None
+            try:
+                return msgspec.json.decode(text, type=self.kind)
+            except msgspec.ValidationError as error:
+                # That was the first field that is wrong: behind it may be what is no JSON.
+                wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [error]
         except (msgspec.DecodeError, RecursionError) as error:
             raise _not_json(text, error) from None
+        raise _bad_input(wrong)
 
     def schema(self) -> dict[str, Any]:
         """How the contract describes it."""

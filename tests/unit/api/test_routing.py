@@ -47,12 +47,14 @@ def app() -> FastAPI:
 
 
 def posted(app: FastAPI, sent: Any) -> httpx.Response:
-    """The answer to a body."""
+    """The answer to a body; text is sent as it is."""
 
     async def ask() -> httpx.Response:
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://x") as client:
             return await client.post(
-                "/", content=json.dumps(sent), headers={"content-type": "application/json"}
+                "/",
+                content=sent if isinstance(sent, str) else json.dumps(sent),
+                headers={"content-type": "application/json"},
             )
 
     return asyncio.run(ask())
@@ -74,3 +76,12 @@ def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) 
     assert answer.status_code == 422
     assert [one["where"] for one in answer.json()["errors"]] == places
     assert posted(app, {"name": "xy", "count": 1}).text == "xy"
+
+
+@pytest.mark.parametrize(
+    "rest", ["", "[" * 100_000, "1e" + "9" * 1000, '"\\ud800"', '{"a":' * 50_000, "9" * 300_000]
+)
+def test_what_is_no_json_behind_what_is_wrong_is_told(app: FastAPI, rest: str) -> None:
+    """The reader ends with the first wrong field; what follows may end it in another way."""
+    answer = posted(app, f'{{"name": 1, "count": {rest}')
+    assert (answer.status_code, answer.json()["type"]) == (422, "urn:rosrv:problem:not-json")
