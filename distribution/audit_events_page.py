@@ -43,7 +43,7 @@ _MONITOR = (
 )  # fmt: skip
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
-    "decision": ("call", "key", "node", "subgraph", "parts", "stranger"),
+    "decision": ("call", "key", "node", "subgraph", "needs", "parts", "stranger"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
     **dict.fromkeys(
