@@ -8,8 +8,13 @@ DryRun = Annotated[bool, Query(description="only say what it would do; for opera
 _NO = frozenset({b"", b"0", b"false", b"off", b"no", b"f", b"n"})
 
 
-def is_dry(query: bytes) -> bool:
-    """Whether a request is a dry run, by its query."""
+_QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})
+
+
+def is_dry(path: str, query: bytes) -> bool:
+    """Whether a request changes nothing, whatever its method says: by its query, or as a question with a body."""
+    if path in _QUESTIONS:
+        return True
     found = [
         value
         for name, _eq, value in (part.partition(b"=") for part in query.split(b"&"))

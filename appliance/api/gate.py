@@ -206,10 +206,10 @@ class _Answer:
             host=self._scope["client"][0],
             who=self.bearer.name if self.bearer else "",
             method=self._scope["method"],
-            path=self._scope["path"],
+            path=path,
             status=status,
             reason=self._scope.get(REASON, ""),
-            dry=is_dry(self._scope["query_string"]),
+            dry=is_dry(path, self._scope["query_string"]),
             duration_us=(time.monotonic_ns() - self._started) // 1000,
         )
 

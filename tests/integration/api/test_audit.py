@@ -189,6 +189,18 @@ def test_what_rest_changed_is_never_folded(rest: Rest) -> None:
     events.close()
 
 
+def test_an_error_in_a_draft_is_nothing_refused(rest: Rest) -> None:
+    """What the console asks while somebody writes is no denial: neither a dry run nor a question is an order."""
+    events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/policy*")
+    next(events)
+    draft = {"text": "[Nodes]\nbogus\n"}
+    for path in ("/v1/policy/test", "/v1/policy?dry_run=1"):
+        assert rest.post(path, draft).status == 422
+        told = json.loads(next(events)["data"])
+        assert (told["decision"], told["detail"]["dry_run"], told["detail"]["status"]) == ("allow", True, 422)
+    events.close()
+
+
 def test_who_was_refused_is_in_the_log(rest: Rest) -> None:
     """A call without a good token is a denial, and names nobody."""
     rest.with_token(None).get("/v1/graph?from=stranger")

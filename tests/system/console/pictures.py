@@ -4,6 +4,7 @@ An appliance with a robot of a hundred nodes, in whose name an operator's machin
 1280 by 800 pixels, in light colours.
 """
 
+import base64
 import tempfile
 from pathlib import Path
 
@@ -48,6 +49,9 @@ def main() -> None:
                 _robot(reader)
                 _now(reader)
                 _audit(reader)
+                _one_topic(reader)
+            with Reader(browser, place, token, width=390, height=844) as narrow:
+                _narrow(narrow)
         browser.close()
 
 
@@ -71,6 +75,36 @@ def _audit(reader: Reader) -> None:
     page.get_by_role("row", name=_STRANGERS[0]).first.click()
     expect(page.locator(".excerpt-line.here")).to_be_visible()
     _take(page, "console-audit")
+
+
+def _one_topic(reader: Reader) -> None:
+    page = reader.go("graph")
+    page.get_by_label("Search the graph").fill("/arm/command")
+    expect(page.locator('[data-key="t/arm/command"]')).to_be_visible()
+    page.get_by_label("Search the graph").press("Enter")
+    expect(page.get_by_role("button", name="Look", exact=True)).to_be_visible()
+    _take(page, "console-graph")
+
+
+def _narrow(reader: Reader) -> None:
+    """Three views beside each other."""
+    shots = []
+    for view in ("now", "graph", "audit"):
+        page = reader.go(view)
+        expect(
+            page.locator({"now": ".event", "graph": ".box.many", "audit": "tbody tr"}[view]).first
+        ).to_be_visible()
+        shots.append(page.screenshot(animations="disabled"))
+    images = "".join(
+        f'<img src="data:image/png;base64,{base64.b64encode(shot).decode()}" style="border:1px solid #8894a3">'
+        for shot in shots
+    )
+    context = reader.context.browser
+    assert context is not None
+    beside = context.new_page(viewport={"width": 3 * 392 + 64, "height": 880})
+    beside.set_content(f'<body style="margin:16px;display:flex;gap:16px">{images}</body>')
+    beside.screenshot(path=_PICTURES / "console-narrow.png")
+    beside.close()
 
 
 def _take(page: Page, name: str) -> None:

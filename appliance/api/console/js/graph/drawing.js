@@ -112,7 +112,7 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose }) {
   const touched = near === null || own || line.from === chosen || line.to === chosen;
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
   const shape = html`<path class=${`line ${kind}${line.kind === "flow" && line.rate > 0 ? " flowing" : ""}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
-  if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
+  if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && (line.from !== chosen || !chosen.startsWith("t/")) && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
   const said = `refused: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
   const pick = (/** @type {any} */ event) => {
     if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
