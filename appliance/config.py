@@ -256,6 +256,47 @@ class Relay(_Section):
     )
 
 
+class RecorderRules(_Section):
+    """The flight recorder: what was said before and after something happened. Off, for it keeps what a robot says."""
+
+    enabled: bool = Field(default=False, description="whether anything is recorded")
+    memory: Annotated[ByteSize, Field(ge=16 << 20)] = Field(
+        default=ByteSize(64 << 20),
+        description="of all relays together, for what they received last; it survives them",
+    )
+    before: Annotated[Seconds, Field(le=3600)] = Field(default=60, description="seconds before what happened")
+    after: Annotated[Seconds, Field(le=3600)] = Field(default=10, description="seconds after it")
+    longest: Annotated[Seconds, Field(le=3600)] = Field(
+        default=600, description="seconds of one recording, however much happens in it"
+    )
+    topics: list[str] = Field(default=["/*"], description="what is recorded: names, `*` is anything")
+    never: list[str] = Field(
+        default=[
+            "sensor_msgs/Image",
+            "sensor_msgs/CompressedImage",
+            "theora_image_transport/Packet",
+            "audio_common_msgs/AudioData",
+            "audio_common_msgs/AudioDataStamped",
+        ],
+        description="names or types that are never recorded; unless it is given: cameras and microphones",
+    )
+    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm"]] = Field(
+        default=["drop", "verdict", "fault", "alarm"],
+        description="what begins a recording, besides an operator",
+    )
+    per_hour: Count = Field(default=6, description="recordings that triggers of one kind may begin")
+    disk: Annotated[ByteSize, Field(ge=64 << 20)] = Field(
+        default=ByteSize(2 << 30), description="of all recordings; one has an eighth of it at most"
+    )
+    days: Seconds | None = Field(default=30, description="after which a recording is removed; null: never")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.longest < self.before + self.after:
+            raise ValueError(f"longest is {self.longest:g}, and before and after are more together")
+        return self
+
+
 class Firewall(_Section):
     """The firewall around the ROSMaster (isolation netns and container)."""
 
@@ -422,6 +463,7 @@ class Settings(_Section):
     audit: Audit = Audit()
     liveness: Liveness = Liveness()
     relay: Relay = Relay()
+    recorder: RecorderRules = RecorderRules()
     firewall: Firewall = Firewall()
     ipsec: Ipsec = Ipsec()
     api_limits: ApiLimits = ApiLimits()

@@ -13,7 +13,17 @@ from typing import Any, Generic, Literal, TypeVar, cast, get_args
 
 import msgspec
 
-from appliance.channel.answers import graph, hosts, inventory, measures, monitors, policy, status, tokens
+from appliance.channel.answers import (
+    graph,
+    hosts,
+    inventory,
+    measures,
+    monitors,
+    policy,
+    recordings,
+    status,
+    tokens,
+)
 from appliance.channel.answers.tokens import TokenRole
 
 A = TypeVar("A")
@@ -198,6 +208,39 @@ MonitorChange = (
 )  # fmt: skip
 
 
+class RecordingsWanted(AdminRequest[recordings.Recordings], frozen=True, tag="recordings"):
+    """The recordings that are kept."""
+
+
+class RecordingWanted(AdminRequest[recordings.Recording], frozen=True, tag="recording"):
+    """One of them."""
+
+    id: str
+
+
+class RecordNow(AdminRequest[recordings.RecordingBegun], frozen=True, tag="record now"):
+    """Record from `before` seconds before now to `after` seconds after; None: as configured."""
+
+    before: float | None = None
+    after: float | None = None
+    note: str = ""
+
+
+class RecordingFetch(AdminRequest[recordings.Recording], frozen=True, tag="recording fetch"):
+    """Somebody takes the messages of a recording: it is recorded who."""
+
+    id: str
+
+
+class RecordingRemove(AdminRequest[recordings.Recording], frozen=True, tag="recording remove"):
+    """Remove a recording."""
+
+    id: str
+
+
+RecorderRequest = RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRemove
+
+
 class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
     """Make a token that ends after `seconds`; the answer is the only place where its text ever stands."""
 
@@ -349,7 +392,7 @@ _Common = (
     | HostRequest
 )  # fmt: skip
 RestRequest = _Common | ChallengeWanted
-AnyRequest = _Common | TokenAdd
+AnyRequest = _Common | RecorderRequest | TokenAdd
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]

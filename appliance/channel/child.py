@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
-from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, Stop
+from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, RingGiven, Stop
 
 
 class Child:
@@ -24,12 +24,14 @@ class Child:
         *,
         said: Callable[[Any], None],
         linked: Callable[[], None] = lambda: None,
+        ring_given: Callable[[RingGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
-        """`link` is the union of the messages of the link to control."""
+        """`link` is the union of the messages of the link to control; `ring_given` takes over the descriptor."""
         self._lifeline = lifeline
         self._link = link
         self._said = said
         self._linked = linked
+        self._ring_given = ring_given
         self._control: Channel | None = None
         self.ended = asyncio.Event()
 
@@ -63,6 +65,8 @@ class Child:
                 self.ended.set()
             case LinkOpened(role="control"):
                 self._open(descriptors[0])
+            case RingGiven():
+                self._ring_given(message, descriptors[0])
             case _:
                 for descriptor in descriptors:
                     os.close(descriptor)

@@ -44,4 +44,5 @@ def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Comple
 monitors = _names(admin.MonitorsWanted(), lambda body: [row.name for row in body.monitors])
 hosts = _names(admin.HostList(), lambda body: [row.name for row in body.hosts])
 tokens = _names(admin.TokenList(), lambda body: [row.name for row in body.tokens])
+recordings = _names(admin.RecordingsWanted(), lambda body: [row.id for row in body.recordings])
 topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topics])

@@ -119,6 +119,26 @@ VERBS: dict[str, Verb | Group] = {
             ),
         },
     ),
+    "record": Group(
+        "The flight recorder: what was said before and after something happened.",
+        {
+            "now": Verb(
+                "appliance.cli.record:now",
+                "Record the last seconds, and the next ones, of what the robot says.",
+            ),
+            "list": Verb(
+                "appliance.cli.record:list_recordings", "List the recordings that are kept, the oldest first."
+            ),
+            "show": Verb("appliance.cli.record:show", "Show why a recording was made, and what it has."),
+            "fetch": Verb(
+                "appliance.cli.record:fetch",
+                "Write a recording's bag to a file; it is recorded who fetched it.",
+            ),
+            "remove": Verb(
+                "appliance.cli.record:remove", "Remove a recording; it is recorded who removed it."
+            ),
+        },
+    ),
     "sign": Verb(
         "appliance.cli.sign:sign",
         "Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.",

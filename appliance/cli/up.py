@@ -86,7 +86,11 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     node_ports = read_inputs(settings)
     run_appliance(
         settings,
-        roles_of(api=settings.api_address is not None, syslog=settings.audit.syslog.to is not None),
+        roles_of(
+            api=settings.api_address is not None,
+            syslog=settings.audit.syslog.to is not None,
+            recorder=settings.recorder.enabled,
+        ),
         partial(_announce, as_json=as_json),
         node_ports=node_ports,
     )

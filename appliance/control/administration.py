@@ -1,8 +1,8 @@
 """What operators can do with the running appliance, over the admin socket and over REST alike.
 
 One core for both: a request of `appliance.channel.admin` in, an answer out. A request is answered by the method that
-takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders` or `TokenOrders`. To add a question, write the
-request and the struct that answers it, and such a method.
+takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders`, `TokenOrders` or `RecordingOrders`. To add a
+question, write the request and the struct that answers it, and such a method.
 """
 
 import inspect
@@ -18,6 +18,7 @@ from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
+from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
 from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import TokenRefusedError
 from appliance.hosts.table import (
@@ -42,24 +43,19 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     HostForbiddenError: "forbidden",
     HostRefusedError: "refused",
     TokenRefusedError: "refused",
+    RecorderAwayError: "failed",
 }
+_Orders = PolicyOrders | MonitorOrders | HostOrders | TokenOrders | RecordingOrders
 _Method = Callable[..., Awaitable[Any]]
 
 
 class Administration:
     """Carries out requests."""
 
-    def __init__(
-        self,
-        looks: Looks,
-        policy: PolicyOrders,
-        monitors: MonitorOrders,
-        hosts: HostOrders,
-        tokens: TokenOrders,
-    ) -> None:
+    def __init__(self, looks: Looks, *orders: _Orders) -> None:
         self._looks = looks
         self._methods: dict[type, tuple[_Method, bool]] = {}
-        for part in (looks, policy, monitors, hosts, tokens):
+        for part in (looks, *orders):
             for _name, method in inspect.getmembers(part, inspect.iscoroutinefunction):
                 kind, names = request_of(method)
                 if kind is not None:

@@ -55,6 +55,7 @@ from appliance.master.upkeep.reconcile import Reconciler
 from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy
 from appliance.policy.model import Address
+from appliance.ros import log_message
 from appliance.ros.standard import standard_definitions
 from appliance.rpc.bulk import bulk_turns
 from appliance.shares.pool import Pool
@@ -351,7 +352,7 @@ class Parts:
 
     def _published(self) -> dict[str, str]:
         """The topics that the appliance's own publisher has, and their types."""
-        own = {rosout.TOPIC: rosout.TYPE} if self._base.settings.monitors_on_rosout else {}
+        own = {rosout.TOPIC: log_message.TYPE} if self._base.settings.monitors_on_rosout else {}
         return own | self.monitors.checked.publications
 
 

@@ -36,6 +36,7 @@ from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
+from appliance.control.recording_orders import RecordingOrders
 from appliance.control.rest import RestLink
 from appliance.control.robot import own_address, robot_addresses
 from appliance.control.signing import Signing
@@ -223,6 +224,11 @@ class _Control:
         if self._lifeline.announced:
             self._tokens.told()
         self._forwarded = Forwarded(self._settings.audit.syslog, base.trail)
+        self._recordings = RecordingOrders(
+            self._settings.recorder,
+            base.trail,
+            lambda: messages.RevisionsStated(base.policies.revision, parts.monitors.revision),
+        )
         looks = Looks(
             parts,
             base.policies,
@@ -238,6 +244,7 @@ class _Control:
             MonitorOrders(parts),
             HostOrders(self._hosts),
             TokenOrders(self._tokens),
+            self._recordings,
         )
         self._rest = RestLink(
             administration,
@@ -351,6 +358,8 @@ class _Control:
                 self._tunnels.attach(Channel(sock, messages.TunnelLink))
             case "syslog":
                 self._forwarded.attach(Channel(sock, messages.ForwardingLink))
+            case "recorder":
+                self._recordings.attach(Channel(sock, messages.RecorderLink))
             case _:
                 _log.error("a link leads to a process that control does not know", role=role)
                 sock.close()

@@ -5,21 +5,17 @@ each kind and second with its text, as the relay tells them, and no more than `_
 there were is said. As with a node's own logger, DEBUG is left out.
 """
 
-import struct
 import time
 from collections.abc import Callable
 
 from appliance.channel.messages import MonitorEvent, OwnHeaderStated, OwnPublished
 from appliance.ros.definitions import Definitions
+from appliance.ros.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
 
 TOPIC = "/rosout"
-TYPE = "rosgraph_msgs/Log"
 _A_SECOND = 50
-_INFO, _WARN, _ERROR = 2, 4, 8
-_LEVELS = {"DEBUG": 1, "INFO": _INFO, "WARN": _WARN, "ERROR": _ERROR, "FATAL": 16}
+_LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": FATAL}
 _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts
-_HEADER = struct.Struct("<III")
-_LENGTH = struct.Struct("<I")
 
 
 class Rosout:
@@ -47,13 +43,13 @@ class Rosout:
     def reported(self, event: MonitorEvent) -> None:
         """A monitor did something; what is not output, a verdict or a fault is left to the audit log."""
         level, text = _words(event)
-        if level < _INFO:
+        if level < INFO:
             return
         second = int(self._clock())
         if second != self._second:
             left, self._second, self._told, self._left_out = self._left_out, second, 0, 0
             if left:
-                self._say(event.time, _WARN, f"{left} more lines of monitors; the audit log has them", "")
+                self._say(event.time, WARN, f"{left} more lines of monitors; the audit log has them", "")
         if self._told >= _A_SECOND:
             self._left_out += event.count or 1
             return
@@ -73,27 +69,6 @@ def header(definitions: Definitions) -> OwnHeaderStated:
     return OwnHeaderStated(TOPIC, TYPE, definitions.md5sum(TYPE), definitions.full_text(TYPE))
 
 
-def log_message(
-    sequence: int, time_ns: int, level: int, name: str, text: str, *, file: str, function: str
-) -> bytes:
-    """A `rosgraph_msgs/Log` as its bytes on the wire; `time_ns` is since the epoch, `level` as in its definition."""
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    fields = (name, text, file, function)
-    return b"".join((
-        _HEADER.pack(sequence & 0xFFFFFFFF, seconds & 0xFFFFFFFF, nanoseconds),
-        _string(""),
-        bytes([level]),
-        *map(_string, fields),
-        _LENGTH.pack(0),  # line
-        _LENGTH.pack(0),  # topics: how many
-    ))  # fmt: skip
-
-
-def _string(text: str) -> bytes:
-    data = text.encode("utf-8", "replace")
-    return _LENGTH.pack(len(data)) + data
-
-
 def _words(event: MonitorEvent) -> tuple[int, str]:
     """The level of a report and its text; level 0 of one that is not for `/rosout`.
 
@@ -107,9 +82,9 @@ def _words(event: MonitorEvent) -> tuple[int, str]:
     if event.count:
         text = f"{event.count} more in the same second: {text}"
     if event.kind == "log":
-        return _LEVELS.get(str(level), _INFO), text
+        return _LEVELS.get(str(level), INFO), text
     if event.kind == "fault":
-        return _ERROR, text
+        return ERROR, text
     if event.kind == "verdict":
-        return (_WARN if category in _ALARMING else _INFO), text
+        return (WARN if category in _ALARMING else INFO), text
     return 0, text

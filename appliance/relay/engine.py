@@ -39,6 +39,7 @@ from appliance.relay.loop import Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.own import OwnPublisher
 from appliance.relay.monitors.places import Place
+from appliance.relay.recorded import Recorded
 from appliance.relay.report import Reporter
 from appliance.shares.pool import Standing
 
@@ -80,6 +81,7 @@ class Engine:
         self._last_rows: list[messages.TopicTraffic] = []
         self._flows = Flows(loop.clock)
         self._looks = Looks(self._reporter.send)
+        self._recorded: Recorded | None = None
         self._later: deque[tuple[messages.Message, tuple[int, ...]]] = deque()
         loop.after(limits.report_every, self._tick)
 
@@ -88,6 +90,10 @@ class Engine:
         self._link = link
         self._reporter.attach(link)
         self._looks.end_all()
+
+    def record(self, recorded: Recorded) -> None:
+        """Leave what publishers say from their next connection on with the flight recorder."""
+        self._recorded = recorded
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         """Carry out one message of control."""
@@ -217,6 +223,7 @@ class Engine:
             ),
             make_room=lambda size: self._make_room(host, size),
             refused=self._reporter.send,
+            recorded=self._recorded,
         )
         publisher: Publisher | OwnPublisher
         if node is not None and node.monitors:

@@ -12,12 +12,13 @@ from dataclasses import replace
 from typing import Any
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Lifeline, LinkOpened, Ping, Pong, Ready, RelayLink, Stop
+from appliance.channel.messages import Lifeline, LinkOpened, Ping, Pong, Ready, RelayLink, RingGiven, Stop
 from appliance.relay.connections.links import Link
 from appliance.relay.connections.sockets import congestion_control
 from appliance.relay.engine import Engine
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.recorded import Recorded
 
 _DESCRIPTORS_BESIDE = 1024
 
@@ -64,6 +65,8 @@ class RelayProcess:
             self._loop.stop()
         elif isinstance(message, LinkOpened) and message.role == "control":
             self._open_control(socket.socket(fileno=descriptors[0]))
+        elif isinstance(message, RingGiven):
+            self._engine.record(Recorded(message, descriptors[0]))
         else:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 

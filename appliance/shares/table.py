@@ -164,6 +164,29 @@ RELAY_HEADERS = Share(
         "unit/relay/connections/test_anteroom.py::test_long_headers_make_room_for_short_ones",
     ),
 )
+RECORDER_MEMORY = Share(
+    "bytes of messages that the flight recorder remembers (divided among the relays)",
+    Bounds(whole=64 << 20, host=32 << 20, strangers=0, kept=0),
+    "recorder.memory (a host's part is half of it, a topic's a quarter)",
+    "while there is room everybody may have it; then what is older than recorder.before goes first, and a topic or a"
+    " host beyond its part loses its own oldest messages",
+    "the recording says what is missing",
+    (
+        "unit/recorder/test_ring.py::test_flood_pushes_out_itself",
+        "unit/recorder/test_ring.py::test_many_topics_of_a_host_push_out_its_own",
+    ),
+)
+RECORDER_DISK = Share(
+    "bytes of recordings (a host here is one recording)",
+    Bounds(whole=2 << 30, host=256 << 20, strangers=0, kept=0),
+    "recorder.disk (one recording has an eighth of it)",
+    "the oldest recording of the kind of trigger that has most goes; a kind begins six recordings an hour",
+    "`recording removed`, `recording missed`",
+    (
+        "unit/recorder/test_shelf.py::test_who_has_most_makes_room",
+        "unit/recorder/test_recorder.py::test_a_flood_of_triggers_fills_no_disk",
+    ),
+)
 REST_CONNECTIONS = Share(
     "connections to REST, TLS handshakes included",
     Bounds(whole=512, host=64, strangers=192, kept=320),

@@ -91,9 +91,14 @@ class Role:
 
 
 def roles_of(
-    *, rosmaster: Path = ROSMASTER, rosout: Path = ROSOUT, api: bool = True, syslog: bool = False
+    *,
+    rosmaster: Path = ROSMASTER,
+    rosout: Path = ROSOUT,
+    api: bool = True,
+    syslog: bool = False,
+    recorder: bool = False,
 ) -> tuple[Role, ...]:
-    """The roles in the order they are started, with or without REST and the forwarder of the audit log.
+    """The roles in the order they are started, with or without REST, the forwarder of the audit log, the recorder.
 
     Raises `StartError` when a program is missing.
     """
@@ -128,7 +133,7 @@ def roles_of(
         ),
         ours(
             "control", "rosrv", "control", "appliance.control.process:main",
-            ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog"),
+            ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog", "recorder"),
             readable_by="rosrv-api",
             walls=lambda facts: Walls(
                 listed=True, families=ROUTES, reads=(*around(*facts.control_reads), str(DPKG)), binds=None,
@@ -152,7 +157,9 @@ def roles_of(
         ours(
             "api", "rosrv-api", "api", "appliance.api.process:main",
             ended_early=800, files=4096, after="control", listens=True, dispensable=True,
-            walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
+            walls=lambda facts: Walls(
+                listed=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
+            ),
         ),
         ours(
             "charon", "rosrv-ipsec", "ipsec", "appliance.ipsec.process:main",
@@ -174,8 +181,14 @@ def roles_of(
                 reaches=None if facts.syslog_port is None else (facts.syslog_port,),
             ),
         ),
+        ours(
+            "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
+            ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
+            network=False,
+            walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
+        ),
     )  # fmt: skip
-    wanted = {"api": api, "syslog": syslog}
+    wanted = {"api": api, "syslog": syslog, "recorder": recorder}
     return tuple(role for role in roles if wanted.get(role.name, True))
 
 

@@ -17,6 +17,7 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
 from appliance.supervisor.restore_mark import refuse_half_restored
+from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state import StateDirectory
@@ -209,6 +210,7 @@ def _supervise(
             relays=settings.relays,
             enclosure=enclosure,
             listeners={"api": api} if api is not None else {},
+            rings=Rings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
         )
         async with manager.watched():
             try:

@@ -43,6 +43,7 @@ from appliance.supervisor.life import (
     link,
 )
 from appliance.supervisor.post import Post
+from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.users import account_of
 
@@ -96,17 +97,19 @@ class Supervisor:
         relays: int = 1,
         enclosure: Enclosure | None = None,
         listeners: Mapping[str, socket.socket] | None = None,
+        rings: Rings | None = None,
     ) -> None:
         """`admin` is handed to control; `ready` is called once, when nodes may connect; it may raise `StartError`.
 
         `listeners` are the sockets of the roles that listen; they stay open here over a role's death, so that
-        connections wait for its next life.
+        connections wait for its next life. `rings` is the memory of the flight recorder; None: nothing is recorded.
         """
         self._facts = facts
         self._posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
         self._kept = KeptSockets()
         self._kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
+        self._rings = rings
         self._ready = ready
         self._is_ready = False
         self._guard = Guard(enclosure or Enclosure(), self._tell_control)
@@ -145,6 +148,8 @@ class Supervisor:
             self._kept.close()
             for listener in self._listeners.values():
                 listener.close()
+            if self._rings is not None:
+                self._rings.close()
 
     def stop(self, failure: str | None = None) -> None:
         """End the appliance; `failure` is why it cannot go on, nothing for an orderly end."""
@@ -227,6 +232,8 @@ class Supervisor:
             post.life.send(
                 messages.SocketRestored(post.role.name), (self._listeners[post.role.name].fileno(),)
             )
+        for given, descriptor in self._rings.given_to(post.role.name, post.index) if self._rings else ():
+            post.life.send(given, (descriptor,))
         self._link(post)
         self._tell_processes()
 

@@ -19,6 +19,7 @@ NUMERIC_IDS = {
     "rosrv-ipsec": 61016,
     "rosrv-syslog": 61017,
     "rosrv-rosout": 61018,
+    "rosrv-recorder": 61019,
 }
 
 

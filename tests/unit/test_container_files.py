@@ -31,7 +31,7 @@ def test_every_process_is_in_the_table_of_rights() -> None:
     text = (ROOT / "docs" / "next-to-your-robot.md").read_text()
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", text, re.MULTILINE)
     documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
-    roles = roles_of(rosmaster=TRUE, rosout=TRUE, api=True, syslog=True)
+    roles = roles_of(rosmaster=TRUE, rosout=TRUE, api=True, syslog=True, recorder=True)
     expected = {role.name: (role.user, set(role.capabilities)) for role in roles}
     assert documented == expected | {"supervisor": ("root", granted())}
 

@@ -15,6 +15,7 @@ from appliance.channel.messages.api import *
 from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *
+from appliance.channel.messages.recorder import *
 from appliance.channel.messages.relay import *
 from appliance.channel.messages.signer import *
 from appliance.channel.messages.tunnels import *

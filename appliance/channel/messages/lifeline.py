@@ -6,6 +6,7 @@ import msgspec
 
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.messages.message import Message
+from appliance.channel.messages.recorder import RingGiven
 from appliance.channel.messages.signer import SignatureMade, SignatureWanted
 from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
@@ -166,5 +167,5 @@ Lifeline = (
     | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
-    | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade
+    | RingGiven | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip

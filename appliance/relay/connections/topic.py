@@ -29,6 +29,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
+from appliance.recorder.ring import Stream
 from appliance.relay.connections.delays import Delays
 from appliance.relay.connections.first_words import APPEARED, FirstWords
 from appliance.relay.connections.flow import Part, PublicationFlow
@@ -91,6 +92,13 @@ class Upstream(Protocol):
         """Have a latching publisher give its message again."""
 
 
+class Recorder(Protocol):
+    """The flight recorder, as a topic sees it."""
+
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
+        """A publisher is connected; None: what it says is not recorded."""
+
+
 Through = Callable[[Batch], Batch | None]
 """Monitors: the frames that go on, as they leave them; None when none does."""
 
@@ -117,6 +125,7 @@ class RelayedTopic:
         limited: Callable[[Part, int, int], None],
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
+        recorded: Recorder | None,
     ) -> None:
         self.key = key
         self.topic = topic
@@ -129,6 +138,8 @@ class RelayedTopic:
         self.flow = PublicationFlow(share, limited)
         self._make_room = make_room
         self._refused = refused
+        self._recorder = recorded
+        self._recording: Stream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
@@ -212,6 +223,9 @@ class RelayedTopic:
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
         self._connected = True
+        self._end_recording()
+        if self._recorder is not None:
+            self._recording = self._recorder.open(self.topic, self.host, header)
         self._listen()
         if before is not None and _identity(before) != _identity(header):
             for member in self._served:
@@ -230,6 +244,7 @@ class RelayedTopic:
 
     def upstream_closed(self) -> None:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
+        self._end_recording()
         self._latch(None)
         self.flow.forget()
         self._withheld = False
@@ -238,6 +253,11 @@ class RelayedTopic:
         self._forget_first_words()
         self._forget_header()
 
+    def _end_recording(self) -> None:
+        if self._recording is not None:
+            self._recording.close()
+            self._recording = None
+
     def received(self, batch: Batch, since: float) -> None:
         """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers."""
         self._messages += batch.messages
@@ -245,6 +265,8 @@ class RelayedTopic:
         self._reported = False
         batch.first = self._next
         self._next += batch.messages
+        if self._recording is not None:
+            self._recording.write(batch.view, batch.messages, batch.first)
         if self.flow:
             passing = self.flow.passing(batch, self._clock(), latching=self._latching)
             if passing is None:
@@ -266,6 +288,9 @@ class RelayedTopic:
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False
+        if self._recording is not None:
+            self._recording.write(batch.view, batch.messages, self._next)
+        self._next += batch.messages
         self._pass_on(batch)
 
     def _pass_on(self, batch: Batch) -> None:
@@ -293,6 +318,7 @@ class RelayedTopic:
 
     def cut_all(self, reason: str) -> None:
         """The topic is withdrawn: every subscriber's connection is closed."""
+        self._end_recording()
         for member in self.members:
             member.cut(reason)
 

@@ -46,6 +46,7 @@ MAY = {
     "api": (UNIX, False, [False, False]),
     "charon": (ROUTES, False, [False, False]),
     "syslog": (ROUTES, False, [True, False]),
+    "recorder": (UNIX, False, [False, False]),
 }
 WITHOUT_PRIVILEGE = {
     "ptrace",
@@ -77,7 +78,7 @@ class Place:
     """What the roles are started in."""
 
     def __init__(self, directory: Path) -> None:
-        self.roles = {role.name: role for role in roles_of(syslog=True)}
+        self.roles = {role.name: role for role in roles_of(syslog=True, recorder=True)}
         self.state = StateDirectory(directory / "state")
         self.state.prepare(self.roles.values())
         self.state.write_config("{}")

@@ -9,7 +9,14 @@ import pytest
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph import TopicMessage
-from appliance.control import host_orders, looks, monitor_orders, policy_orders, token_orders
+from appliance.control import (
+    host_orders,
+    looks,
+    monitor_orders,
+    policy_orders,
+    recording_orders,
+    token_orders,
+)
 from appliance.control.administration import request_of
 
 METHODS = [
@@ -20,6 +27,7 @@ METHODS = [
         monitor_orders.MonitorOrders,
         host_orders.HostOrders,
         token_orders.TokenOrders,
+        recording_orders.RecordingOrders,
     )
     for _name, method in inspect.getmembers(part, inspect.iscoroutinefunction)
 ]

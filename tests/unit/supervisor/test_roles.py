@@ -45,7 +45,7 @@ def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Pat
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
     """If one end of a link is new, the row of that end says so: a restart of either renews it."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True)}
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True)}
     for role in roles.values():
         for other in role.links:
             assert role.name in roles[other].links
@@ -62,9 +62,19 @@ def test_the_forwarder_is_there_when_it_has_something_to_do() -> None:
     assert not forwarder.capabilities
 
 
+def test_the_recorder_is_there_when_it_is_wanted() -> None:
+    """It has a user of its own and no network, reads the audit log, and its recordings are for the api to read."""
+    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, recorder=True)}
+    recorder = roles["recorder"]
+    assert "recorder" not in {role.name for role in roles_of(rosmaster=HERE, rosout=HERE)}
+    assert recorder.user not in {role.user for role in roles.values() if role is not recorder}
+    assert recorder.group == recorder.readable_by == roles["api"].user
+    assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
+
+
 def test_rows_are_consistent() -> None:
     """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
-    roles = roles_of(rosmaster=HERE, rosout=HERE, syslog=True)
+    roles = roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True)
     assert all(role.user in NUMERIC_IDS for role in roles)
     assert all((role.entry is None) != (role.program is None) for role in roles)
     parts = [role.part for role in roles if role.entry]

@@ -87,11 +87,11 @@ def test_what_an_older_kernel_does_not_limit_is_told(abi: int, lacks: int) -> No
 
 def test_every_process_of_ours_is_listed_but_that_which_starts_charon() -> None:
     """Who parses what strangers send has a list, and only programs of others (and their starter) run programs."""
-    for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True):
+    for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True):
         walls = role.walls(FACTS)
         assert walls.listed is (role.name not in {"rosmaster", "rosout", "charon"}), role.name
         assert bool(walls.programs) is not walls.listed
-        assert (walls.families == UNIX) is (role.name in {"signer", "api"})
+        assert (walls.families == UNIX) is (role.name in {"signer", "api", "recorder"})
         assert role.network or (walls.families, walls.binds, walls.reaches) == (UNIX, (), ())
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
 from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.connections.topic import Recorder, RelayedTopic
 from tests.support.relay_memory import share
 
 HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
@@ -96,7 +96,9 @@ class RecordedMember:
 class Story:
     """A topic with a clock that a test sets."""
 
-    def __init__(self, *, memory: int = 1 << 30, fresh: bool = True) -> None:
+    def __init__(
+        self, *, memory: int = 1 << 30, fresh: bool = True, recorded: Recorder | None = None
+    ) -> None:
         self.now = 100.0
         self.share = share(memory)
         self.refused: list[LatchRefused] = []
@@ -113,6 +115,7 @@ class Story:
             limited=lambda *row: self.limited.append(row),
             make_room=lambda _size: None,
             refused=self.refused.append,
+            recorded=recorded,
         )
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream

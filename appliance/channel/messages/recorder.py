@@ -1,0 +1,109 @@
+"""The recorder's links: the memory that the supervisor gives to relays and recorder, and control <-> the recorder."""
+
+from typing import ClassVar
+
+from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.messages.message import Message
+
+
+class RingGiven(Message):
+    """The supervisor gives relay `index`, and the recorder, the memory in which that relay leaves what it receives.
+
+    It was made at `since` (nanoseconds since the epoch). The relay keeps `seconds` of the topics of which a glob of
+    `topics` fits the name, but none of which one of `never` fits the name or the type.
+    """
+
+    descriptors: ClassVar[int] = 1
+    index: int
+    since: int
+    seconds: float
+    topics: list[str]
+    never: list[str]
+
+
+class RecordingsAsked(Message):
+    """Control asks which recordings are kept, and to be told again of those that it has not noted."""
+
+
+class RecordingsStated(Message):
+    """All recordings that are kept, the oldest first."""
+
+    recordings: list[Recording]
+
+
+class RevisionsWanted(Message):
+    """The recorder asks what is in force."""
+
+
+class RevisionsStated(Message):
+    """The revisions of policy and specifications in force."""
+
+    policy: int
+    monitors: int
+
+
+class RecordingClosed(Message):
+    """A recording is whole; told again until control has noted it."""
+
+    recording: Recording
+
+
+class RecordingNoted(Message):
+    """Control has made an audit record of a recording."""
+
+    id: str
+
+
+class RecordingWanted(Message):
+    """Control asks for a recording from `before` seconds before now (`trigger`) to `after` seconds after."""
+
+    number: int
+    trigger: Trigger
+    before: float
+    after: float
+
+
+class RecordingBegun(Message):
+    """What was asked for as `number` is or becomes a part of recording `id`, which ends at `ends` (ns) or later."""
+
+    number: int
+    id: str
+    ends: int
+
+
+class RecordingRemovalWanted(Message):
+    """Control asks to remove a recording for `who`."""
+
+    number: int
+    id: str
+    who: str
+
+
+class RecordingRemoved(Message):
+    """A recording is gone: for `who` (then `number` is that of the order), or because of `reason`."""
+
+    number: int
+    recording: Recording
+    who: str
+    reason: str
+
+
+class RecordingRefused(Message):
+    """What was asked for as `number` is not done; `unknown`: there is no such recording."""
+
+    number: int
+    reason: str
+    unknown: bool = False
+
+
+class RecordingMissed(Message):
+    """Something that is a trigger made no recording, and why; told once in a while only."""
+
+    trigger: Trigger
+    reason: str
+
+
+RecorderLink = (
+    RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingClosed | RecordingNoted
+    | RecordingWanted | RecordingBegun | RecordingRemovalWanted | RecordingRemoved | RecordingRefused | RecordingMissed
+)  # fmt: skip

@@ -1,0 +1,197 @@
+"""Control's end of the link to the flight recorder: what operators ask of it, and what the audit log has of it."""
+
+import asyncio
+import itertools
+import time
+from collections.abc import Callable
+
+from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
+from appliance.channel import admin, messages
+from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger
+from appliance.channel.channel import Channel
+from appliance.config import RecorderRules
+from appliance.control.errors import SenselessError, UnknownThingError
+
+_PATIENCE_SECONDS = 10.0
+_LONGEST_NOTE = 300
+_Answer = messages.RecordingBegun | messages.RecordingRemoved | messages.RecordingRefused
+
+
+class RecorderAwayError(Exception):
+    """The recorder does not run, or cannot do what it was asked."""
+
+
+class RecordingOrders:
+    """Each method with a request answers it. They raise `RecorderAwayError`, `UnknownThingError`, `SenselessError`.
+
+    `in_force()` are the revisions that a recording is described with.
+    """
+
+    def __init__(
+        self, rules: RecorderRules, trail: AuditTrail, in_force: Callable[[], messages.RevisionsStated]
+    ) -> None:
+        self._rules = rules
+        self._trail = trail
+        self._in_force = in_force
+        self._channel: Channel | None = None
+        self._kept: dict[str, Recording] = {}
+        self._numbers = itertools.count(1)
+        self._asked: dict[int, asyncio.Future[_Answer]] = {}
+
+    def attach(self, channel: Channel) -> None:
+        """A recorder is there."""
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = channel
+
+        def received(message: object, _descriptors: tuple[int, ...]) -> None:
+            if self._channel is channel:
+                self._received(channel, message)
+
+        def lost(_reason: str = "") -> None:
+            if self._channel is channel:
+                self._channel = None
+                for waiting in self._asked.values():
+                    waiting.cancel()
+
+        channel.attach(asyncio.get_running_loop(), received, lost, lost)
+
+    # --- what operators ask -------------------------------------------------------------------------------
+
+    async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
+        """Those that are kept, the oldest first."""
+        self._require()
+        return Recordings([self._kept[name] for name in sorted(self._kept)])
+
+    async def recording(self, request: admin.RecordingWanted) -> Recording:
+        """One of them."""
+        self._require()
+        return self._find(request.id)
+
+    async def now(self, request: admin.RecordNow, who: str) -> RecordingBegun:
+        """Record, whatever happens."""
+        self._require()
+        before = self._rules.before if request.before is None else request.before
+        after = self._rules.after if request.after is None else request.after
+        if not 0 <= before <= self._rules.longest or not 0 < after <= self._rules.longest:
+            raise SenselessError(
+                f"before is 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
+            )
+        record = self._trail.happened(
+            "recording ordered",
+            request.note[:_LONGEST_NOTE],
+            severity=Severity.NOTICE,
+            who=who,
+            before=before,
+            after=after,
+        )
+        text = f"{who}: {request.note}" if request.note else who
+        trigger = Trigger(time.time_ns(), "order", record, text[:_LONGEST_NOTE])
+        answer = await self._ask(lambda number: messages.RecordingWanted(number, trigger, before, after))
+        assert isinstance(answer, messages.RecordingBegun)  # noqa: S101  what this order is answered with
+        return RecordingBegun(answer.id, answer.ends)
+
+    async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
+        """Say that somebody takes its messages, which he reads where they lie."""
+        self._require()
+        recording = self._find(request.id)
+        self._trail.happened(
+            "recording fetched",
+            f"by {who}",
+            severity=Severity.NOTICE,
+            recording=recording.id,
+            sha256=recording.sha256,
+            who=who,
+        )
+        return recording
+
+    async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
+        """Take it away."""
+        self._require()
+        answer = await self._ask(lambda number: messages.RecordingRemovalWanted(number, request.id, who))
+        assert isinstance(answer, messages.RecordingRemoved)  # noqa: S101  what this order is answered with
+        return answer.recording
+
+    def _require(self) -> None:
+        if not self._rules.enabled:
+            raise RecorderAwayError(
+                "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
+            )
+        if self._channel is None:
+            raise RecorderAwayError("the flight recorder does not run at the moment")
+
+    def _find(self, recording_id: str) -> Recording:
+        if recording_id not in self._kept:
+            raise UnknownThingError(f"there is no recording {recording_id[:40]}")
+        return self._kept[recording_id]
+
+    async def _ask(self, order: Callable[[int], messages.Message]) -> _Answer:
+        """The recorder's answer to an order, which is given a number."""
+        number = next(self._numbers)
+        future: asyncio.Future[_Answer] = asyncio.get_running_loop().create_future()
+        self._asked[number] = future
+        try:
+            if self._channel is not None:
+                self._channel.send(order(number))
+            answer = await asyncio.wait_for(future, _PATIENCE_SECONDS)
+        except (TimeoutError, asyncio.CancelledError):
+            raise RecorderAwayError("the flight recorder did not answer") from None
+        finally:
+            del self._asked[number]
+        if isinstance(answer, messages.RecordingRefused):
+            raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
+        return answer
+
+    # --- what the recorder says ---------------------------------------------------------------------------
+
+    def _received(self, channel: Channel, message: object) -> None:
+        match message:
+            case messages.RecordingsStated(recordings):
+                self._kept = {recording.id: recording for recording in recordings}
+            case messages.RevisionsWanted():
+                channel.send(self._in_force())
+            case messages.RecordingClosed(recording):
+                self._closed(recording)
+                channel.send(messages.RecordingNoted(recording.id))
+            case messages.RecordingMissed(trigger, reason):
+                self._trail.happened(
+                    "recording missed",
+                    reason,
+                    severity=Severity.WARNING,
+                    what=trigger.what,
+                    record=trigger.record,
+                )
+            case messages.RecordingRemoved(_number, recording, who, reason):
+                self._kept.pop(recording.id, None)
+                self._trail.happened(
+                    "recording removed",
+                    reason or f"by {who}",
+                    severity=Severity.NOTICE,
+                    recording=recording.id,
+                    sha256=recording.sha256,
+                    who=who or "recorder",
+                )
+                self._answered(message)
+            case messages.RecordingBegun() | messages.RecordingRefused():
+                self._answered(message)
+
+    def _answered(self, message: _Answer) -> None:
+        future = self._asked.get(message.number)
+        if future is not None and not future.done():
+            future.set_result(message)
+
+    def _closed(self, recording: Recording) -> None:
+        self._kept[recording.id] = recording
+        self._trail.happened(
+            "recording closed",
+            "complete" if recording.complete else f"not complete: {recording.why_not}",
+            severity=Severity.NOTICE,
+            recording=recording.id,
+            sha256=recording.sha256,
+            size=recording.size,
+            began=recording.began,
+            ended=recording.ended,
+            complete=recording.complete,
+            triggers=[f"{trigger.what} {trigger.record}" for trigger in recording.triggers],
+        )

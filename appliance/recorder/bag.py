@@ -1,0 +1,154 @@
+"""Writes bags of ROS 1 (format 2.0) in pieces, so that what a fallen writer began is finished by the next.
+
+`rosbags` writes no field of its own into the header of a connection (which host sent it), and cannot go on with a bag
+that another process began; this can. Chunks are not compressed; each is followed by its index. What `close` needs to
+know of them it reads back from the file, so all there is to keep between two lives is how long the file was, and the
+connections. Format: http://wiki.ros.org/Bags/Format/2.0.
+"""
+
+import struct
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+_MAGIC = b"#ROSBAG V2.0\n"
+_HEAD_SIZE = 4096
+_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
+_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 6, 7))
+_INDEX_ENTRY = struct.Struct("<III")
+_COUNT = struct.Struct("<II")
+_BILLION = 1_000_000_000
+
+
+class Message(NamedTuple):
+    """A message of a connection; `time` is nanoseconds since the epoch."""
+
+    connection: int
+    time: int
+    body: bytes | memoryview
+
+
+class BagWriter:
+    """Writes the bag at `path`, after the first `size` bytes of what is there already (0: anew)."""
+
+    def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
+        """`connections` are the headers of those that the first `size` bytes have."""
+        self._connections = dict(connections)
+        self._file: BinaryIO = path.open("r+b" if size else "w+b")
+        if size:
+            self._file.truncate(size)
+            self._file.seek(size)
+        else:
+            self._file.write(_MAGIC + _bag_header(0, 0, 0))
+
+    def connect(self, header: Mapping[str, str]) -> int:
+        """Begin a connection with this header (topic, type, md5sum, message_definition, callerid, …); its number."""
+        number = len(self._connections)
+        self._connections[number] = dict(header)
+        return number
+
+    def write(self, messages: Iterable[Message]) -> int:
+        """Write these as one chunk; how long the file is now. No message, no chunk."""
+        chunk, index = bytearray(), dict[int, list[bytes]]()
+        first, last = 1 << 63, 0
+        for message in messages:
+            if message.connection not in index:
+                index[message.connection] = []
+                chunk += self._connection(message.connection)
+            stamp = divmod(message.time, _BILLION)
+            index[message.connection].append(_INDEX_ENTRY.pack(*stamp, len(chunk)))
+            conn, time = _U32.pack(message.connection), struct.pack("<II", *stamp)
+            chunk += _record({"op": _MESSAGE, "conn": conn, "time": time}, message.body)
+            first, last = min(first, message.time), max(last, message.time)
+        if index:
+            size = _U32.pack(len(chunk))
+            self._file.write(_record({"op": _CHUNK, "compression": b"none", "size": size}, chunk))
+            for number, entries in index.items():
+                fields = {"op": _INDEX, "ver": _U32.pack(1), "conn": _U32.pack(number)}
+                self._file.write(_record(fields | {"count": _U32.pack(len(entries))}, b"".join(entries)))
+        self._file.flush()
+        return self._file.tell()
+
+    def leave(self) -> None:
+        """End without an index: another writer may go on."""
+        self._file.close()
+
+    def close(self) -> None:
+        """Write the index of the whole, and end."""
+        with self._file:
+            end = self._file.tell()
+            infos = self._chunk_infos(end)
+            self._file.seek(end)
+            for number in self._connections:
+                self._file.write(self._connection(number))
+            for info in infos:
+                self._file.write(info)
+            self._file.seek(len(_MAGIC))
+            self._file.write(_bag_header(end, len(self._connections), len(infos)))
+
+    def _connection(self, number: int) -> bytes:
+        header = self._connections[number]
+        fields = {"op": _CONNECTION, "conn": _U32.pack(number), "topic": header["topic"].encode()}
+        return _record(
+            fields,
+            _fields({name: value.encode("utf-8", "surrogateescape") for name, value in header.items()}),
+        )
+
+    def _chunk_infos(self, end: int) -> list[bytes]:
+        """A record for each chunk: where it is, its time, and how many messages of which connection it has."""
+        chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
+        at = len(_MAGIC) + _HEAD_SIZE
+        while at < end:
+            self._file.seek(at)
+            fields = self._read_fields()
+            size = _U32.unpack(self._file.read(4))[0]
+            if fields["op"] == _CHUNK:
+                chunks.append((at, [], []))
+            else:
+                times = [(entry[0], entry[1]) for entry in _INDEX_ENTRY.iter_unpack(self._file.read(size))]
+                self._file.seek(-size, 1)
+                chunks[-1][1].append((_U32.unpack(fields["conn"])[0], len(times)))
+                chunks[-1][2].extend((min(times), max(times)))
+            at = self._file.tell() + size
+        return [
+            _record(
+                {
+                    "op": _CHUNK_INFO,
+                    "ver": _U32.pack(1),
+                    "chunk_pos": _U64.pack(place),
+                    "start_time": struct.pack("<II", *min(times)),
+                    "end_time": struct.pack("<II", *max(times)),
+                    "count": _U32.pack(len(counts)),
+                },
+                b"".join(_COUNT.pack(*count) for count in counts),
+            )
+            for place, counts, times in chunks
+        ]
+
+    def _read_fields(self) -> dict[str, bytes]:
+        data = self._file.read(_U32.unpack(self._file.read(4))[0])
+        fields, at = {}, 0
+        while at < len(data):
+            end = at + 4 + _U32.unpack_from(data, at)[0]
+            name, _, value = data[at + 4 : end].partition(b"=")
+            fields[name.decode()] = value
+            at = end
+        return fields
+
+
+def _bag_header(index: int, connections: int, chunks: int) -> bytes:
+    """The first record, padded to its fixed size."""
+    fields = {"op": _BAG, "index_pos": _U64.pack(index)}
+    fields |= {"conn_count": _U32.pack(connections), "chunk_count": _U32.pack(chunks)}
+    padding = _HEAD_SIZE - len(_record(fields, b""))
+    return _record(fields, b" " * padding)
+
+
+def _record(fields: Mapping[str, bytes], data: bytes | bytearray | memoryview) -> bytes:
+    head = _fields(fields)
+    return b"".join((_U32.pack(len(head)), head, _U32.pack(len(data)), data))
+
+
+def _fields(fields: Mapping[str, bytes]) -> bytes:
+    lines = [name.encode() + b"=" + value for name, value in fields.items()]
+    return b"".join(_U32.pack(len(line)) + line for line in lines)

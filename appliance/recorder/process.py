@@ -1,0 +1,98 @@
+"""The recorder as a process of the appliance: lifeline, link to control, and a thread that works.
+
+It has no network, reads the memory of the relays and the audit log, and writes recordings. It outlives control: what it
+has to tell waits on the shelf.
+"""
+
+import asyncio
+import contextvars
+import mmap
+import os
+import socket
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child import Child
+from appliance.config import Settings, load_resolved
+from appliance.recorder.recorder import Recorder
+from appliance.recorder.shelf import Shelf
+
+_DAY = 86_400.0
+_T = TypeVar("_T")
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    """Record until the supervisor ends it."""
+    asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
+
+
+class _Process:
+    """The parts of the process and the wires between them."""
+
+    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+        self._settings = settings
+        self._child = Child(
+            Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
+            messages.RecorderLink,
+            said=self._hear,
+            linked=lambda: self._hear(messages.RecordingsAsked()),
+            ring_given=self._ring_given,
+        )
+        self._rings: dict[int, memoryview] = {}
+        self._memory = 0
+        self._said: list[Any] = []
+        self._wake = asyncio.Event()
+
+    async def run(self) -> None:
+        """Work from start to end."""
+        self._child.attach(messages.Ready())
+        ended = asyncio.ensure_future(self._child.ended.wait())
+        recorder: Recorder | None = None
+        with ThreadPoolExecutor(1) as worker:
+            while not ended.done():
+                if len(self._rings) == self._settings.relays:
+                    if recorder is None:
+                        recorder = await _in(worker, self._make_recorder)
+                    said, self._said = self._said, []
+                    for message in await _in(worker, recorder.step, said):
+                        self._child.tell(message)
+                woken = asyncio.ensure_future(self._wake.wait())
+                pause = recorder.pause if recorder is not None else None
+                await asyncio.wait((ended, woken), timeout=pause, return_when=asyncio.FIRST_COMPLETED)
+                woken.cancel()
+                self._wake.clear()
+        if recorder is not None:
+            recorder.close()
+
+    def _make_recorder(self) -> Recorder:
+        settings, rules = self._settings, self._settings.recorder
+        return Recorder(
+            rules,
+            Shelf(
+                Path.cwd(), disk=int(rules.disk), seconds=None if rules.days is None else rules.days * _DAY
+            ),
+            settings.state / "control" / "audit.db",
+            [ring for _index, ring in sorted(self._rings.items())],
+            memory=self._memory,
+            reserve=int(settings.audit.reserve_bytes),
+        )
+
+    def _hear(self, message: Any) -> None:
+        self._said.append(message)
+        self._wake.set()
+
+    def _ring_given(self, given: messages.RingGiven, descriptor: int) -> None:
+        self._rings[given.index] = memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
+        self._memory = max(self._memory, given.since)
+        os.close(descriptor)
+        self._wake.set()
+
+
+async def _in(worker: ThreadPoolExecutor, work: Callable[..., _T], *arguments: Any) -> _T:
+    """What work in the thread returns; it logs as this process does."""
+    context = contextvars.copy_context()
+    return await asyncio.get_running_loop().run_in_executor(worker, lambda: context.run(work, *arguments))

@@ -1,0 +1,187 @@
+"""Reads what relays left in a ring, and believes nothing of it: a fallen relay can spoil its own messages, no more."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from appliance.recorder.ring import (
+    HEADER,
+    MARK,
+    MISSED,
+    NONE_BEGINS,
+    PAD,
+    RECORD,
+    REFUSED,
+    Row,
+    birth_at,
+    geometry,
+    rows,
+    words_of,
+)
+from appliance.ros.errors import ProtocolError
+from appliance.ros.tcpros import decode_header
+
+_LENGTH = struct.Struct("<I")
+_LONGEST_HEADER = 256 << 10
+_NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
+
+_Blocks = dict[int, tuple[int, Row]]
+"""The blocks of a chain by their number, each with its row."""
+
+
+class Place(NamedTuple):
+    """How far a stream was read: block of its chain, and byte in it."""
+
+    number: int
+    offset: int
+
+
+class Batch(NamedTuple):
+    """Frames that came at once, without their lengths; `time` is nanoseconds since the epoch, `first` from 1."""
+
+    time: int
+    first: int
+    frames: list[memoryview]
+
+
+class Found(NamedTuple):
+    """What is new of a stream. `torn`: something before or between was pushed out, or is damaged."""
+
+    stream: int
+    header: dict[str, str]
+    batches: list[Batch]
+    torn: bool
+
+
+@dataclass(slots=True)
+class _Run:
+    """Blocks of a chain that follow each other, and what they hold."""
+
+    number: int
+    begins: int
+    data: bytearray
+    broken: bool  # something before it is not there
+
+
+class RingReader:
+    """Reads one ring; `places` is how far each stream was read."""
+
+    def __init__(self, memory: memoryview, places: dict[int, Place] | None = None) -> None:
+        self._memory = memory
+        self._words = words_of(memory)
+        self._geometry = geometry(len(memory))
+        self.places = places or {}
+
+    @property
+    def not_there(self) -> tuple[int, int]:
+        """Messages that were too long, and streams that were refused, since the ring was made."""
+        return self._words[MISSED], self._words[REFUSED]
+
+    def read(self, since: int, until: int) -> Iterator[Found]:
+        """What has come since the last call, of the time between these two (nanoseconds since the epoch)."""
+        headers: dict[int, _Blocks] = {}
+        data: dict[int, _Blocks] = {}
+        for block, row in rows(self._memory):
+            if row.sound:
+                chains = headers if row.kind == HEADER else data
+                chains.setdefault(row.stream, {})[row.number] = block, row
+        self.places = {stream: place for stream, place in self.places.items() if stream in data}
+        for stream, blocks in data.items():
+            header = self._header(headers.get(stream, {}))
+            if header is not None:
+                batches, torn = self._new(stream, blocks, since, until)
+                if batches or torn:
+                    yield Found(stream, header, batches, torn)
+
+    def _header(self, blocks: _Blocks) -> dict[str, str] | None:
+        text = bytearray()
+        for number in range(len(blocks)):
+            part = self._copy(*blocks[number]) if number in blocks else None
+            if part is None or len(text) + len(part) > _LONGEST_HEADER:
+                return None
+            text += part
+        try:
+            header = decode_header(bytes(text[_LENGTH.size :]))
+        except ProtocolError:
+            return None
+        return header if header.keys() >= _NEEDED else None
+
+    def _copy(self, block: int, row: Row) -> bytes | None:
+        """The part of a block that counts; None if it has been taken for something else meanwhile."""
+        start = self._geometry.data + block * self._geometry.block
+        part = bytes(self._memory[start : start + min(row.used, self._geometry.block)])
+        return part if self._words[birth_at(block)] == row.birth else None
+
+    def _runs(self, blocks: _Blocks, place: Place | None) -> Iterator[_Run]:
+        """What is to be read, from `place` on; blocks that do not follow each other begin a run each."""
+        run: _Run | None = None
+        broken = False
+        for number in sorted(blocks):
+            if place is not None and number < place.number:
+                continue
+            block, row = blocks[number]
+            part = self._copy(block, row)
+            if run is not None and (
+                part is None or number != run.number + len(run.data) // self._geometry.block
+            ):
+                yield run
+                run = None
+                broken = True
+            if part is not None and run is None:
+                broken = broken or number != (0 if place is None else place.number)
+                if broken and row.begins == NONE_BEGINS:
+                    continue  # the middle of a record whose beginning is not there
+                run = _Run(number, row.begins, bytearray(), broken)
+            if part is not None and run is not None:
+                run.data += part
+        if run is not None:
+            yield run
+
+    def _new(self, stream: int, blocks: _Blocks, since: int, until: int) -> tuple[list[Batch], bool]:
+        batches: list[Batch] = []
+        place, torn = self.places.get(stream), False
+        for run in self._runs(blocks, place):
+            at = run.begins if run.broken else 0 if place is None else place.offset
+            in_doubt = (
+                run.broken
+            )  # until the first record says whether what is missing is of the time asked for
+            view = memoryview(bytes(run.data))
+            while at + _LENGTH.size <= len(view):
+                if _LENGTH.unpack_from(view, at)[0] == PAD:
+                    at = (at // self._geometry.block + 1) * self._geometry.block
+                    continue
+                if at + RECORD.size > len(view):
+                    break
+                mark, messages, size, time, first = RECORD.unpack_from(view, at)
+                if mark != MARK:
+                    torn, at = True, len(view)  # nobody knows where the next record begins
+                    break
+                torn, in_doubt = torn or (in_doubt and time >= since), False
+                end = at + RECORD.size + size
+                if end > len(view):
+                    break
+                if since <= time <= until:
+                    frames = _frames(view[at + RECORD.size : end], messages)
+                    if frames is None:
+                        torn = True
+                    else:
+                        batches.append(Batch(time, first, frames))
+                at = end
+            torn = torn or in_doubt
+            blocks_read, offset = divmod(at, self._geometry.block)
+            self.places[stream] = Place(run.number + blocks_read, offset)
+        return batches, torn
+
+
+def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
+    """The messages of a record; None where their lengths do not fill it."""
+    found: list[memoryview] = []
+    at = 0
+    while at + _LENGTH.size <= len(view) and len(found) < messages:
+        end = at + _LENGTH.size + _LENGTH.unpack_from(view, at)[0]
+        if end > len(view):
+            return None
+        found.append(view[at + _LENGTH.size : end])
+        at = end
+    return found if at == len(view) and len(found) == messages else None

@@ -1,0 +1,241 @@
+"""A recording while it is made: from the memory of the relays to a bag, a step at a time.
+
+Invariants:
+
+1. After each step the bag's length and all that is needed to go on stand in `progress`, which is replaced whole. A new
+   life of the recorder cuts the bag there and goes on: the memory still has what was not written.
+2. What is missing is said: by topic where the numbers of messages have a gap, in words where nobody can count it.
+3. A bag has no more than `largest` bytes, the decisions of its time not counted in.
+"""
+
+import hashlib
+import os
+import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit.output import Entry, as_json
+from appliance.audit.record import Severity
+from appliance.channel.answers.recordings import RecordedTopic, Recording, Trigger
+from appliance.channel.messages import RevisionsStated
+from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.reading import Found, Place, RingReader
+from appliance.recorder.shelf import ABOUT, BAG
+from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
+from appliance.ros.standard import standard_definitions
+
+RECORDS, LOG = "/rosrv/records", "/rosrv/log"
+MOST_TRIGGERS = 200
+_PROGRESS = "progress"
+_CHUNK = 1 << 20
+_MOST_NAMED = 10
+_LENGTH = struct.Struct("<I")
+_LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
+
+
+class Counted(msgspec.Struct):
+    """What was written of one topic of one type."""
+
+    topic: str
+    type: str
+    md5sum: str
+    messages: int = 0
+    bytes: int = 0
+    missed: int = 0
+
+
+class Progress(msgspec.Struct):
+    """How far a recording is; times are nanoseconds since the epoch.
+
+    `memory` is when the rings were made. `size` is the length of the bag, `connections` their headers. Of each ring:
+    how far each stream was read (`places`), which message of it comes next (`following`), and how much of it was not
+    there when the recording began.
+    """
+
+    id: str
+    memory: int
+    began: int
+    ends: int
+    triggers: list[Trigger]
+    size: int = 0
+    connections: list[dict[str, str]] = []
+    places: list[dict[int, Place]] = []
+    following: list[dict[int, int]] = []
+    not_there: list[tuple[int, int]] = []
+    topics: list[Counted] = []
+    torn: list[str] = []
+    why_not: str = ""
+    """Why it ended before its time."""
+
+
+def load_progress(folder: Path) -> Progress:
+    """How far the recording in `folder` is. Raises `OSError` and `msgspec.MsgspecError`."""
+    return msgspec.msgpack.decode((folder / _PROGRESS).read_bytes(), type=Progress)
+
+
+class RecordingInProgress:
+    """The recording that is made in `folder` of what is in `rings`; goes on after what `progress` says."""
+
+    def __init__(
+        self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
+    ) -> None:
+        """Raises `OSError`."""
+        folder.mkdir(mode=0o750, exist_ok=True)
+        folder.chmod(0o750)
+        self.progress = progress
+        self._folder = folder
+        self._largest = largest
+        self._bag = BagWriter(folder / BAG, dict(enumerate(progress.connections)), progress.size)
+        self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
+        self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}
+        places = progress.places or [{} for _ring in rings]
+        self._readers = [RingReader(ring, dict(read)) for ring, read in zip(rings, places, strict=False)]
+        if not progress.following:
+            progress.following = [{} for _ring in rings]
+            progress.not_there = [reader.not_there for reader in self._readers]
+
+    def step(self, until: int) -> None:
+        """Write what has come up to a time (nanoseconds since the epoch). Raises `OSError`."""
+        progress = self.progress
+        for number, reader in enumerate(self._readers):
+            for found in reader.read(progress.began, until):
+                self._take(found, progress.following[number])
+        progress.places = [reader.places for reader in self._readers]
+        new = self._folder / f"{_PROGRESS}.new"
+        new.write_bytes(msgspec.msgpack.encode(progress))
+        new.replace(self._folder / _PROGRESS)
+
+    def _take(self, found: Found, following: dict[int, int]) -> None:
+        progress, header = self.progress, found.header
+        row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
+        if row is None:
+            row = self._topics[kind] = Counted(*kind)
+            progress.topics.append(row)
+        if found.torn and found.stream not in following and row.topic not in progress.torn:
+            progress.torn.append(row.topic)
+        connection = self._connection(header)
+        waiting: list[Message] = []
+        size = 0
+        for batch in found.batches:
+            row.missed += batch.first - following.get(found.stream, batch.first)
+            following[found.stream] = batch.first + len(batch.frames)
+            if progress.size + size > self._largest:
+                progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
+                row.missed += len(batch.frames)
+                continue
+            for frame in batch.frames:
+                waiting.append(Message(connection, batch.time, frame))
+                size += len(frame)
+            row.messages += len(batch.frames)
+            if size > _CHUNK:
+                progress.size = self._bag.write(waiting)
+                row.bytes, waiting, size = row.bytes + size, [], 0
+        progress.size = self._bag.write(waiting)
+        row.bytes += size
+
+    def _connection(self, header: dict[str, str]) -> int:
+        """The number of a connection: a publisher that comes again with the same header has the same."""
+        number = self._numbers.get(_key(header))
+        if number is None:
+            number = self._numbers[_key(header)] = self._bag.connect(header)
+            self.progress.connections.append(dict(header))
+        return number
+
+    def leave(self) -> None:
+        """Go on no more; what is on the disk stays as it is."""
+        self._bag.leave()
+
+    def finish(self, records: Iterable[Entry], revisions: RevisionsStated) -> Recording:
+        """End the bag with the audit records of its time, and describe it: all of it is on disk then.
+
+        Raises `OSError`.
+        """
+        progress = self.progress
+        self._write_records(records)
+        self._bag.close()
+        bag = self._folder / BAG
+        with bag.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fchmod(file.fileno(), 0o640)
+            os.fsync(file.fileno())
+        why_not = self._missing()
+        recording = Recording(
+            id=progress.id,
+            began=progress.began,
+            ended=progress.ends,
+            triggers=progress.triggers,
+            topics=[RecordedTopic(**msgspec.structs.asdict(row)) for row in progress.topics],
+            policy=revisions.policy,
+            monitors=revisions.monitors,
+            size=bag.stat().st_size,
+            sha256=sha256,
+            complete=not why_not,
+            why_not=why_not,
+        )
+        with (self._folder / ABOUT).open("wb") as about:
+            about.write(msgspec.json.format(msgspec.json.encode(recording)) + b"\n")
+            about.flush()
+            os.fchmod(about.fileno(), 0o640)
+            os.fsync(about.fileno())
+        (self._folder / _PROGRESS).unlink(missing_ok=True)
+        folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        os.fsync(folder)
+        os.close(folder)
+        return recording
+
+    def _missing(self) -> str:
+        """What is not in the bag, in words; empty when nothing is missing."""
+        progress = self.progress
+        reasons = [progress.why_not] if progress.why_not else []
+        missed = sum(row.missed for row in progress.topics)
+        if missed:
+            reasons.append(f"{missed} messages had no room (see topics)")
+        if progress.torn:
+            named = ", ".join(progress.torn[:_MOST_NAMED]) + (
+                " and others" if progress.torn[_MOST_NAMED:] else ""
+            )
+            reasons.append(f"the beginning had left recorder.memory already: {named}")
+        for reader, (missed_before, refused_before) in zip(self._readers, progress.not_there, strict=False):
+            missed_now, refused_now = reader.not_there
+            if missed_now > missed_before:
+                reasons.append(f"{missed_now - missed_before} messages were too long for recorder.memory")
+            if refused_now > refused_before:
+                reasons.append(f"{refused_now - refused_before} connections had no room in recorder.memory")
+        return "; ".join(reasons)
+
+    def _write_records(self, records: Iterable[Entry]) -> None:
+        """What was decided in that time, as JSON and as lines that rqt_console shows, beside the messages."""
+        definitions = standard_definitions()
+        numbers = {
+            topic: self._connection({
+                "topic": topic,
+                "type": kind,
+                "md5sum": definitions.md5sum(kind),
+                "message_definition": definitions.full_text(kind),
+                "callerid": "/rosrv",
+                "latching": "0",
+            })
+            for topic, kind in ((RECORDS, "std_msgs/String"), (LOG, TYPE))
+        }  # fmt: skip
+        waiting: list[Message] = []
+        for entry in records:
+            record = entry.record
+            line = as_json(entry).encode()
+            waiting.append(Message(numbers[RECORDS], record.time, _LENGTH.pack(len(line)) + line))
+            text = f"{record.event}: {record.reason}" if record.reason else record.event
+            level = _LEVELS.get(record.severity, INFO)
+            file, function = record.resource or "", record.caller_id or ""
+            said = log_message(
+                entry.sequence, record.time, level, "/rosrv", text, file=file, function=function
+            )
+            waiting.append(Message(numbers[LOG], record.time, said))
+            if len(waiting) >= _CHUNK >> 9:
+                self._bag.write(waiting)
+                waiting = []
+        self._bag.write(waiting)
+
+
+def _key(header: dict[str, str]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted(header.items()))

@@ -1,0 +1,395 @@
+"""The memory in which a relay leaves what it has received last; it survives the relay, and the recorder reads it.
+
+The supervisor holds the memory; one relay writes (`RingWriter`), one recorder reads (`RingReader`). It is made of
+blocks of one size. The connection to a publisher is a *stream*: a chain of header blocks (its TCPROS header, with the
+definition of the type) and a chain of data blocks, numbered from 0. Records stand in the data chain one after another,
+over the ends of blocks: time, number of the first frame, how many frames, and the frames as they came.
+
+Invariants:
+
+1. What a block holds counts only up to `used` in its row of the table, one word that is stored after the data; a row
+   counts only while `birth`, another word, is not 0, and that is stored last. So a writer that is killed at any
+   instruction leaves whole records, and one torn record at most, at the end of a chain, which nobody reads.
+2. A block that is taken for something new gets `birth` 0 first. Who reads copies the block and looks at the row again:
+   if `birth` has changed, there is no such block.
+3. While there are free blocks everybody may have them. When there are none, what is too old goes first; then a topic
+   or a host that has its share loses its own oldest block; for the others one of those gives up its oldest that are
+   beyond theirs, and if nobody is, the oldest of all goes. So a flood pushes out itself. The block that a stream is
+   filling counts as new while it says something, however seldom.
+4. The reader believes nothing that it reads: sizes come from the memory's own size, and every number is bounded by it.
+5. Header blocks stay while their stream is open or has data; they take a quarter of the memory at most, those of a host
+   a quarter of its share. Streams that are closed make room, the oldest first. A stream that finds no room for its
+   header is not recorded, and counted (`REFUSED`), as are the messages of a record beyond the share of its topic
+   (`MISSED`).
+
+`used` and `birth` are aligned words of 64 bits. Where the processor may show stores in another order (ARM), a reader is
+told of a record's data by its next look at the latest, and it looks at what is some milliseconds old.
+"""
+
+import struct
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from appliance.ros.tcpros import encode_header
+
+SMALLEST = 1 << 20
+"""No ring is smaller than so many bytes."""
+
+HEADER, DATA = 1, 2
+RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
+MARK, PAD = 0x0001_D00D, 0x0002_D00D
+_PAD = struct.Struct("<I")
+NONE_BEGINS = (1 << 32) - 1
+
+_BLOCKS = 4096
+_SMALLEST_BLOCK, _LARGEST_BLOCK = 4 << 10, 256 << 10
+_COUNTERS = 4096  # bytes before the table
+_WORDS = 8  # of a row
+_ROW = struct.Struct("=QQQIIQ24x")  # birth, stream, number, kind, begins, used
+MISSED, REFUSED = 0, 1  # words of the counters
+_LONG = 4  # blocks; a record beyond begins with one, so that it does not depend on a block that is much older
+_MOST_NUMBER = 1 << 62
+_MOST_HEADERS = 4  # a quarter
+
+
+class Geometry(NamedTuple):
+    """Where things are in a ring; `data` is where the first block begins."""
+
+    block: int
+    blocks: int
+    data: int
+
+
+def geometry(size: int) -> Geometry:
+    """How a memory of so many bytes is divided. Raises `ValueError` for one that is too small."""
+    if size < SMALLEST:
+        raise ValueError(f"a ring of {size} bytes is too small: {SMALLEST} at least")
+    block = _SMALLEST_BLOCK
+    while block < _LARGEST_BLOCK and block * _BLOCKS < size:
+        block *= 2
+    blocks = (size - _COUNTERS) // (block + _ROW.size)
+    return Geometry(block, blocks, size - blocks * block)
+
+
+class Row(NamedTuple):
+    """What the table says of a block."""
+
+    birth: int
+    stream: int
+    number: int
+    kind: int
+    begins: int
+    used: int
+
+    @property
+    def sound(self) -> bool:
+        """Whether a writer can have written it: the numbers of a fallen one must not end up beyond a word."""
+        return (
+            0 < self.birth < _MOST_NUMBER
+            and 0 < self.stream < _MOST_NUMBER
+            and self.number < _MOST_NUMBER
+            and self.kind in {HEADER, DATA}
+        )
+
+
+@dataclass(eq=False, slots=True)
+class _Share:
+    """The data blocks of a topic or a host, the oldest first; how many header blocks and streams it has."""
+
+    most: int
+    blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
+    headers: int = 0
+    streams: int = 0
+
+
+@dataclass(eq=False, slots=True)
+class _Chain:
+    """The blocks of one stream, and whom they count for."""
+
+    shares: tuple[_Share, ...] = ()
+    names: tuple[str, str] = ("", "")
+    headers: list[int] = field(default_factory=list)
+    data: int = 0
+    writer: "Stream | None" = None
+
+
+def words_of(memory: memoryview) -> memoryview:
+    """The memory as words of 64 bits, each of which is loaded and stored at once."""
+    return memory[: len(memory) // 8 * 8].cast("Q")
+
+
+def rows(memory: memoryview) -> list[tuple[int, Row]]:
+    """The table as it is now: each block with its row."""
+    table = bytes(memory[_COUNTERS : _COUNTERS + geometry(len(memory)).blocks * _ROW.size])
+    return [(block, Row._make(row)) for block, row in enumerate(_ROW.iter_unpack(table))]
+
+
+def birth_at(block: int) -> int:
+    """Which word says when a block was taken."""
+    return _COUNTERS // 8 + block * _WORDS
+
+
+class Stream:
+    """What one connection to a publisher leaves in the ring, until it is closed."""
+
+    __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "block", "written")
+
+    def __init__(self, ring: "RingWriter", stream: int, chain: _Chain) -> None:
+        self._ring = ring
+        self._stream = stream
+        self._chain = chain
+        self._number = 0
+        self.block = -1
+        self.written = 0  # when
+        self._place = self._end = 0  # in the memory
+
+    def write(self, frames: memoryview, messages: int, first: int) -> None:
+        """Leave these frames, `first` the number of the first one."""
+        ring = self._ring
+        size = len(frames)
+        now = self.written = ring.clock()
+        place = self._place
+        end = place + RECORD.size + size
+        if end <= self._end:
+            RECORD.pack_into(ring.memory, place, MARK, messages, size, now, first)
+            ring.memory[place + RECORD.size : end] = frames
+            ring.words[ring.used_at(self.block)] = end - self._end + ring.block
+            self._place = end
+        elif size > ring.longest:
+            ring.count(MISSED, messages)
+        else:
+            self._append(memoryview(RECORD.pack(MARK, messages, size, now, first)), frames)
+
+    def close(self) -> None:
+        """Nothing more comes: its blocks stay until others need them."""
+        self._ring.close_chain(self._stream, self._chain)
+
+    def lose_block(self) -> None:
+        """The block that is being filled has been taken: the next record begins another."""
+        self.block, self._place, self._end = -1, 0, 0
+
+    def _append(self, head: memoryview, frames: memoryview) -> None:
+        """A record over the end of a block."""
+        ring = self._ring
+        left = len(head) + len(frames)
+        if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
+            _PAD.pack_into(ring.memory, self._place, PAD)
+            ring.words[ring.used_at(self.block)] = ring.block
+            self._place = self._end
+        for part in (head, frames):
+            done = 0
+            while done < len(part):
+                if self._place == self._end:
+                    begins = 0 if part is head and not done else left
+                    self._next(begins if begins < ring.block else NONE_BEGINS)
+                count = min(len(part) - done, self._end - self._place)
+                ring.memory[self._place : self._place + count] = part[done : done + count]
+                self._place += count
+                ring.words[ring.used_at(self.block)] = self._place - self._end + ring.block
+                done += count
+                left -= count
+
+    def _next(self, begins: int) -> None:
+        self.block = self._ring.take(self._stream, self._number, DATA, begins, self._chain)
+        self._number += 1
+        self._place = self._ring.geometry.data + self.block * self._ring.block
+        self._end = self._place + self._ring.block
+
+
+class RingWriter:
+    """Writes into `memory` (shared, writable), after whoever wrote there before.
+
+    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need it;
+    what is older than `seconds` goes first.
+    """
+
+    def __init__(
+        self,
+        memory: memoryview,
+        *,
+        topic_share: float,
+        host_share: float,
+        seconds: float,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.geometry = geometry(len(memory))
+        self.block = self.geometry.block
+        self.memory = memory
+        self.words = words_of(memory)
+        self.clock = clock
+        self._keep = int(seconds * 1e9)
+        self._most_of_topic = max(2, int(self.geometry.blocks * topic_share))
+        self._most_of_host = max(2, int(self.geometry.blocks * host_share))
+        self.longest = (self._most_of_topic - 1) * self.block - RECORD.size
+        self._topics: dict[str, _Share] = {}
+        self._hosts: dict[str, _Share] = {}
+        self._chains: dict[int, _Chain] = {}
+        # Data blocks, the oldest first: of which stream, and since when.
+        self._order: OrderedDict[int, tuple[int, int]] = OrderedDict()
+        self._beyond: dict[_Share, None] = {}
+        self._headers = 0
+        self._free: list[int] = []
+        self._birth = self._last_stream = 0
+        self._inherit()
+
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
+        """Begin a stream; None when there is no room for its header."""
+        text = memoryview(encode_header({**header, "topic": topic, "host": host}))
+        needed = -(-len(text) // self.block)
+        shares = tuple(
+            known.get(name) or _Share(most)
+            for known, name, most in (
+                (self._topics, topic, self._most_of_topic),
+                (self._hosts, host, self._most_of_host),
+            )
+        )
+        if not self._room_for_header(needed, shares[1]):
+            self.count(REFUSED, 1)
+            return None
+        self._topics[topic], self._hosts[host] = shares
+        for share in shares:
+            share.streams += 1
+            share.headers += needed
+        self._last_stream += 1
+        chain = self._chains[self._last_stream] = _Chain(shares, (topic, host))
+        for number in range(needed):
+            part = text[number * self.block : (number + 1) * self.block]
+            block = self.take(self._last_stream, number, HEADER, 0, chain)
+            place = self.geometry.data + block * self.block
+            self.memory[place : place + len(part)] = part
+            self.words[self.used_at(block)] = len(part)
+        chain.writer = Stream(self, self._last_stream, chain)
+        return chain.writer
+
+    def count(self, counter: int, by: int) -> None:
+        """Count what is not there."""
+        self.words[counter] = (self.words[counter] + by) % (1 << 64)
+
+    def used_at(self, block: int) -> int:
+        """Which word says how much of a block counts."""
+        return birth_at(block) + 4
+
+    def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain) -> int:
+        """A block for a stream: a free one, or the oldest of its topic or host if that has its share, or of all."""
+        if not self._free:
+            self._give_up(chain)
+        block = self._free.pop()
+        self._birth += 1
+        row = _COUNTERS + block * _ROW.size
+        _ROW.pack_into(self.memory, row, 0, stream, number, kind, begins, 0)
+        self.words[birth_at(block)] = self._birth
+        if kind == HEADER:
+            chain.headers.append(block)
+            self._headers += 1
+        else:
+            chain.data += 1
+            self._order[block] = stream, self.clock()
+            for share in chain.shares:
+                share.blocks[block] = None
+                if len(share.blocks) > share.most:
+                    self._beyond[share] = None
+        return block
+
+    def close_chain(self, stream: int, chain: _Chain) -> None:
+        """A stream ends."""
+        chain.writer = None
+        if not chain.data:
+            self._forget(stream, chain)
+
+    def _give_up(self, chain: _Chain) -> None:
+        oldest = self._oldest()
+        if self._order[oldest][1] + self._keep >= self.clock() or self._in_use(oldest):
+            full = (share for share in chain.shares if len(share.blocks) >= share.most)
+            share = next(full, None) or next(iter(self._beyond), None)
+            oldest = oldest if share is None else next(iter(share.blocks))
+        self._push_out(oldest)
+
+    def _in_use(self, block: int) -> bool:
+        """Whether a stream fills this block, and has done so lately: one that says little has all it said there."""
+        writer = self._chains[self._order[block][0]].writer
+        return writer is not None and writer.block == block and writer.written + self._keep >= self.clock()
+
+    def _oldest(self) -> int:
+        """The oldest block; those that are being filled count as new."""
+        for _ in range(len(self._order)):
+            block = next(iter(self._order))
+            if not self._in_use(block):
+                break
+            self._order.move_to_end(block)
+        return next(iter(self._order))
+
+    def _push_out(self, block: int) -> None:
+        stream, _since = self._order.pop(block)
+        loser = self._chains[stream]
+        for share in loser.shares:
+            del share.blocks[block]
+            if len(share.blocks) <= share.most:
+                self._beyond.pop(share, None)
+        loser.data -= 1
+        self._release(block)
+        if loser.writer is None and not loser.data:
+            self._forget(stream, loser)
+        elif loser.writer is not None and loser.writer.block == block:
+            loser.writer.lose_block()
+
+    def _room_for_header(self, needed: int, host: _Share) -> bool:
+        """Whether there is room in all and in the host's part, or can be where closed streams are pushed out."""
+
+        def crowded(*, of_host: bool) -> bool:
+            has, whole = (
+                (host.headers, self._most_of_host) if of_host else (self._headers, self.geometry.blocks)
+            )
+            return has + needed > whole // _MOST_HEADERS
+
+        for of_host in (False, True):
+            closed = (
+                stream
+                for stream, chain in list(self._chains.items())
+                if chain.writer is None and (not of_host or host in chain.shares)
+            )
+            while crowded(of_host=of_host):
+                stream = next(closed, None)
+                if stream is None:
+                    return False
+                for block in [block for block, (owner, _since) in self._order.items() if owner == stream]:
+                    self._push_out(block)
+        return True
+
+    def _forget(self, stream: int, chain: _Chain) -> None:
+        del self._chains[stream]
+        for block in chain.headers:
+            self._release(block)
+        self._headers -= len(chain.headers)
+        for known, name, share in zip((self._topics, self._hosts), chain.names, chain.shares, strict=False):
+            share.streams -= 1
+            share.headers -= len(chain.headers)
+            if not share.streams:
+                del known[name]
+
+    def _release(self, block: int) -> None:
+        self.words[birth_at(block)] = 0
+        self._free.append(block)
+
+    def _inherit(self) -> None:
+        """Take over what an earlier writer left: its streams are closed, its blocks are the oldest."""
+        left = sorted((row, block) for block, row in rows(self.memory) if row.sound)
+        with_data = {row.stream for row, _block in left if row.kind == DATA}
+        for row, block in left:
+            if row.stream not in with_data:
+                continue
+            chain = self._chains.setdefault(row.stream, _Chain())
+            if row.kind == DATA:
+                chain.data += 1
+                self._order[block] = row.stream, self.clock()
+            else:
+                chain.headers.append(block)
+                self._headers += 1
+            self._birth = max(self._birth, row.birth)
+            self._last_stream = max(self._last_stream, row.stream)
+        kept = {block for row, block in left if row.stream in with_data}
+        for block in reversed(range(self.geometry.blocks)):
+            if block not in kept:
+                self._release(block)

@@ -1,0 +1,118 @@
+"""The recordings that are kept: `ID/recording.bag` and `ID/recording.json`, and what was begun as `.ID.part/`.
+
+Invariants:
+
+1. A folder with the name of a recording is whole: it gets that name when all that is in it is on disk.
+2. All of them together never have more than `disk` bytes: room for the largest is made before one is begun. Of the kind
+   of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others.
+3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
+"""
+
+import re
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from appliance.channel.answers.recordings import Recording
+
+BAG, ABOUT = "recording.bag", "recording.json"
+MOST_KEPT = 500
+_NOTED = "noted"
+_ID = re.compile(r"[0-9a-f]{20}")
+_PART = re.compile(r"\.([0-9a-f]{20})\.part")
+_LARGEST = 8  # the part of `disk` that one recording may have
+_log = structlog.get_logger()
+
+
+class Shelf:
+    """The recordings in `folder`. They have `disk` bytes together, and go after `seconds` (None: never)."""
+
+    def __init__(self, folder: Path, *, disk: int, seconds: float | None) -> None:
+        self._folder = folder
+        self._disk = disk
+        self._seconds = seconds
+        self.recordings = sorted(self._read(), key=lambda recording: recording.id)
+
+    def _read(self) -> Iterator[Recording]:
+        for path in self._folder.iterdir():
+            if _ID.fullmatch(path.name):
+                try:
+                    yield msgspec.json.decode((path / ABOUT).read_bytes(), type=Recording)
+                except (OSError, msgspec.MsgspecError) as error:
+                    _log.error("a recording cannot be read", recording=path.name, error=str(error))
+
+    @property
+    def largest(self) -> int:
+        """Bytes that one recording may have."""
+        return self._disk // _LARGEST
+
+    @property
+    def free(self) -> int:
+        """Bytes that are free on the disk."""
+        return shutil.disk_usage(self._folder).free
+
+    def part(self, recording_id: str) -> Path:
+        """The folder in which a recording is made."""
+        return self._folder / f".{recording_id}.part"
+
+    def parts(self) -> list[Path]:
+        """Those that were begun and not finished, the oldest first."""
+        return sorted(path for path in self._folder.iterdir() if _PART.fullmatch(path.name))
+
+    def keep(self, recording: Recording) -> None:
+        """A recording is whole, and all of it on disk."""
+        self.part(recording.id).rename(self._folder / recording.id)
+        self.recordings.append(recording)
+
+    def find(self, recording_id: str) -> Recording | None:
+        """The recording of this id; None when there is none."""
+        return next((found for found in self.recordings if found.id == recording_id), None)
+
+    def remove(self, recording: Recording) -> None:
+        """Take a recording away. Raises `OSError`."""
+        shutil.rmtree(self._folder / recording.id)
+        self.recordings.remove(recording)
+
+    def note(self, recording_id: str) -> None:
+        """The audit log has it."""
+        if self.find(recording_id) is not None:
+            (self._folder / recording_id / _NOTED).touch()
+
+    def unnoted(self) -> list[Recording]:
+        """Those of which it is not known whether the audit log has them."""
+        return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
+
+    def surplus(self, now: int, *, room: bool) -> Iterator[tuple[Recording, str]]:
+        """What is to be removed now (nanoseconds since the epoch), and why; `room`: another recording begins.
+
+        Each is to be removed before the next is asked for.
+        """
+        while self._seconds is not None and self.recordings:
+            oldest = self.recordings[0]
+            if oldest.ended + int(self._seconds * 1e9) > now:
+                break
+            yield oldest, "it is older than recorder.days"
+        while room and self.recordings:
+            if sum(self._sizes().values()) + self.largest > self._disk:
+                why = "recorder.disk is used up"
+            elif len(self.recordings) >= MOST_KEPT:
+                why = f"there are {MOST_KEPT} recordings"
+            else:
+                break
+            sizes = self._sizes()
+            fullest = max(sizes, key=lambda what: sizes[what])
+            yield next(found for found in self.recordings if _kind(found) == fullest), why
+
+    def _sizes(self) -> Counter[str]:
+        sizes: Counter[str] = Counter()
+        for recording in self.recordings:
+            sizes[_kind(recording)] += recording.size
+        return sizes
+
+
+def _kind(recording: Recording) -> str:
+    return recording.triggers[0].what if recording.triggers else "order"

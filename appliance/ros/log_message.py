@@ -1,0 +1,29 @@
+"""Lines of `rosgraph_msgs/Log`, as rqt_console and `rosbag` show them."""
+
+import struct
+
+TYPE = "rosgraph_msgs/Log"
+DEBUG, INFO, WARN, ERROR, FATAL = 1, 2, 4, 8, 16
+_HEADER = struct.Struct("<III")
+_LENGTH = struct.Struct("<I")
+
+
+def log_message(
+    sequence: int, time_ns: int, level: int, name: str, text: str, *, file: str, function: str
+) -> bytes:
+    """A `rosgraph_msgs/Log` as its bytes on the wire; `time_ns` is since the epoch, `level` as in its definition."""
+    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
+    fields = (name, text, file, function)
+    return b"".join((
+        _HEADER.pack(sequence & 0xFFFFFFFF, seconds & 0xFFFFFFFF, nanoseconds),
+        _string(""),
+        bytes([level]),
+        *map(_string, fields),
+        _LENGTH.pack(0),  # line
+        _LENGTH.pack(0),  # topics: how many
+    ))  # fmt: skip
+
+
+def _string(text: str) -> bytes:
+    data = text.encode("utf-8", "replace")
+    return _LENGTH.pack(len(data)) + data

@@ -1,0 +1,47 @@
+"""The memory in which relays leave what they received last; it outlives them, as listening sockets outlive control.
+
+A relay writes into its own. The recorder gets descriptors that only read, and nobody can make a memory smaller, so
+that reading it never fails. Nothing is ever read here.
+"""
+
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+
+from appliance.channel.messages import RingGiven
+from appliance.config import RecorderRules
+
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+_PAGE = 4096
+
+
+class Rings:
+    """One memory for each relay, together what `rules` say. Raises `OSError`."""
+
+    def __init__(self, rules: RecorderRules, relays: int) -> None:
+        size = int(rules.memory) // relays // _PAGE * _PAGE
+        since = time.time_ns()
+        self._rings: list[tuple[RingGiven, int, int]] = []  # to be written and to be read
+        for index in range(relays):
+            writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.ftruncate(writable, size)
+            fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
+            readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
+            given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never))
+            self._rings.append((given, writable, readable))
+
+    def given_to(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:
+        """What a process gets at its start."""
+        for given, writable, readable in self._rings:
+            if role == "recorder":
+                yield given, readable
+            elif role == "relay" and given.index == index:
+                yield given, writable
+
+    def close(self) -> None:
+        """Let go of it."""
+        for _given, writable, readable in self._rings:
+            os.close(writable)
+            os.close(readable)
+        self._rings.clear()

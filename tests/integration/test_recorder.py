@@ -1,0 +1,166 @@
+"""The flight recorder beside real nodes: a monitor's drop makes a recording that stock tools read."""
+
+import hashlib
+import json
+import os
+import signal
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.waiting import eventually
+
+MONITOR = """
+censor() {
+    event said(std::string text) /rude std_msgs/String '{data:text}' { return; }
+}
+"""
+CONFIGURATION = """
+recorder:
+  enabled: true
+  memory: 16MiB
+  before: 30
+  after: 2
+  disk: 512MiB
+  triggers: [drop]
+  never: [/secret/*]
+audit: {reserve_bytes: 1MiB}
+"""
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with a recorder, and a monitor that drops what is said on /rude."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with tempfile.TemporaryDirectory(prefix="rosrv-recorder-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "monitors").mkdir()
+        (folder / "monitors" / "censor.rv").write_text(MONITOR)
+        (folder / "appliance.yaml").write_text(CONFIGURATION)
+        options = (
+            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "off"
+        )  # fmt: skip
+        with Appliance(options=options) as appliance:
+            yield appliance
+
+
+@pytest.fixture
+def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
+    """Nodes of one test."""
+    with RosSession(appliance.master_uri, tmp_path) as session:
+        yield session
+
+
+def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
+    """The recordings, once there are so many."""
+
+    def found() -> list[dict[str, Any]] | None:
+        listed = appliance.rosrv("record", "list", "--json", check=False)
+        rows = [json.loads(line) for line in listed.stdout.splitlines()] if not listed.returncode else []
+        return rows if len(rows) >= count else None
+
+    return eventually(found, appliance.story)
+
+
+def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
+    """The bag of a recording, as an operator gets it."""
+    bag = folder / f"{recording}.bag"
+    appliance.rosrv("record", "fetch", recording, "--out", str(bag))
+    return bag
+
+
+def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
+    """The strings of a topic, as Debian's rosbag reads them."""
+    program = (
+        "import rosbag, sys\n"
+        "for _topic, message, _time in rosbag.Bag(sys.argv[1]).read_messages([sys.argv[2]]):\n"
+        "    print(message.data)"
+    )
+    return ros.run("/usr/bin/python3", "-c", program, str(bag), topic).stdout.splitlines()
+
+
+def test_a_drop_makes_a_recording_that_stock_tools_read(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """With what was dropped, what was said before and after, and the decisions; the log proves it, and who took it."""
+    listener = ros.listener("roscpp", "/chatter", name="ear")
+    for topic in ("/rude", "/secret/key"):
+        ros.listener("rospy", topic)
+    ros.talker("rospy", "/chatter", name="voice")
+    ros.talker("roscpp", "/secret/key")
+    listener.wait_for_count(20, event="received")
+    lout = ros.talker("roscpp", "/rude", "--text", "bad", name="lout")
+    appliance.recorded(event="message dropped")
+    lout.interrupt()
+    [row] = recordings(appliance)
+    heard = [event["data"] for event in listener.seen(event="received")]
+    assert (row["complete"], row["why_not"]) == (True, "")
+    assert row["triggers"][0]["what"] == "drop"
+    bag = fetched(appliance, row["id"], tmp_path)
+    chatter = said(ros, bag, "/chatter")
+    assert chatter[:20] == heard[:20]
+    assert any(text.startswith("bad") for text in said(ros, bag, "/rude"))
+    assert said(ros, bag, "/secret/key") == []
+    decided = [json.loads(line) for line in said(ros, bag, "/rosrv/records")]
+    assert row["triggers"][0]["record"] in {record["id"] for record in decided}
+    info = ros.run("/usr/bin/rosbag", "info", str(bag)).stdout
+    assert "/rosrv/log" in info
+    assert "rosgraph_msgs/Log" in info
+    assert ros.run("/usr/bin/rosbag", "check", str(bag), check=False).returncode == 0
+    [closed] = appliance.recorded(event="recording closed")
+    assert closed["detail"]["recording"] == row["id"]
+    assert closed["detail"]["sha256"] == row["sha256"] == hashlib.sha256(bag.read_bytes()).hexdigest()
+    assert appliance.recorded(event="recording fetched")[0]["detail"]["who"] == "operator"
+    folder = appliance.state / "recordings" / row["id"]
+    if os.geteuid() == 0:
+        assert (folder.stat().st_uid, folder.stat().st_gid) == (61019, 61014)
+        assert stat.S_IMODE((folder / "recording.bag").stat().st_mode) == 0o640
+    appliance.rosrv("record", "remove", row["id"])
+    assert not folder.exists()
+    assert appliance.recorded(event="recording removed")[0]["detail"]["who"] == "operator"
+    assert appliance.rosrv("record", "fetch", row["id"], check=False).returncode == 1
+
+
+@pytest.mark.parametrize("victims", [("relay",), ("relay", "control")])
+def test_what_a_killed_relay_had_received_is_in_the_recording(
+    appliance: Appliance, ros: RosSession, tmp_path: Path, victims: tuple[str, ...]
+) -> None:
+    """Every message that a subscriber got before and after is there, once."""
+    listener = ros.listener("roscpp", "/chatter", name="ear")
+    ros.talker("roscpp", "/chatter", name="voice")
+    listener.wait_for_count(10, event="received")
+    for row in appliance.status()["processes"]:
+        if row["role"] in victims:
+            os.kill(row["pid"], signal.SIGKILL)
+    through = len(listener.seen(event="received")) + 5
+    listener.wait_for_count(through, event="received")
+    begun = json.loads(appliance.rosrv("record", "now", "--after", "1s", "--note", "kill", "--json").stdout)
+    [row] = recordings(appliance)
+    assert (row["id"], row["triggers"][0]["text"]) == (begun["id"], "operator: kill")
+    assert (row["complete"], row["why_not"]) == (True, "")
+    chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
+    assert {event["data"] for event in listener.seen(event="received")[:through]} <= set(chatter)
+    assert len(chatter) == len(set(chatter))
+    assert appliance.recorded(event="recording closed")[0]["detail"]["recording"] == row["id"]
+
+
+def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_path: Path) -> None:
+    """The recording that it had begun is finished by the next, under the same name, with every message once."""
+    listener = ros.listener("roscpp", "/chatter", name="ear")
+    ros.talker("roscpp", "/chatter", name="voice")
+    heard = [event["data"] for event in listener.wait_for_count(10, event="received")]
+    begun = json.loads(appliance.rosrv("record", "now", "--after", "3s", "--json").stdout)
+    appliance.kill("recorder")
+    [row] = recordings(appliance)
+    assert (row["id"], row["complete"], row["why_not"]) == (begun["id"], True, "")
+    chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
+    assert set(heard) <= set(chatter)
+    assert len(chatter) == len(set(chatter))

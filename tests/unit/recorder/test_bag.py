@@ -1,0 +1,66 @@
+"""Bags: other programs read what was written, also when the writer fell in the middle."""
+
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Reader
+
+from appliance.recorder.bag import BagWriter, Message
+
+HEADER = {
+    "topic": "/chatter",
+    "type": "std_msgs/String",
+    "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1",
+    "message_definition": "string data\n",
+    "callerid": "/talker",
+    "host": "10.0.0.1",
+}
+SECOND = 1_000_000_000
+
+
+def body(text: bytes) -> bytes:
+    """A std_msgs/String."""
+    return len(text).to_bytes(4, "little") + text
+
+
+def read(path: Path) -> list[tuple[str, int, bytes]]:
+    """What the reader of `rosbags` finds, in the order of time."""
+    with Reader(path) as reader:
+        return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
+
+
+def test_read_by_rosbags(tmp_path: Path) -> None:
+    """Messages of several chunks come back in the order of their times, with type and definition."""
+    bag = BagWriter(tmp_path / "a.bag", {})
+    chatter, other = bag.connect(HEADER), bag.connect(HEADER | {"topic": "/other"})
+    bag.write([Message(chatter, 5 * SECOND + 3, body(b"late")), Message(other, SECOND, body(b"first"))])
+    bag.write([])
+    bag.write([Message(chatter, 2 * SECOND, memoryview(body(b"second")))])
+    bag.close()
+    assert read(tmp_path / "a.bag") == [
+        ("/other", SECOND, body(b"first")),
+        ("/chatter", 2 * SECOND, body(b"second")),
+        ("/chatter", 5 * SECOND + 3, body(b"late")),
+    ]
+
+
+@pytest.mark.parametrize("torn", [0, 1, 50, 200])
+def test_another_writer_goes_on(tmp_path: Path, torn: int) -> None:
+    """Of a bag that was left in the middle of a chunk everything before stays, and more can be written."""
+    path = tmp_path / "left.bag"
+    bag = BagWriter(tmp_path / "a.bag", {})
+    size = bag.write([Message(bag.connect(HEADER), SECOND, body(b"one"))])
+    path.write_bytes((tmp_path / "a.bag").read_bytes() + bytes(torn))
+    bag.close()
+    bag = BagWriter(path, {0: HEADER}, size)
+    bag.write(
+        [Message(0, 2 * SECOND, body(b"two")), Message(bag.connect(HEADER), 3 * SECOND, body(b"three"))]
+    )
+    bag.close()
+    assert [data for _topic, _time, data in read(path)] == [body(b"one"), body(b"two"), body(b"three")]
+
+
+def test_empty_bag(tmp_path: Path) -> None:
+    """A bag without a message is a bag."""
+    BagWriter(tmp_path / "a.bag", {}).close()
+    assert read(tmp_path / "a.bag") == []

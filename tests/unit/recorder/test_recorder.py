@@ -1,0 +1,265 @@
+"""The recorder on a real log and a real ring: what begins, extends and ends a recording, and what limits it."""
+
+import hashlib
+import json
+import mmap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rosbags.rosbag1 import Reader
+
+from appliance.audit.log import AuditLog
+from appliance.channel import messages
+from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.config import RecorderRules
+from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
+from appliance.recorder.ring import SMALLEST, RingWriter
+from appliance.recorder.shelf import Shelf
+from tests.support.audit import decision, settle
+from tests.unit.recorder.test_ring import HEADER, Clock, frame
+
+SECOND = 1_000_000_000
+BEGAN = 1_000 * SECOND
+TEXT = (5).to_bytes(4, "little") + b"hello"
+
+
+class Scene:
+    """A relay's ring, an audit log and the recorder, by a clock that the test sets."""
+
+    def __init__(self, folder: Path, *, disk: int = 64 << 20, **rules: Any) -> None:
+        self.clock = Clock(BEGAN)
+        self.disk = disk
+        self.folder = folder / "recordings"
+        self.folder.mkdir(exist_ok=True)
+        self.log = AuditLog(folder / "audit.db", clock=self.clock)
+        settle(self.log)
+        self.rules = RecorderRules(**{"enabled": True, "before": 10, "after": 5, "longest": 60} | rules)
+        self.memory = memoryview(mmap.mmap(-1, SMALLEST))
+        self.born = BEGAN
+        self.writer = RingWriter(self.memory, topic_share=0.25, host_share=0.5, seconds=10, clock=self.clock)
+        self.stream = self.writer.open("/chatter", "10.0.0.1", HEADER)
+        self.said = 0
+        self.recorder = self.make_recorder()
+
+    def begin_anew(self) -> None:
+        """Another life of the recorder."""
+        self.recorder.close()
+        self.recorder = self.make_recorder()
+
+    def make_recorder(self) -> Recorder:
+        """A recorder, with what it finds."""
+        shelf = Shelf(self.folder, disk=self.disk, seconds=None)
+        return Recorder(
+            self.rules,
+            shelf,
+            self.log.path,
+            [self.memory],
+            memory=self.born,
+            reserve=1 << 20,
+            clock=self.clock,
+        )
+
+    def say(self, body: bytes = TEXT) -> None:
+        """A publisher says something."""
+        assert self.stream is not None
+        self.said += 1
+        self.stream.write(memoryview(frame(body)), 1, self.said)
+
+    def happen(self, event: str = "message dropped", **fields: Any) -> str:
+        """Something is recorded now; its id."""
+        record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
+        self.log.record(record)
+        settle(self.log)
+        return record.id
+
+    def later(self, seconds: float, *said: Any) -> list[messages.Message]:
+        """So many seconds later the recorder takes its next step."""
+        self.clock.now += int(seconds * SECOND)
+        return self.recorder.step(said)
+
+    def closed(self, answers: list[messages.Message]) -> list[Recording]:
+        """The recordings that control is told of."""
+        return [one.recording for one in answers if isinstance(one, messages.RecordingClosed)]
+
+    def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
+        """What is in its bag."""
+        path = self.folder / recording.id / "recording.bag"
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
+        assert path.stat().st_size == recording.size
+        with Reader(path) as reader:
+            return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    """With a first message at its beginning."""
+    scene = Scene(tmp_path)
+    scene.say()
+    yield scene
+    scene.log.close()
+
+
+def test_before_and_after(scene: Scene) -> None:
+    """Messages of the seconds before and after, the record as a message, and what describes it beside the bag."""
+    scene.later(20)
+    scene.say(TEXT.replace(b"hello", b"alarm"))
+    scene.later(1)
+    dropped = scene.happen(reason="too fast")
+    assert not scene.closed(scene.later(0.2))
+    scene.say()
+    assert not scene.closed(scene.later(4.9))
+    scene.say()  # after its end
+    [recording] = scene.closed(scene.later(SETTLE_SECONDS + 0.1))
+    assert recording == scene.closed(scene.later(0, messages.RecordingsAsked()))[0]
+    happened = BEGAN + 21 * SECOND
+    assert (recording.began, recording.ended) == (happened - 10 * SECOND, happened + 5 * SECOND)
+    assert (recording.complete, recording.why_not) == (True, "")
+    assert recording.triggers == [Trigger(happened, "drop", dropped, "message dropped: too fast")]
+    [topic] = recording.topics
+    assert (topic.topic, topic.type, topic.messages, topic.missed) == ("/chatter", "std_msgs/String", 2, 0)
+    found = scene.bag(recording)
+    assert [data for name, _time, data in found if name == "/chatter"] == [
+        TEXT.replace(b"hello", b"alarm"),
+        TEXT,
+    ]
+    [(_name, time, record)] = [row for row in found if row[0] == "/rosrv/records"]
+    assert (time, json.loads(record[4:])["id"]) == (happened, dropped)
+    assert [time for name, time, _data in found if name == "/rosrv/log"] == [happened]
+    kept = scene.folder / recording.id
+    assert msgspec.json.decode((kept / "recording.json").read_bytes(), type=Recording) == recording
+    assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json"}
+
+
+def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
+    """Up to its longest; what happens later begins another."""
+    scene.happen()
+    scene.later(0.1)
+    for _second in range(20):
+        assert not scene.closed(scene.later(4))
+        scene.happen()
+        if scene.clock.now >= BEGAN + 56 * SECOND:
+            break
+    answers = scene.later(0.1) + scene.later(10)
+    [recording] = scene.closed(answers)
+    assert recording.ended == BEGAN + 60 * SECOND
+    assert len(recording.triggers) == 15
+    scene.happen()
+    scene.later(0.1)
+    assert scene.closed(scene.later(10))[0].began == scene.clock.now - int(20.1 * SECOND)
+
+
+def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
+    """So many of a kind begin a recording in an hour, control is told once, and orders are still obeyed."""
+    scene = Scene(tmp_path, per_hour=3)
+    told: list[messages.Message] = []
+    for _minute in range(10):
+        scene.happen()
+        told += scene.later(0.1) + scene.later(10)
+    assert len(scene.closed(told)) == 3
+    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    assert "recorder.per_hour" in missed.reason
+    scene.happen("monitor fault")
+    assert len(scene.closed(scene.later(0.1) + scene.later(10))) == 1
+    order = messages.RecordingWanted(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
+    [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingBegun)]
+    assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
+    assert scene.closed(scene.later(3))[0].id == begun.id
+    scene.log.close()
+
+
+def test_a_recording_has_an_eighth_of_the_disk(tmp_path: Path) -> None:
+    """What is beyond is counted, and the recording says why it ended."""
+    scene = Scene(tmp_path, disk=8 * 100_000)
+    scene.happen()
+    for _message in range(12):
+        scene.say(bytes(20_000))
+    [recording] = scene.closed(scene.later(0.1))
+    assert recording.ended == scene.clock.now
+    [topic] = recording.topics
+    assert (topic.messages + topic.missed, topic.missed > 0) == (12, True)
+    assert "an eighth of recorder.disk" in recording.why_not
+    assert not recording.complete
+    scene.log.close()
+
+
+def test_what_had_left_the_memory_is_said(scene: Scene) -> None:
+    """The oldest messages of the time asked for are gone: by topic, in words."""
+    for _message in range(30):
+        scene.say(bytes(100_000))
+    scene.happen()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert not recording.complete
+    assert "had left recorder.memory already: /chatter" in recording.why_not
+
+
+def test_a_fallen_recorder_is_followed_by_one_that_goes_on(scene: Scene) -> None:
+    """Every message once, under the same name, and the trigger once."""
+    scene.happen()
+    scene.later(0.1)
+    [part] = scene.folder.iterdir()
+    scene.say()
+    with (part / "recording.bag").open("ab") as bag:
+        bag.write(b"torn")
+    scene.begin_anew()
+    scene.later(1)
+    scene.say()
+    [recording] = scene.closed(scene.later(6))
+    assert part.name == f".{recording.id}.part"
+    assert recording.complete
+    assert len(recording.triggers) == 1
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT, TEXT, TEXT]
+
+
+def test_after_another_start_of_the_appliance_it_is_finished_as_it_is(scene: Scene) -> None:
+    """The memory is another: what was written is kept, and says that its end is missing; an empty part goes."""
+    scene.happen()
+    scene.later(0.1)
+    (scene.folder / f".{'a' * 20}.part").mkdir()
+    scene.born = scene.clock.now = BEGAN + 100 * SECOND
+    scene.begin_anew()
+    [recording] = scene.closed(scene.later(0))
+    assert (recording.complete, recording.why_not) == (False, "the appliance ended while it was made")
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+    assert [path.name for path in scene.folder.iterdir()] == [recording.id]
+
+
+def test_a_recorder_that_comes_late_sees_what_happened_meanwhile(scene: Scene) -> None:
+    """Within the time that the memory has; what has a recording already begins no other."""
+    scene.happen()
+    scene.clock.now += 3 * SECOND
+    scene.begin_anew()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert recording.triggers[0].time == BEGAN
+    scene.begin_anew()
+    scene.later(0.1)
+    assert not scene.closed(scene.later(60))
+
+
+def test_a_recording_is_told_until_it_is_noted_and_removed_by_order(scene: Scene) -> None:
+    """Removing what is not there is refused as unknown."""
+    scene.happen()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert scene.closed(scene.later(0, messages.RecordingsAsked())) == [recording]
+    answers = scene.later(0, messages.RecordingNoted(recording.id), messages.RecordingsAsked())
+    assert scene.closed(answers) == []
+    assert messages.RecordingsStated([recording]) in answers
+    remove = messages.RecordingRemovalWanted(3, recording.id, "eve")
+    assert scene.later(0, remove) == [messages.RecordingRemoved(3, recording, "eve", "")]
+    [refused] = scene.later(0, remove)
+    assert isinstance(refused, messages.RecordingRefused)
+    assert refused.unknown
+
+
+def test_revisions_are_those_that_control_said_last(scene: Scene) -> None:
+    """They are asked for when a recording begins and ends."""
+    scene.happen()
+    assert messages.RevisionsWanted() in scene.later(0.1)
+    scene.later(0, messages.RevisionsStated(4, 2))
+    [recording] = scene.closed(scene.later(6))
+    assert (recording.policy, recording.monitors) == (4, 2)

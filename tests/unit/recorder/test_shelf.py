@@ -1,0 +1,85 @@
+"""The shelf: whole recordings only, room for the next, and those that have most of it make it."""
+
+from pathlib import Path
+
+import msgspec
+
+from appliance.channel.answers.recordings import Recording, Trigger, TriggerKind
+from appliance.recorder.shelf import ABOUT, Shelf
+
+MIB = 1 << 20
+SECOND = 1_000_000_000
+
+
+def recording(number: int, what: TriggerKind = "drop", size: int = MIB) -> Recording:
+    """The recording of this second."""
+    time = number * SECOND
+    trigger = Trigger(time, what, "record", "")
+    return Recording(
+        f"{number:020x}", time, time, [trigger], [], 1, 1, size=size, sha256="", complete=True, why_not=""
+    )
+
+
+def put(shelf: Shelf, kept: Recording) -> Recording:
+    """Keep it, as the recorder does."""
+    part = shelf.part(kept.id)
+    part.mkdir()
+    (part / ABOUT).write_bytes(msgspec.json.encode(kept))
+    shelf.keep(kept)
+    return kept
+
+
+def cleared(shelf: Shelf, now: int = 0, *, room: bool = False) -> list[tuple[Recording, str]]:
+    """What goes, as the recorder lets it go."""
+    gone = []
+    for kept, why in shelf.surplus(now, room=room):
+        shelf.remove(kept)
+        gone.append((kept, why))
+    return gone
+
+
+def test_what_is_kept_is_found_again(tmp_path: Path) -> None:
+    """By the next recorder, in the order of time; what had only been begun is a part, what is spoilt is none."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    second, first = put(shelf, recording(2)), put(shelf, recording(1))
+    shelf.part("f" * 20).mkdir()
+    spoilt = tmp_path / ("e" * 20)
+    spoilt.mkdir()
+    (spoilt / ABOUT).write_text("{")
+    again = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    assert again.recordings == [first, second]
+    assert again.parts() == [again.part("f" * 20)]
+    again.remove(first)
+    assert not (tmp_path / first.id).exists()
+    assert again.find(first.id) is None
+
+
+def test_what_the_log_has_is_told_once(tmp_path: Path) -> None:
+    """Until it is noted a recording is told again."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    first, second = put(shelf, recording(1)), put(shelf, recording(2))
+    shelf.note(first.id)
+    shelf.note("0" * 20)
+    assert Shelf(tmp_path, disk=64 * MIB, seconds=None).unnoted() == [second]
+
+
+def test_who_has_most_makes_room(tmp_path: Path) -> None:
+    """The oldest of the kind that has most bytes goes, so that a flood of drops takes away no other recording."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    put(shelf, recording(1, "order", 8 * MIB))
+    put(shelf, recording(2, "fault", 8 * MIB))
+    for number in range(3, 8):
+        put(shelf, recording(number, "drop", 8 * MIB))
+    assert not cleared(shelf)
+    assert not cleared(shelf, room=True)
+    put(shelf, recording(8, "drop", 8 * MIB))
+    assert cleared(shelf, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is used up")]
+
+
+def test_what_is_too_old_goes(tmp_path: Path) -> None:
+    """After as many seconds as are configured, counted from a recording's end."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=10)
+    put(shelf, recording(1))
+    put(shelf, recording(2))
+    assert not cleared(shelf, 11 * SECOND - 1)
+    assert cleared(shelf, 11 * SECOND + 1) == [(recording(1), "it is older than recorder.days")]

@@ -1,0 +1,53 @@
+"""Which records are triggers, and that a flood of one kind hides no other."""
+
+from typing import get_args
+
+import pytest
+
+from appliance.audit.record import Record, Severity
+from appliance.channel.answers.recordings import TriggerKind
+from appliance.config import RecorderRules
+from appliance.recorder.triggers import HourlyLimit, trigger_of
+from tests.unit.recorder.test_shelf import SECOND, recording
+
+HOUR = 3600 * SECOND
+KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
+
+
+@pytest.mark.parametrize(
+    ("record", "what"),
+    [
+        (Record(id="1", time=5, event="message dropped", reason="too fast"), "drop"),
+        (Record(id="1", time=5, event="message changed"), "change"),
+        (Record(id="1", time=5, event="monitor verdict"), "verdict"),
+        (Record(id="1", time=5, event="monitor fault", severity=Severity.ALARM), "fault"),
+        (Record(id="1", time=5, event="decision", decision="deny"), "denial"),
+        (Record(id="1", time=5, event="signature refused", severity=Severity.ALARM), "alarm"),
+        (Record(id="1", time=5, event="decision", decision="allow"), None),
+        (Record(id="1", time=5, event="recording closed", severity=Severity.NOTICE), None),
+    ],
+)
+def test_records_are_triggers_of_the_kind_that_is_wanted(record: Record, what: str | None) -> None:
+    """And of no other; an alarm that is something else, too, is that first."""
+    trigger = trigger_of(record, KINDS)
+    assert (trigger and trigger.what) == what
+    if trigger is not None:
+        assert (trigger.time, trigger.record) == (5, "1")
+        assert trigger.text.startswith(record.event)
+    assert trigger_of(record, [kind for kind in KINDS if kind not in {what, "alarm"}]) is None
+
+
+def test_all_kinds_but_orders_can_be_configured() -> None:
+    """The words of the configuration are those of the recordings."""
+    configurable = get_args(get_args(RecorderRules.model_fields["triggers"].annotation)[0])
+    assert set(configurable) == set(KINDS) - {"order"}
+
+
+def test_each_kind_has_its_own_hour() -> None:
+    """Also over the life of a recorder: those that are kept count."""
+    limit = HourlyLimit(2, [recording(1, "drop")])
+    now = 10 * SECOND
+    assert [limit.take("drop", now) for _try in range(3)] == [True, False, False]
+    assert limit.take("fault", now)
+    assert limit.take("drop", SECOND + HOUR)
+    assert not limit.take("drop", SECOND + HOUR)

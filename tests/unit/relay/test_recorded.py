@@ -1,0 +1,64 @@
+"""What a relay leaves with the flight recorder: what publishers say, before anybody changes or drops it."""
+
+import mmap
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.channel.messages import RingGiven
+from appliance.recorder.reading import RingReader
+from appliance.recorder.ring import SMALLEST
+from appliance.relay.recorded import Recorded
+from tests.unit.relay.connections.test_topic import HEADER, Story, batch
+
+EVER = 0, 1 << 63
+
+
+def given(descriptor: int, *, never: tuple[str, ...] = ()) -> Recorded:
+    """The recorder of a relay."""
+    return Recorded(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor))
+
+
+@pytest.fixture
+def memory() -> Iterator[int]:
+    """A ring."""
+    descriptor = os.memfd_create("ring")
+    os.ftruncate(descriptor, SMALLEST)
+    yield descriptor
+    os.close(descriptor)
+
+
+def kept(descriptor: int) -> list[tuple[str, bytes]]:
+    """What is in a ring: topic and message."""
+    reader = RingReader(memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)))
+    return [
+        (found.header["topic"], bytes(message))
+        for found in reader.read(*EVER)
+        for batch in found.batches
+        for message in batch.frames
+    ]
+
+
+def test_what_monitors_drop_is_recorded(memory: int) -> None:
+    """As it came, with the publisher's true name and host; from the connection's beginning to its end."""
+    story = Story(recorded=given(memory))
+    story.topic.monitor(lambda _batch: None, wanted=True)
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1", b"2"))
+    story.topic.upstream_closed()
+    assert member.received == b""
+    assert kept(memory) == [("/chatter", b"1"), ("/chatter", b"2")]
+    reader = RingReader(memoryview(mmap.mmap(memory, 0, prot=mmap.PROT_READ)))
+    [found] = reader.read(*EVER)
+    assert (found.header["callerid"], found.header["host"]) == ("/talker", "10.0.0.1")
+
+
+@pytest.mark.parametrize("never", [("/chatter",), ("/ch?tter",), ("std_msgs/*",), ("std_msgs/String",)])
+def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]) -> None:
+    """By the name of the topic or of its type; nor is what no glob of `topics` fits."""
+    header = {"type": "std_msgs/String", "md5sum": "*", "callerid": "/talker"}
+    assert given(memory, never=never).open("/chatter", "10.0.0.1", header) is None
+    assert given(memory).open("/other", "10.0.0.1", header) is None
+    assert given(memory).open("/chatter", "10.0.0.1", header) is not None

@@ -1,0 +1,43 @@
+"""The memory of the flight recorder: who gets which of it, and that nobody can spoil it for others."""
+
+import mmap
+import os
+
+import pytest
+from pydantic import ByteSize
+
+from appliance.config import RecorderRules
+from appliance.supervisor.rings import Rings
+
+MIB = 1 << 20
+
+
+def test_a_relay_writes_into_its_own_and_the_recorder_reads_all() -> None:
+    """What one writes the other sees; together they have what is configured."""
+    rings = Rings(RecorderRules(memory=ByteSize(32 * MIB), topics=["/a*"], before=7), 2)
+    [(given, written)] = rings.given_to("relay", 1)
+    assert (given.index, given.seconds, given.topics) == (1, 7, ["/a*"])
+    read = {one.index: descriptor for one, descriptor in rings.given_to("recorder", 0)}
+    assert [os.fstat(descriptor).st_size for descriptor in read.values()] == [16 * MIB, 16 * MIB]
+    mmap.mmap(written, 0)[:5] = b"hello"
+    assert os.pread(read[1], 5, 0) == b"hello"
+    assert os.pread(read[0], 5, 0) == bytes(5)
+    assert not list(rings.given_to("control", 0))
+    rings.close()
+    with pytest.raises(OSError):
+        os.fstat(written)
+
+
+def test_nobody_makes_it_smaller_and_the_recorder_changes_nothing() -> None:
+    """Reading it never fails because of a relay, and what a relay wrote is the relay's."""
+    rings = Rings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
+    [(_given, written)] = rings.given_to("relay", 0)
+    [(_given, read)] = rings.given_to("recorder", 0)
+    for size in (0, 32 * MIB):
+        with pytest.raises(PermissionError):
+            os.ftruncate(written, size)
+    with pytest.raises(OSError):
+        os.pwrite(read, b"x", 0)
+    with pytest.raises(PermissionError):
+        mmap.mmap(read, 0)
+    rings.close()
